@@ -44,7 +44,7 @@ setup(
     description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
     license='Apache-2.0',
     # Not needed in flight: for the figures, and for large flocks.
-    extras_require={'simulation': ['matplotlib', 'mcap', 'numba', 'scipy'],
+    extras_require={'simulation': ['matplotlib', 'mcap', 'scipy'],
                     'cluster': ['distributed'],
                     # Where there is no ROS; on a robot apt and rosdep bring all of it.
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',

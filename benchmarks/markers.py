@@ -32,20 +32,10 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
+from flock_desk.camera.leader import board, Face, marker_print, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import render_in_one_thread, Renderer, Sensor
-from flock_desk.camera.rig import T_BODY_OPTICAL
-from flock_desk.camera.scene import (
-    box,
-    field_with_buildings,
-    plain,
-    Surface,
-    T_BODY_MARKER,
-    Texture,
-)
-from flock_desk.marker import snippet
-from flock_desk.runs.marker_panel import layout, SIZES
-from flock_desk.runs.marker_panel import snippet as panel_snippet
+from flock_desk.runs.marker_pages import entry, layout, panel_entry, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -65,7 +55,6 @@ from flock_follower.perception.tracker import Tracker
 
 DICTIONARY = 'DICT_4X4_50'
 DISTANCES = (0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-INK, PAPER = 0.03, 0.72
 RUNS, IMAGES = 8, 12
 APPROACH, APPROACH_RATE = 44.0, 15.0  # s, Hz
 CAMERA = Camera()
@@ -90,7 +79,7 @@ class Seen(NamedTuple):
     nees: float
 
 
-def printed(markers: tuple[Marker, ...]) -> list[Surface]:
+def printed(markers: tuple[Marker, ...]) -> list[Face]:
     """Return one print that shows markers, all of one cell size or multiples, and its board."""
     cells = marker_cells(DICTIONARY)
     cell = min(m.side_length for m in markers) / cells
@@ -107,12 +96,9 @@ def printed(markers: tuple[Marker, ...]) -> list[Surface]:
         row = round((high[1] - y - marker.side_length / 2) / cell)
         column = round((x - marker.side_length / 2 - low[0]) / cell)
         paper[row:row + len(code), column:column + len(code)] = code
-    values = (INK + (PAPER - INK) * paper).astype(np.float32).ravel()
     middle = T_BODY_MARKER @ Transform(translation=np.append((low + high) / 2.0, 0.0))
-    surface = Surface(middle, columns * cell / 2, rows * cell / 2, Texture(
-        (int(rows), int(columns)), cell, values, None, np.zeros(1, np.int32)))
-    behind = middle @ Transform(translation=np.array([0.0, 0.0, -0.006]))
-    return [*box(behind, [columns * cell, rows * cell, 0.01], plain(0.6)), surface]
+    face = marker_print(paper, cell, middle)
+    return [*board(face), face]
 
 
 def fly(renderer: Renderer, config: NeighborConfig, leader: Motion, seed: int, count: int,
@@ -179,11 +165,10 @@ def main() -> None:
     """Print what is seen."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
     render_in_one_thread()
-    carried = {'0.16 m': parse(yaml.safe_load(snippet(DICTIONARY, [0], 0.16))),
-               'panel': parse(yaml.safe_load(panel_snippet(layout(DICTIONARY, [0, 1], SIZES))))}
-    scenery = field_with_buildings()
-    renderers = {name: Renderer(CAMERA, Sensor(), scenery, printed(config.neighbors[0].markers),
-                                viewpoint=OWN.translation) for name, config in carried.items()}
+    carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),
+               'panel': parse(yaml.safe_load(panel_entry(layout(DICTIONARY, [0, 1], SIZES))))}
+    renderers = {name: Renderer(CAMERA, Sensor(), printed(config.neighbors[0].markers))
+                 for name, config in carried.items()}
     print('hovering: share of images, RMS of the distance, its mean error, NEES of the place')
     for distance in DISTANCES:
         for name, config in carried.items():

@@ -47,8 +47,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from flock_desk.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
-from flock_desk.camera.scene import T_BODY_MARKER
+from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.runs.frame_errors import FrameErrors
 from flock_desk.sample_bag import (
     IMAGE_RATE,
@@ -308,7 +307,6 @@ class Flight:
         return {method: self._figures(method) for method in self.methods}
 
     def _figures(self, method: str) -> Figures:
-        self.errors[method].finish()
         table = self.errors[method].table('leader')
         recall = float(np.isfinite(table['distance']).mean())
         # The truth of the last images may come after the end of a short run.

@@ -31,10 +31,9 @@ import time
 import numpy as np
 
 from flock_desk.flocks import graph as flock_graph
-from flock_desk.flocks import vicsek
 from flock_desk.flocks.agents import NEAREST
-from flock_desk.flocks.all_pairs import accelerations, Method
-from flock_desk.flocks.neighbor_search import nearest, pairs_within
+from flock_desk.flocks.graph import nearest, pairs_within
+from flock_desk.flocks.models import accelerations, velocities_after
 from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
 from flock_follower.geometry import Array
 
@@ -61,20 +60,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def all_pairs(n: int, repeats: int) -> list[tuple[str, bool]]:
-    """Print the time per pair of each method, and the peak memory before and with whole."""
+    """Print the time per pair by blocks and by whole matrices, and the peak memory of each."""
     x, v = flock(n)
-    methods: list[Method] = ['blocked']
-    try:
-        accelerations(x, v, PARAMS, method='compiled')  # the first call compiles
-        methods.append('compiled')
-    except ImportError as error:
-        print(f'compiled: not measured ({error})')
-    # Turn by turn, so that a slow moment of the machine is nobody's alone.
-    seconds = dict.fromkeys(methods, np.inf)
-    for _ in range(repeats):
-        for method in methods:
-            seconds[method] = min(seconds[method],
-                                  timed(accelerations, x, v, PARAMS, 'flocking', method))
+    blocked = min(timed(accelerations, x, v, PARAMS, 'flocking', 'blocked')
+                  for _ in range(repeats)) / n ** 2
     peak = peak_memory()
     whole, room = n, available_memory()
     while whole ** 2 * _WHOLE_BYTES > room:
@@ -82,20 +71,13 @@ def all_pairs(n: int, repeats: int) -> list[tuple[str, bool]]:
     if whole < n:
         print(f'whole matrices of {n} agents do not fit in {room / 1e9:.1f} GB: '
               f'measured with {whole}')
-    per_pair = {method: s / n ** 2 for method, s in seconds.items()}
-    per_pair['whole'] = min(timed(accelerations, *flock(whole), PARAMS, 'flocking', 'whole')
-                            for _ in range(min(repeats, 2))) / whole ** 2
+    at_once = min(timed(accelerations, *flock(whole), PARAMS, 'flocking', 'whole')
+                  for _ in range(min(repeats, 2))) / whole ** 2
     print('all pairs     ns/pair   times as fast as whole   peak memory of the process')
-    for name, memory in (('whole', peak_memory()), *((m, peak) for m in methods)):
-        times = per_pair['whole'] / per_pair[name]
-        print(f'  {name:<10} {1e9 * per_pair[name]:8.2f}   {times:22.1f}   '
+    for name, seconds, memory in (('whole', at_once, peak_memory()), ('blocked', blocked, peak)):
+        print(f'  {name:<10} {1e9 * seconds:8.2f}   {at_once / seconds:22.1f}   '
               f'{memory / 1e6:10.0f} MB')
-    bounds = [('blocked at least 4 times as fast as whole',
-               per_pair['whole'] >= 4.0 * per_pair['blocked'])]
-    if 'compiled' in per_pair:
-        bounds.append(('compiled at least 4 times as fast as blocked',
-                       per_pair['blocked'] >= 4.0 * per_pair['compiled']))
-    return bounds
+    return [('blocked at least as fast as whole', at_once >= blocked)]
 
 
 def neighbors(n: int, repeats: int) -> list[tuple[str, bool]]:
@@ -122,7 +104,7 @@ def neighbor_steps(x: Array, v: Array) -> dict[str, Callable[[], object]]:
             x, v, FLIGHT_PARAMS, nearest(x, NEAREST)),
         'neighbour graph': lambda: flock_graph.accelerations(
             x, v, FLIGHT_PARAMS, graph, near=pairs_within(x, distance)),
-        'Vicsek': lambda: vicsek.velocities_after(x, v, _RADIUS)}
+        'Vicsek': lambda: velocities_after(x, v, _RADIUS)}
 
 
 def beside_sisyphe(n: int, repeats: int) -> None:
@@ -144,7 +126,7 @@ def beside_sisyphe(n: int, repeats: int) -> None:
                        block_sparse_reduction=sparse, number_of_cells=1024)
         next(model)  # the first step compiles
         theirs.append(min(timed(next, model) for _ in range(repeats)))
-    ours = min(timed(vicsek.velocities_after, x, unit, _RADIUS) for _ in range(repeats))
+    ours = min(timed(velocities_after, x, unit, _RADIUS) for _ in range(repeats))
     print(f"\none step of Vicsek's model, {n} agents, radius {_RADIUS} m, float64\n"
           f'  here, k-d tree           {1e3 * ours:8.1f} ms\n'
           f'  SiSyPHE, all pairs       {1e3 * theirs[0]:8.1f} ms  ({theirs[0] / ours:.1f} times)\n'

@@ -15,9 +15,9 @@
 """
 The steps of a flight by the command ``follow``: which request is due, and which key confirms it.
 
-check, arm, takeoff, offboard, engage, then it follows; land at the end. The step that is due is
-the first one whose result the nodes do not report: what is reached already is left out, and after
-a takeover it is offboard again. Nothing here reads a clock; times are s on a monotonic clock.
+The steps are check, arm, takeoff, offboard, engage; land at the end. The step that is due is the
+first one whose result the nodes do not report: a step that is reached already is left out, and
+after a takeover offboard is due again. No function reads a clock; times are s, monotonic.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SILENCE: Final[float] = 3.0
 DISCOVERY: Final[float] = 8.0
 #: Only reports received so long, s, after an answer show what the request has changed.
 SETTLING: Final[float] = 0.2
-#: A distance older than this is not shown, s.
+#: An older distance is not shown, s.
 SHOWN: Final[float] = 1.0
 INTERRUPTED: Final[int] = 130
 #: The service of each request, and its value; None: it takes none. 'check' is no service.
@@ -62,22 +62,22 @@ def loopback(connection: str) -> bool:
 
 @dataclass
 class Reports:
-    """What the nodes have reported last."""
+    """The last report of each node."""
 
     bridge: str = ''
     """``mavlink_bridge/state``, also that before the autopilot was lost; '': none yet."""
     nodes: dict[str, tuple[float, Mapping[str, str]]] = field(default_factory=dict)
-    """Of each node when its diagnostics were received, and their values."""
+    """The time of the last diagnostics of each node, s, and their values."""
     distance: tuple[float, str] = (-math.inf, '')
-    """When the distance to the leader was received, and it in words."""
+    """The time at which the distance to the leader was received, s, and its text."""
     battery: str = ''
 
     def value(self, node: str, key: str) -> str:
-        """Return a value of a node's diagnostics, '' where there is none."""
+        """Return a value of a node's diagnostics, '' if there is none."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
     def missing(self, now: float) -> list[str]:
-        """Return the nodes that report nothing."""
+        """Return the nodes without a report within ``SILENCE``."""
         return [node for node in NODES
                 if node not in self.nodes or now - self.nodes[node][0] > SILENCE]
 
@@ -91,7 +91,7 @@ class Reports:
         return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
 
     def due(self, checked: bool) -> str:
-        """Return the first step whose result is not reported, '' where it follows."""
+        """Return the first step whose result is not reported, '' while the vehicle follows."""
         reached = {'check': checked, 'arm': self.value('mavlink_bridge', 'armed') == 'True',
                    'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
                    'offboard': self.bridge == 'ACTIVE',
@@ -99,7 +99,7 @@ class Reports:
         return next((step for step, done in reached.items() if not done), '')
 
     def line(self, now: float) -> str:
-        """Return the live line: states, distance, battery, reasons; a terminal cuts the end."""
+        """Return the live line: states, distance, battery, reasons."""
         received, distance = self.distance
         word, _, why = self.bridge.partition(': ')
         reasons = '; '.join(filter(None, [why, self.value('planner', 'reason')]))
@@ -110,17 +110,17 @@ class Reports:
 
 class Flight:
     """
-    Decides what to request; every method returns the requests to make now, keys of ``SERVICES``.
+    Decides which requests to make; every method returns those to make now, keys of ``SERVICES``.
 
-    :param confirm: whether a key confirms each step; else each is requested once, and a refusal,
-        a missing node or a step that is due again ends it.
+    :param confirm: whether a key confirms each step. If not, each step is requested once, and a
+        refusal, a missing node or a step that is due again ends the flight.
     """
 
     def __init__(self, now: float, confirm: bool = True) -> None:
         self.code: int | None = None
-        """The exit code, once it has ended."""
+        """The exit code, once the flight has ended."""
         self.lines: list[str] = []
-        """What to print; the caller empties it."""
+        """Lines to print; the caller empties the list."""
         self._confirm = confirm
         self._answered = now  # of the last answer, s
         self._checked = self._landing = False
@@ -159,18 +159,21 @@ class Flight:
         return self._request(due)
 
     def press(self, key: str, reports: Reports) -> list[str]:
-        """Take a key: that of the step that is due confirms it; l lands whatever is due."""
+        """Take a key: the key of the step that is due confirms it; l lands at any step."""
         step = KEYS.get(key, '')
-        if step == 'land' and self._ending is None and 'land' not in self._pending and (
-                reports.value('mavlink_bridge', 'flying') != 'False'):
+        if self._ending is not None:
+            return []
+        if step == 'land' and 'land' not in self._pending and (
+                reports.value('mavlink_bridge', 'flying') != 'False'
+                or 'takeoff' in self._pending):
             self._landing = True
             return self._request('disengage', 'land')
         ready = step and step == self._question and not self._pending and not self._landing
-        return self._request(step) if ready and self._ending is None else []
+        return self._request(step) if ready else []
 
     def answer(self, step: str, success: bool, message: str, reports: Reports,
                now: float) -> list[str]:
-        """Take the answer to a request; a refusal leads to no next step."""
+        """Take the answer to a request; after a refusal no further step is requested."""
         self._pending.discard(step)
         self._answered, self._question = now, None
         self.lines.append(message)
@@ -186,15 +189,18 @@ class Flight:
             return self.end(1, reports)
         return []
 
-    def end(self, code: int, reports: Reports) -> list[str]:
+    def end(self, code: int, reports: Reports, insist: bool = True) -> list[str]:
         """
-        Brake and hand over, then end with an exit code; a second call ends at once.
+        Brake and hand over, then end with an exit code.
 
-        A vehicle that others fly keeps its mode: nothing is requested of the autopilot unless the
-        bridge sends setpoints, or a take-off or offboard was requested and is not answered yet.
+        The mode of the autopilot is left alone unless the bridge sends setpoints, or a take-off
+        or offboard was requested and is not answered yet: a pilot may be flying. A landing goes
+        on.
+
+        :param insist: whether a second call ends at once, without the answers.
         """
         if self._ending is not None:
-            self.code = self._ending
+            self.code = self._ending if insist else self.code
             return []
         climbs = self._pending & {'takeoff', 'offboard'}
         self._ending, self._pending = code, set()
@@ -212,7 +218,7 @@ class Flight:
         return list(steps)
 
     def _name(self, missing: list[str], reports: Reports) -> list[str]:
-        """Name the nodes that are missing, once; end where nothing was requested before."""
+        """Name the missing nodes, once; end if nothing was requested before."""
         if missing == self._missing:
             return []
         self._missing, self._question = missing, None

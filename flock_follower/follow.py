@@ -15,10 +15,10 @@
 """
 One command to follow: check, arm, take off, offboard, engage; a key confirms each step.
 
-``ros2 run flock_follower follow`` beside the running nodes. A line shows state, distance, reason
-and battery. A step that is refused prints the reason, and nothing goes on. The key l lands.
+Run ``ros2 run flock_follower follow`` beside the nodes. A line shows state, distance, reason and
+battery. If a step is refused, the reason is printed and the step stays due. The key l lands.
 Ctrl-C, SIGTERM and a closed terminal brake and hand over: the planner is disengaged, and the
-autopilot holds. The services stay as they are.
+autopilot holds.
 
 Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or, with ``--yes``, a step is
 refused.
@@ -59,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def verdict(seen: Observations) -> tuple[bool, str]:
-    """Return whether nothing keeps it from flying, and what ``check`` finds, in words."""
+    """Return whether ``check`` permits the flight, and its findings as text."""
     findings = judge_all(seen)
     return ready(findings), table(seen, findings, colours=sys.stdout.isatty())
 

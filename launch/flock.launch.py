@@ -20,15 +20,20 @@ leader is follower i - 1, that of the first one the scenario's. Arm, change to o
 engage from the last to the first: the first one flies off.
 """
 
+from pathlib import Path
+import runpy
+import sys
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.substitutions import FindPackageShare
+from launch.substitutions import LaunchConfiguration
+
+from flock_follower.parameters.launch_arguments import refuse_unknown
 
 MOST = 8  # each takes about one core
+EACH = {'namespace', 'target_system', 'connection'}  # every follower has its own
 ARGUMENTS = {
     'followers': ('2', f'how many, 1 to {MOST}'),
     'scenario': ('indoor', 'a name in config/scenarios, or the path of a .yaml file'),
@@ -42,8 +47,8 @@ def start(context: LaunchContext) -> list[Any]:
     said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     if not (said['followers'].isdigit() and 1 <= int(said['followers']) <= MOST):
         raise ValueError(f'followers = {said["followers"]!r}: must be an integer in [1, {MOST}]')
-    source = PythonLaunchDescriptionSource(PathJoinSubstitution(
-        [FindPackageShare('flock_follower'), 'launch', 'simulation.launch.py']))
+    source = PythonLaunchDescriptionSource(
+        str(Path(__file__).with_name('simulation.launch.py')))
     return [IncludeLaunchDescription(source, launch_arguments={
         'namespace': f'follower_{i}', 'system': str(i), 'scenario': said['scenario'],
         'seed': str(int(said['seed']) + i - 1), 'port': str(int(said['port']) + i - 1),
@@ -53,6 +58,8 @@ def start(context: LaunchContext) -> list[Any]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description."""
+    of_follower = runpy.run_path(str(Path(__file__).with_name('follower.launch.py')))['ARGUMENTS']
+    refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *(of_follower.keys() - EACH)})
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -16,10 +16,11 @@
 Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
 An argument left empty leaves its parameter as the parameter files have it. A node that ends is
-started again. The recipes beside this file include it with the topics and parameters of a camera
-and an odometry (docs/sensors.md).
+started again. camera.launch.py includes it with the topics and the mounting of a known camera and
+odometry (docs/sensors.md).
 """
 
+import sys
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
@@ -28,6 +29,8 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
+
+from flock_follower.parameters.launch_arguments import refuse_unknown
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic and service'),
@@ -117,6 +120,7 @@ def start(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description."""
+    refuse_unknown(sys.argv, __file__, ARGUMENTS)
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -18,6 +18,10 @@ Start a flight on the desk: the simulator, and the three nodes of a follower.
 The exit code is 1 if the simulator ends with an error, or because the machine is too busy.
 """
 
+from pathlib import Path
+import runpy
+import sys
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
@@ -29,11 +33,13 @@ from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
+from flock_follower.parameters.launch_arguments import refuse_unknown
+
+FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic and service'),
     'scenario': ('indoor', 'a name in config/scenarios, or the path of a .yaml file'),
@@ -53,6 +59,8 @@ def generate_launch_description() -> LaunchDescription:
     It hovers until ``mavlink_bridge/offboard`` and ``planner/engage`` are called, and ends with
     the scenario. Limits and band are those of ``config``, not of the scenario.
     """
+    of_follower = runpy.run_path(FOLLOWER)['ARGUMENTS'].keys() - {'connection', 'target_system'}
+    refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *of_follower})
     port = LaunchConfiguration('port')
     simulator = Node(
         package='flock_follower', executable='simulator', output='screen',
@@ -64,8 +72,7 @@ def generate_launch_description() -> LaunchDescription:
             'end_if_busy': True,
             'connection': ParameterValue(['127.0.0.1:', port], value_type=str)}])
     follower = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(PathJoinSubstitution(
-            [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
+        PythonLaunchDescriptionSource(FOLLOWER),
         launch_arguments={'namespace': LaunchConfiguration('namespace'),
                           'record': LaunchConfiguration('record'),
                           'target_system': LaunchConfiguration('system'),

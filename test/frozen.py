@@ -90,7 +90,7 @@ def flights(options: argparse.Namespace) -> Table:
 
 def _flown(name: str, runs: range) -> dict[str, list[float | str]]:
     measured = measure(fly(load(name), runs, guard=True))
-    columns = [getattr(measured, figure).tolist() for figure in FIGURES]
+    columns = [measured[figure].tolist() for figure in FIGURES]
     return {f'{name} run {run}': [*row] for run, row in zip(runs, zip(*columns))}
 
 

@@ -25,10 +25,8 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import contextmanager
 import math
-import os
 import signal
 import time
-from unittest import mock
 
 from builtin_interfaces.msg import Time
 import cv2
@@ -310,37 +308,11 @@ class NodeUnderFire:
 
 
 @contextmanager
-def silent_decoders():
-    """
-    Keep what libpng and libjpeg say of every broken image out of the log.
-
-    They write to the descriptor of stderr, past Python and OpenCV's own log level. For one thread
-    only: what others write to stderr in the meantime is lost, so no node in flight does it.
-    """
-    decode, nowhere, told = cv2.imdecode, os.open(os.devnull, os.O_WRONLY), os.dup(2)
-
-    def silently(*arguments):
-        os.dup2(nowhere, 2)
-        try:
-            return decode(*arguments)
-        finally:
-            os.dup2(told, 2)
-
-    try:
-        with mock.patch.object(cv2, 'imdecode', silently):
-            yield
-    finally:
-        os.close(nowhere)
-        os.close(told)
-
-
-@contextmanager
 def node_under_fire(kind, seed):
     """Make a node and take it down again; rclpy is initialised by whoever calls."""
     under_fire = NodeUnderFire(kind, seed)
     try:
-        with silent_decoders():
-            yield under_fire
+        yield under_fire
     finally:
         under_fire.close()
 

@@ -21,7 +21,7 @@ use. An argument that was given, or declared before, keeps its value in a file t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 import runpy
@@ -65,7 +65,7 @@ class DeclareLaunchArgument(NamedTuple):
 
 
 class PythonLaunchDescriptionSource(NamedTuple):
-    path: Any
+    path: str
 
 
 class IncludeLaunchDescription(NamedTuple):
@@ -85,10 +85,14 @@ class Node(NamedTuple):
     output: str
     namespace: str
     parameters: list[Any]
-    remappings: list[tuple[str, str]]
-    respawn: bool
-    respawn_delay: float
-    prefix: str | None
+    remappings: Sequence[tuple[str, str]] = ()
+    respawn: bool = False
+    respawn_delay: float = 0.0
+    prefix: str | None = None
+
+
+def ignored(*_: Any, **__: Any) -> None:
+    """Stand in for what acts only while nodes run."""
 
 
 def text(value: Any, context: Context) -> str:
@@ -103,7 +107,12 @@ def stand_ins() -> Iterator[None]:
         'launch.actions': {
             'DeclareLaunchArgument': DeclareLaunchArgument,
             'IncludeLaunchDescription': IncludeLaunchDescription,
-            'OpaqueFunction': OpaqueFunction},
+            'OpaqueFunction': OpaqueFunction,
+            'EmitEvent': ignored, 'RegisterEventHandler': ignored},
+        'launch.event_handlers': {'OnProcessExit': ignored},
+        'launch.events': {'Shutdown': ignored},
+        'launch.events.process': {'ProcessExited': ignored},
+        'launch_ros.parameter_descriptions': {'ParameterValue': ignored},
         'launch.launch_description_sources': {
             'PythonLaunchDescriptionSource': PythonLaunchDescriptionSource},
         'launch.substitutions': {'LaunchConfiguration': LaunchConfiguration,
@@ -134,10 +143,15 @@ def launched(file: str, **arguments: str) -> tuple[dict[str, Node], Context]:
 
 
 def _nodes(path: Path, context: Context) -> Iterator[Node]:
-    for entity in runpy.run_path(str(path))['generate_launch_description']():
-        if isinstance(entity, DeclareLaunchArgument):
-            context.setdefault(entity.name, text(entity.default_value, context))
+    entities = list(runpy.run_path(str(path))['generate_launch_description']())
+    while entities:
+        entity = entities.pop(0)
+        if isinstance(entity, Node):
+            yield entity
+        elif isinstance(entity, DeclareLaunchArgument):
+            if entity.default_value is not None:
+                context.setdefault(entity.name, text(entity.default_value, context))
         elif isinstance(entity, IncludeLaunchDescription):
-            yield from _nodes(Path(text(entity.source.path, context)), context)
+            yield from _nodes(Path(entity.source.path), context)
         else:
-            yield from entity.function(context)
+            entities[:0] = entity.function(context)

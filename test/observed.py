@@ -16,11 +16,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from flock_follower.checks.every_check import judge_all
+from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import (
     Machine,
     Observations,
@@ -41,6 +45,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
 )
+from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.parameters.files import read_parameters, TABLE
 from flock_follower.resources import resource
 
@@ -49,12 +54,44 @@ SECONDS = 5.0
 FOCAL = 600.0
 #: Where a leader stands, in odom, and the camera on base_link, m.
 LEADER, CAMERA = np.array([1.6, 1.3, 1.4]), np.array([0.10, 0.0, 0.0])
-CALIBRATION = {
-    'width': 640, 'height': 480, 'model': 'plumb_bob', 'd': [0.0] * 5,
-    'k': [FOCAL, 0.0, 320.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 1.0],
-    'p': [FOCAL, 0.0, 320.0, 0.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0],
-    'window': [0, 0, 640, 480, 1, 1]}
 COVARIANCE = [1e-4] * 12
+
+
+def vector(numbers: Any, names: str = 'xyz') -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip(names, numbers)))
+
+
+def calibration() -> SimpleNamespace:
+    """Return the CameraInfo of its camera."""
+    return SimpleNamespace(
+        width=640, height=480, distortion_model='plumb_bob', d=[0.0] * 5, binning_x=0, binning_y=0,
+        k=[FOCAL, 0.0, 320.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 1.0], p=[0.0] * 12,
+        roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0))
+
+
+def odometry_message(row: list[float]) -> SimpleNamespace:
+    """Return a row of :func:`odometry_rows` as a message."""
+    sec, nanosec = divmod(to_nanoseconds(row[1]), NANOSECONDS)
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id='odom', stamp=SimpleNamespace(sec=sec, nanosec=nanosec)),
+        child_frame_id='base_link',
+        pose=SimpleNamespace(
+            pose=SimpleNamespace(position=vector(row[2:5]), orientation=vector(row[5:9], 'xyzw')),
+            covariance=np.diag(row[15:21]).ravel()),
+        twist=SimpleNamespace(
+            twist=SimpleNamespace(linear=vector(row[9:12]), angular=vector(row[12:15])),
+            covariance=np.diag(row[21:27]).ravel()))
+
+
+@dataclass
+class Observed(Observations):
+    """Observations whose odometry is given as ``rows``, see :func:`odometry_rows`."""
+
+    rows: list[list[float]] = field(default_factory=list)
+
+    def judged(self) -> list[Finding]:
+        self.odometry = [(to_nanoseconds(row[0]), odometry_message(row)) for row in self.rows]
+        return judge_all(self)
 
 
 def attitude(time: float) -> Array:
@@ -80,7 +117,12 @@ def between(before: float, after: float) -> Array:
 
 
 def odometry_rows(rate: float = 50.0, late: float = 0.01) -> list[list[float]]:
-    """Return rows of its odometry as REP-105 wants it."""
+    """
+    Return its odometry as REP-105 wants it.
+
+    A row holds arrival, stamp, s; position (3), attitude (x, y, z, w), velocity (3), rates (3);
+    the variances of pose (6) and twist (6).
+    """
     rows = []
     for n in range(round(SECONDS * rate)):
         time = n / rate
@@ -127,7 +169,7 @@ def heard(rate: float, late: float) -> dict[str, Any]:
     return {'stamps': stamps, 'arrivals': [stamp + late for stamp in stamps]}
 
 
-def healthy(live: bool = True) -> Observations:
+def healthy(live: bool = True) -> Observed:
     """Return what is seen of a system, or of a bag, of which nothing is amiss."""
     names = names_there('', {})
     topics = {names[name]: TopicSeen([TopicEnd(sender if live else '', TYPES[name], *qos)],
@@ -150,11 +192,11 @@ def healthy(live: bool = True) -> Observations:
     parameters = read_parameters(resource('config/follower.yaml'), TABLE)
     if live:
         parameters = {node: {**own, 'use_sim_time': False} for node, own in parameters.items()}
-    return Observations(
+    return Observed(
         live=live, source='' if live else 'flight', duration=SECONDS, names=names, topics=topics,
         nodes=['/camera', '/vio', *(f'/{node}' for node in OURS)] if live else [],
-        parameters=parameters, odometry=rows, frames=[['odom', 'base_link']],
-        autopilot=[row[:] for row in rows], calibration=dict(CALIBRATION),
+        parameters=parameters, rows=rows, frames=[['odom', 'base_link']],
+        autopilot=[(row[1], np.array(row[5:9])) for row in rows], calibration=calibration(),
         dictionary='DICT_4X4_50', wanted_markers={0: 'leader'},
         pictures=[Picture(START + 0.4 * n, 640, 480, 'mono8', 307200, 120.0, 40.0, {0: 60.0})
                   for n in range(12)],

@@ -185,11 +185,20 @@ def test_ctrl_c_ends_what_is_under_way(step: str, vehicle: dict[str, str]) -> No
     assert desk.flight.code == 1
 
 
-def test_a_second_ctrl_c_does_not_wait_for_the_answer() -> None:
+def test_a_second_ctrl_c_ends_without_the_answer_and_a_second_hangup_does_not() -> None:
     desk = Desk(bridge='ACTIVE')
     desk.flight.end(INTERRUPTED, desk.reports)
+    assert desk.flight.end(INTERRUPTED, desk.reports, insist=False) == []
+    assert desk.flight.code is None
     assert desk.flight.end(INTERRUPTED, desk.reports) == []
     assert desk.flight.code == INTERRUPTED
+
+
+def test_l_ends_a_takeoff_before_the_vehicle_is_in_the_air() -> None:
+    desk = Desk(vehicle={**GROUND, 'armed': 'True'})
+    desk.until('takeoff')
+    assert desk.press('l') == []  # on the ground
+    assert desk.press('tl') == ['takeoff', 'disengage', 'land']
 
 
 def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None:

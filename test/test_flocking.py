@@ -128,11 +128,6 @@ def test_lyapunov_function_falls_strictly_to_the_reference(leaderless: Run) -> N
     assert np.all(np.diff(w) < 0.0)
 
 
-def test_mean_velocity_is_constant(leaderless: Run) -> None:
-    drift = leaderless.v.mean(axis=1) - leaderless.v[0].mean(axis=0)
-    assert np.max(np.abs(drift)) < 1e-12
-
-
 @pytest.mark.parametrize(('model', 'extremum', 'reference', 'digits'), [
     ('cucker_smale', np.min, 0.404997, 5e-7),
     ('cucker_dong', np.max, 21.984, 5e-4),
@@ -152,8 +147,8 @@ def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
         return u
 
     # Two runs, because no step may straddle the jump of the input.
-    first = runge_kutta(law(False), LEADER_FOLLOWER, 1.25, 0.0025)
-    second = runge_kutta(law(True), (first.x[-1], first.v[-1]), 8.75, 0.0025)
+    first = runge_kutta(law(False), LEADER_FOLLOWER, 1.25, 0.01)
+    second = runge_kutta(law(True), (first.x[-1], first.v[-1]), 8.75, 0.01)
     r2 = np.concatenate([first.r2, second.r2])
     assert r2.min() == pytest.approx(1.3976, abs=1e-4)
     assert r2.max() == pytest.approx(2.0049, abs=1e-4)
@@ -207,39 +202,18 @@ def assert_close(actual: Array, expected: Array, rounding: float = 0.0) -> None:
     assert actual == pytest.approx(expected, rel=1e-8, abs=limit)
 
 
-@given(flocks(), MODELS, st.tuples(*[st.floats(-100.0, 100.0)] * 3))
-def test_law_does_not_change_with_origin_or_a_common_velocity(
-        flock: tuple[Array, Array], model: Any, shift: tuple[float, float, float]) -> None:
+@given(flocks(), MODELS, st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+       st.randoms(use_true_random=False))
+def test_law_moves_turns_and_permutes_with_the_flock_and_sums_to_zero(
+        flock: tuple[Array, Array], model: Any, vector: tuple[float, float, float],
+        random: Any) -> None:
     x, v = flock
-    offset = np.array(shift[:x.shape[1]])
-    moved = accelerations(x + offset, v - offset, FLIGHT, model)
-    assert_close(moved, accelerations(x, v, FLIGHT, model), rounding(flock))
-
-
-@given(flocks(), MODELS, st.tuples(*[st.floats(-3.0, 3.0)] * 3))
-def test_law_turns_with_the_axes(flock: tuple[Array, Array], model: Any,
-                                 vector: tuple[float, float, float]) -> None:
-    x, v = flock
-    if x.shape[1] == 3:
-        rotation = rotation_vector_to_matrix(vector)
-    else:
-        rotation = rotation_vector_to_matrix([0.0, 0.0, vector[2]])[:2, :2]
-    turned = accelerations(x @ rotation.T, v @ rotation.T, FLIGHT, model)
-    assert_close(turned, accelerations(x, v, FLIGHT, model) @ rotation.T, rounding(flock))
-
-
-@given(flocks(), MODELS, st.randoms(use_true_random=False))
-def test_law_does_not_depend_on_the_order_of_agents(flock: tuple[Array, Array], model: Any,
-                                                    random: Any) -> None:
-    x, v = flock
-    order = random.sample(range(len(x)), len(x))
-    assert_close(accelerations(x[order], v[order], FLIGHT, model),
-                 accelerations(x, v, FLIGHT, model)[order])
-
-
-@given(flocks(), MODELS)
-def test_accelerations_sum_to_zero(flock: tuple[Array, Array], model: Any) -> None:
-    u = accelerations(*flock, FLIGHT, model)
+    n, order = x.shape[1], random.sample(range(len(x)), len(x))
+    rotation = rotation_vector_to_matrix(vector if n == 3 else [0.0, 0.0, vector[2]])[:n, :n]
+    offset, u = 30.0 * np.array(vector[:n]), accelerations(x, v, FLIGHT, model)
+    moved = accelerations((x[order] + offset) @ rotation.T, (v[order] - offset) @ rotation.T,
+                          FLIGHT, model)
+    assert_close(moved, u[order] @ rotation.T, 20.0 * rounding(flock))
     assert np.linalg.norm(u.sum(axis=0)) <= 1e-12 * (1.0 + np.sum(np.abs(u)))
 
 

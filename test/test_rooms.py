@@ -50,12 +50,12 @@ ROOMS = {
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
     'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'pipeline': ('flock mavlink messages perception planner', ''),
+    'follower': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
     'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
+    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink yaml'),
     'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
               'planner support visualization', 'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
@@ -63,19 +63,19 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'sensors': ('perception scenarios', 'numpy'),
-    'closed_loop': ('camera external flock mavlink messages pipeline planner scenarios sensors '
-                    'vehicles', 'numpy'),
-    'flocks': ('flock flocking', 'numba numpy scipy'),
-    'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
-             'parameters perception pipeline planner scenarios sensors',
+    'sensors': ('scenarios', 'numpy'),
+    'closed_loop': ('camera external flock follower mavlink messages odometry perception '
+                    'planner scenarios sensors vehicles', 'numpy'),
+    'flocks': ('flock flocking', 'numpy scipy'),
+    'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
+             'parameters perception planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
                    'mavlink messages nodes parameters perception planner runs scenarios '
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
-HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
+HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy'}  # not installed on a drone
 IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')
 
 

@@ -15,30 +15,39 @@
 """
 A rendered camera: a leader before its surroundings, through a distorting lens, onto a sensor.
 
-Poses spread over the exposure time give motion blur. Of the leader each is seen with several
-samples per pixel. The surroundings are cast for every image, which takes a tenth of a second, or,
-for flights in real time, seen as from one viewpoint: see ``panorama``. Everything else is the same
-for both. Pixel coordinates are OpenCV's: (0, 0) is the centre of the top-left pixel.
+The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
+everything but the leader is taken to be far away. Of the leader an image is the mean of poses
+spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
+centre of the top-left pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader_drawing import LeaderDrawing
-from flock_desk.camera.lens import Camera, Rays, Window
-from flock_desk.camera.panorama import PanoramaView
-from flock_desk.camera.scene import Image, Scenery, Surface
-from flock_desk.camera.surroundings import Surroundings
-from flock_follower.geometry import Array, Transform
+from flock_desk.camera.leader import Face, leader
+from flock_desk.camera.lens import Camera
+from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.resources import resource
 
-_FULL = 1.25  # share of the full well: the most light that is told apart from more
+Image = NDArray[np.float32]
+
+NEAR = 0.05  # m: nothing nearer to the camera is seen
+_SHIFT = 4  # bits behind the point in the corners of polygons
+_MARGIN = 2  # px around a body
+_TEXELS = 8  # per cell of a print; between two of them light changes linearly
+_CELL = 16  # px between the rays whose place in the panorama is computed
+_SKY = 0.60  # radiance of the panorama's largest value
+_SUN, _AMBIENT = np.array([-0.48, 0.36, 0.8]), 0.55  # direction; share of light from everywhere
+_FULL = 1.25  # share of the full well: more light than this saturates
 _SCALE = 65535 / _FULL  # of light in 16 bits
 _LEVEL_BITS, _DRAW_BITS = 11, 8  # levels of light, and quantiles of noise, in the table of both
 _SPREAD = 0.607  # px: of the lens's blur, 17 % of a pixel's light on either side
@@ -80,105 +89,220 @@ class Renderer:
     """
     Renders one leader before its surroundings.
 
-    :param leader: surfaces in the leader's body frame; none for an empty world.
+    :param body: the leader's faces.
+    :param seed: of the noise.
     :param fineness: its square is the number of samples of the leader per pixel and sub-pose.
-    :param prints: surfaces in the world that are drawn as the leader is.
-    :param viewpoint: a place (3,), m, from which the surroundings are taken to be seen always;
-        None: from where the camera is.
+    :param prints: bodies that stand still: faces in the frame of the body, and its pose.
     """
 
-    def __init__(self, camera: Camera, sensor: Sensor, scenery: Scenery,
-                 leader: Sequence[Surface] = (), seed: int = 1, *, fineness: int = 4,
-                 viewpoint: Array | None = None, prints: Sequence[Surface] = ()) -> None:
+    def __init__(self, camera: Camera, sensor: Sensor, body: Sequence[Face] | None = None,
+                 seed: int = 1, fineness: int = 4,
+                 prints: Sequence[tuple[Sequence[Face], Transform]] = ()) -> None:
         self.camera, self.sensor = camera, sensor
         self._seed = seed
-        rays = Rays(camera)
-        self._surroundings = (Surroundings(rays, scenery) if viewpoint is None
-                              else PanoramaView(camera, scenery, viewpoint))
-        self._sharp = viewpoint is None  # a panorama is out of focus as it is
-        self._leader = LeaderDrawing(rays, scenery, leader, fineness)
-        self._prints = [(each.pose.translation, LeaderDrawing(rays, scenery, [each], fineness))
-                        for each in prints]
-        fall = 1 + np.float32(sensor.vignetting) * (rays.x * rays.x + rays.y * rays.y)
-        self._exposed = np.float32(_SCALE * sensor.gain) / (fall * fall)
+        u, v = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
+        rays = np.dstack([*camera.rays(u, v), np.ones_like(u)]).astype(np.float32)
+        self._panorama = _Panorama(camera)
+        self._leader = _Drawing(camera, rays, leader() if body is None else body, fineness)
+        self._prints = [(_Drawing(camera, rays, faces, fineness), pose)
+                        for faces, pose in prints]
+        fall = 1.0 + sensor.vignetting * (rays[..., 0] ** 2 + rays[..., 1] ** 2)
+        self._exposed = (_SCALE * sensor.gain / fall ** 2).astype(np.float32)
         self._table = _noise_table(sensor)
 
     def image(self, index: int, cameras: Sequence[Transform], leaders: Sequence[Transform],
               light: Light | None = None) -> NDArray[np.uint8]:
         """
-        Return what the sensor gives: mono8, (height, width).
+        Return the image of the sensor: mono8, (height, width).
 
         :param index: number of the image: its noise depends on it and the seed alone.
         :param cameras: poses of the optical frame in the world, spread over the exposure.
         :param leaders: poses of the leader's body in the world at the same times; none at all
             leave it out.
         """
-        radiance, leader = self._radiance(cameras, leaders)
-        return self.develop(index, radiance, light, np.s_[:, :] if self._sharp else leader)
+        return self.develop(index, self.radiance(cameras, leaders), light)
 
     def radiance(self, cameras: Sequence[Transform], leaders: Sequence[Transform]) -> Image:
         """Return the light on the sensor (height, width) behind an ideal lens, without noise."""
-        return self._radiance(cameras, leaders)[0]
+        surroundings = self._panorama.seen(cameras[len(cameras) // 2].rotation)
+        total = np.zeros_like(surroundings)
+        for k, camera in enumerate(cameras):
+            image = surroundings.copy()
+            bodies = [*self._prints, *((self._leader, leader) for leader in leaders[k:k + 1])]
+            for drawing, pose in sorted(bodies, key=lambda each: -math.dist(
+                    each[1].translation, camera.translation)):
+                drawing.draw(image, camera, pose)
+            total += image
+        return total / np.float32(len(cameras))
 
-    def _radiance(self, cameras: Sequence[Transform],
-                  leaders: Sequence[Transform]) -> tuple[Image, Window]:
-        """Return the light, and the part of it that shows leader and prints."""
-        image = self._surroundings.seen(cameras)
-        drawings = [(place, drawing, [Transform()] * len(cameras))
-                    for place, drawing in self._prints]
-        if leaders:
-            drawings.append((leaders[0].translation, self._leader, [*leaders]))
-        eye, window = cameras[0].translation, np.s_[:0, :0]
-        for _, drawing, poses in sorted(
-                drawings, key=lambda each: -float(np.linalg.norm(each[0] - eye))):
-            seen = drawing.seen(cameras, poses)
-            if seen is not None:
-                image[seen.window] = seen.value + (1 - seen.cover) * image[seen.window]
-                window = _around(window, seen.window)
-        return image, window
-
-    def develop(self, index: int, radiance: Image, light: Light | None = None,
-                sharp: Window = np.s_[:, :]) -> NDArray[np.uint8]:
-        """
-        Return the image (height, width), mono8: vignetting, lens blur, noise, gamma.
-
-        :param sharp: the part that the lens has not blurred yet.
-        """
-        exposed = radiance * self._exposed
-        if light is not None:
-            exposed *= np.float32(light.gain)
-            exposed += np.float32(_SCALE * light.veil)
-        np.minimum(exposed, np.float32(65535), out=exposed)
-        code = exposed.astype(np.uint16)
-        if code[sharp].size:  # in integers OpenCV's blur is the same on every processor
-            code[sharp] = cv2.GaussianBlur(code[sharp], (3, 3), _SPREAD,
-                                           borderType=cv2.BORDER_REPLICATE)
-        code = code.astype(np.int32)
-        code >>= 16 - _LEVEL_BITS
-        code <<= _DRAW_BITS
+    def develop(self, index: int, radiance: Image,
+                light: Light | None = None) -> NDArray[np.uint8]:
+        """Return the image (height, width), mono8: vignetting, lens blur, noise, gamma."""
+        light = light or Light()
+        exposed = radiance * self._exposed * np.float32(light.gain)
+        exposed += np.float32(_SCALE * light.veil)
+        blurred = cv2.GaussianBlur(np.minimum(exposed, np.float32(65535)).astype(np.uint16),
+                                   (3, 3), _SPREAD, borderType=cv2.BORDER_REPLICATE)
+        code = blurred.astype(np.int32) >> (16 - _LEVEL_BITS) << _DRAW_BITS
         noise = np.random.default_rng([self._seed, index]).bytes(code.size)
         code |= np.frombuffer(noise, np.uint8).reshape(code.shape)
         return self._table.take(code, mode='clip')
-
-
-def _around(a: Window, b: Window) -> Window:
-    """Return the window around two, the first of which may be empty."""
-    if a[0].stop == 0:
-        return b
-    rows, columns = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b))
-    return rows, columns
 
 
 def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:
     """Return the pixel values (levels * draws,): of every level of light with every noise."""
     count, levels = 2 ** _DRAW_BITS, 2 ** _LEVEL_BITS
     draws = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
-    draws = (draws / np.sqrt(np.mean(draws * draws))).round(9)
+    draws /= np.sqrt(np.mean(draws * draws))
     light = ((np.arange(levels) + 0.5) * _FULL / levels)[:, None]
     read = sensor.read_noise / sensor.full_well
     noisy = light + draws * np.sqrt(light / sensor.full_well + read * read)
     return np.rint(255.0 * np.clip(noisy, 0.0, 1.0) ** (1.0 / sensor.gamma)).astype(
         np.uint8).ravel()
+
+
+class _Panorama:
+    """
+    The surroundings in all directions, from config/panorama.jpg.
+
+    A row is an elevation, a column an azimuth, anticlockwise seen from above; the first and last
+    row are repeated up to the zenith and down to the nadir.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        stored: Any = cv2.imread(str(resource('config/panorama.jpg')), cv2.IMREAD_GRAYSCALE)
+        self._light = (_SKY * (stored / 255.0) ** 2.2).astype(np.float32)
+        self._shape = camera.height, camera.width
+        # Middles of cells, from one cell before the image to one behind it.
+        u, v = np.meshgrid(*(np.arange(-0.5 - _CELL / 2, size + _CELL, _CELL)
+                             for size in (camera.width, camera.height)))
+        self._rays = np.stack([*camera.rays(u, v), np.ones_like(u)])
+
+    def seen(self, rotation: Array) -> Image:
+        """Return the light (height, width) of a camera whose axes ``rotation`` takes to ENU."""
+        rows, columns = self._light.shape
+        per_rad = columns / (2.0 * math.pi)
+        heading = math.atan2(rotation[1, 2], rotation[0, 2])
+        ahead, left, up = np.tensordot(
+            rotation_vector_to_matrix([0.0, 0.0, -heading]) @ rotation, self._rays, 1)
+        column = per_rad * (np.arctan2(left, ahead) + heading)
+        row = (rows - 1) / 2.0 - per_rad * np.arctan2(up, np.hypot(ahead, left))
+        places = cv2.resize(np.dstack([column, np.clip(row, 0.0, rows - 1.0)]).astype(np.float32),
+                            None, fx=_CELL // 2, fy=_CELL // 2, interpolation=cv2.INTER_LINEAR)
+        # Every other pixel is enough: the panorama is coarser than most cameras.
+        seen = cv2.remap(self._light, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        full: Image = cv2.resize(seen, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+        return full[_CELL:_CELL + self._shape[0], _CELL:_CELL + self._shape[1]]
+
+
+class _Window(NamedTuple):
+    """A part of an image, with first and last + 1 column and row."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def around(self, pixels: Array) -> _Window:
+        """Return the part of it that holds pixels (n, 2)."""
+        low = np.floor(pixels.min(axis=0)).astype(int) - _MARGIN
+        high = np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN
+        return _Window(max(low[0], self.left), max(low[1], self.top),
+                       min(high[0], self.right), min(high[1], self.bottom))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return width and height."""
+        return max(self.right - self.left, 0), max(self.bottom - self.top, 0)
+
+    def of(self, image: Image, n: int = 1, left: int = 0, top: int = 0) -> Image:
+        """Return this part of an image that begins at (left, top), with n samples per pixel."""
+        return image[n * (self.top - top):n * (self.bottom - top),
+                     n * (self.left - left):n * (self.right - left)]
+
+
+class _Drawing:
+    """Draws one body: polygons, farther ones first, and prints as cast rays show them."""
+
+    def __init__(self, camera: Camera, rays: Image, faces: Sequence[Face], n: int) -> None:
+        self._camera, self._rays, self._faces, self._n = camera, rays, faces, n
+        self._starts = np.cumsum([0, *(len(face.outline) for face in faces[:-1])])
+        self._points = np.concatenate([face.outline for face in faces])
+        self._normals, self._middles = (
+            np.array([getattr(face, name) for face in faces]) for name in ('normal', 'middle'))
+        # Of the plane of each face above the middle of its box, m.
+        self._heights = np.sum(
+            self._normals * (self._points[self._starts] - self._middles), axis=1)
+        self._two_sided = np.array([face.opacity < 1.0 for face in faces])
+        self._textures = [None if face.cells is None else _texture(face.cells) for face in faces]
+
+    def draw(self, image: Image, camera: Transform, body: Transform) -> None:
+        """Draw the body on light (height, width); poses of the optical frame and the body."""
+        n, pose = self._n, camera.inverse() @ body
+        points = pose.apply(self._points)
+        ahead = points[:, 2] > NEAR
+        whole = _Window(0, 0, self._camera.width, self._camera.height)
+        if not ahead.any():
+            return
+        pixels = self._camera.project(np.where(ahead[:, None], points, 1.0))
+        window = whole.around(pixels[ahead])
+        if not all(window.size):
+            return
+        fine = np.zeros((n * window.size[1], n * window.size[0], 2), np.float32)
+        light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(
+            self._normals @ body.rotation.T @ _SUN, 0.0)
+        # The centre of a sample lies half a sample from the edge of its pixel.
+        corners = np.rint((((pixels - window[:2]) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
+        eye = pose.inverse().translation
+        shown = np.logical_and.reduceat(ahead, self._starts) & (
+            self._two_sided | (np.sum(self._normals * (eye - self._middles), axis=1)
+                               > self._heights))
+        for k in np.argsort(-np.linalg.norm(self._middles - eye, axis=1), kind='stable'):
+            if not shown[k]:
+                continue
+            face, texture = self._faces[k], self._textures[k]
+            part = slice(self._starts[k], self._starts[k] + len(face.outline))
+            colour = light[k] * face.value, 1.0
+            if texture is None and face.opacity == 1.0:
+                cv2.fillConvexPoly(fine, corners[part], colour, shift=_SHIFT)
+                continue
+            inner = window.around(pixels[part])
+            if not all(inner.size):
+                continue
+            if texture is not None:
+                self._print(fine, window, inner, points[part],
+                            texture * np.array([light[k], 1.0], np.float32))
+                continue
+            behind = inner.of(fine, n, window.left, window.top)
+            painted = behind.copy()
+            offset = n * 2 ** _SHIFT * np.subtract(inner[:2], window[:2], dtype=np.int32)
+            cv2.fillConvexPoly(painted, corners[part] - offset, colour, shift=_SHIFT)
+            behind += np.float32(face.opacity) * (painted - behind)
+        drawn = cv2.resize(fine, window.size, interpolation=cv2.INTER_AREA)
+        seen = window.of(image)
+        seen[:] = drawn[..., 0] + (1.0 - drawn[..., 1]) * seen
+
+    def _print(self, fine: Image, window: _Window, inner: _Window, corners: Array,
+               texture: Image) -> None:
+        """Draw a print whose corners (4, 3) are in the optical frame, on light and cover."""
+        # A ray meets the plane of the print at corner 0 + s (1 - 0) + t (3 - 0), in shares s, t.
+        # Texels are at places / nearness.
+        to_print = np.linalg.inv(np.stack(
+            [corners[1] - corners[0], corners[3] - corners[0], corners[0]], axis=1))
+        to_print[:2] *= np.reshape(texture.shape[1::-1], (2, 1))
+        column, row, nearness = cv2.split(cv2.transform(inner.of(self._rays), to_print))
+        nearness, n = np.maximum(nearness, np.float32(1e-3)), self._n
+        places = cv2.resize(cv2.merge([column / nearness, row / nearness]) - np.float32(0.5),
+                            None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
+        part = inner.of(fine, n, window.left, window.top)
+        seen = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderValue=0)
+        part[:] = seen + (1.0 - seen[..., 1:]) * part
+
+
+def _texture(cells: Array) -> Image:
+    """Return light and cover (rows, columns, 2) of the cells of a print."""
+    fine = np.kron(cells, np.ones((_TEXELS, _TEXELS)))
+    return np.dstack([fine, np.ones_like(fine)]).astype(np.float32)
 
 
 def render_in_one_thread() -> None:

@@ -13,15 +13,16 @@
 # limitations under the License.
 
 """
-How well flights went, from what really happened in them: every measure is defined here.
+How well flights went: the figures of each run from engaging on, and of all runs of a scenario.
 
-Each is taken run by run, from engaging on; ``summary`` puts the runs of a scenario together.
+All is true, not estimated. A row of ``measure`` is a follower. Of a flock, ``of_runs`` puts the
+rows of its followers together run by run: the worst of them if safety or a share of runs asks for
+that, else the mean. One that fails is left out: its effect on the others is in their figures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -29,58 +30,70 @@ import numpy as np
 
 from flock_desk.closed_loop.flights_log import Flights, STATES
 from flock_follower.geometry import Array
+from flock_follower.planner.modes import State
 
 FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
+LOST_AFTER = 5.0  # s without following at the end of a flight, and it counts as lost
+STRAYED = 1.25  # times the far edge of the band: with nobody that near it is lost, too
+
+Measures = dict[str, Array]
+"""Figures by name, (n,) each."""
+Reduction = Callable[..., Any]
 
 
-@dataclass(frozen=True)
-class RunMetrics:
-    """Measures of n runs, (n,) each."""
+class Figure(NamedTuple):
+    """A figure of a scenario: of which measure, and over runs and over the followers of one."""
 
-    in_band: Array
-    """1 where sqrt(d0) < r < sqrt(d1) throughout, else 0."""
-    min_separation: Array
-    """Least distance, m."""
-    max_separation: Array
-    """Greatest distance, m."""
-    out_of_band: Array
-    """Time out of the band, s."""
-    time_in_band: Array
-    """Share of the time in the band."""
-    guard_active: Array
-    """Share of the planner's ticks in which the guard altered the command."""
-    jerk: Array
-    """Root mean square of the commanded acceleration's change from tick to tick, m/s^3."""
-    tracking_error: Array
-    """Root mean square of r - sqrt((d0 + d1) / 2), m."""
-    velocity_error: Array
-    """Root mean square of |v_F - v_L|, m/s."""
-    in_sight: Array
-    """Share of the time in which the camera has the marker in view, from its front."""
-    out_of_sight: Array
-    """Longest time in which it has not, in whole ticks, s; what hides the marker counts not."""
-    detection_gap: Array
-    """Longest time without an image that showed the leader, in whole ticks, s."""
-    final_distance: Array
-    """Mean distance over the last 20 s, m."""
-    max_speed: Array
-    """Greatest speed of the follower while it flies setpoints, m/s."""
-    speed_share: Array
-    """The same as a share of v_max."""
-    handover_altitude: Array
-    """Greatest change of altitude in the second after the vehicle begins to fly setpoints, m."""
-    handover_climb: Array
-    """Greatest vertical speed while it flies setpoints, from a second after that on, m/s."""
-    altitude_change: Array
-    """Greatest change of altitude while the vehicle flies setpoints, m."""
-    unasked_setpoints: Array
-    """Setpoints that left though nobody had called offboard."""
+    measure: str
+    over_runs: Reduction
+    over_followers: Reduction = np.mean
 
 
-def measure(flights: Flights) -> RunMetrics:
-    """Return the measures of every run."""
+def _rms(values: Array, axis: int | None = None) -> Any:
+    return np.sqrt(np.mean(values ** 2, axis=axis))
+
+
+#: By key of flights.json; the last ones are of flocks.
+FIGURES = {
+    'in_band': Figure('in_band', np.mean, np.min),  # sqrt(d0) < r < sqrt(d1) throughout
+    'min_separation_m': Figure('min_separation', np.min, np.min),
+    'max_separation_m': Figure('max_separation', np.max, np.max),
+    'out_of_band_s': Figure('out_of_band', np.mean, np.max),
+    'time_in_band': Figure('time_in_band', np.mean),  # a share, as the next
+    'time_in_sight': Figure('in_sight', np.mean),  # the marker in view, from its front
+    # In whole ticks; what hides the marker does not count.
+    'longest_out_of_sight_s': Figure('out_of_sight', np.max, np.max),
+    'guard_active': Figure('guard_active', np.mean),  # share of ticks with an altered command
+    'jerk_m_s3': Figure('jerk', np.mean),  # RMS of the command's change from tick to tick
+    'tracking_error_m': Figure('tracking_error', np.mean),  # RMS of r - sqrt((d0 + d1) / 2)
+    'velocity_error_m_s': Figure('velocity_error', np.mean),  # RMS of |v_F - v_L|
+    # Without an image that showed the leader, in whole ticks.
+    'longest_detection_gap_s': Figure('detection_gap', np.max, np.max),
+    'final_distance_m': Figure('final_distance', np.mean),
+    'final_distance_lowest_m': Figure('final_distance', np.min),
+    'final_distance_highest_m': Figure('final_distance', np.max),
+    # From here on while the vehicle flies setpoints.
+    'max_speed_m_s': Figure('max_speed', np.max, np.max),
+    'max_speed_share': Figure('speed_share', np.max, np.max),  # of v_max
+    'too_fast': Figure('speed_share', lambda share: (share > TOO_FAST).mean(), np.max),
+    # In the first second; afterwards; and the change of altitude in the whole time.
+    'handover_altitude_m': Figure('handover_altitude', np.max, np.max),
+    'handover_climb_m_s': Figure('handover_climb', np.max, np.max),
+    'altitude_change_m': Figure('altitude_change', np.max, np.max),
+    'unasked_setpoints': Figure('unasked_setpoints', np.sum, np.sum),  # without an offboard call
+    # Followers that do not follow at the end, or that no chain of near ones links to the leader.
+    'lost_for_good': Figure('lost', np.sum),
+    'rms_acceleration_m_s2': Figure('rms_acceleration', _rms),
+    'time_tracking': Figure('tracking', np.mean),  # share in TRACK
+    'edges': Figure('edges', np.mean),  # how many each follows
+    'neighbors_in_sight': Figure('shown', np.mean),  # of all others, each
+}
+
+
+def measure(flights: Flights) -> Measures:
+    """Return the measures of every row."""
     band = flights.scenario.flight
     distance = np.linalg.norm(flights.leader - flights.follower, axis=2)
     period = float(flights.times[1] - flights.times[0])
@@ -89,25 +102,57 @@ def measure(flights: Flights) -> RunMetrics:
         flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])])
     fastest = (np.linalg.norm(flights.velocity, axis=2) * flights.obeying).max(axis=1)
     steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
-    return RunMetrics(
-        in_band=(flights.outside.sum(axis=1) == 0.0).astype(float),
-        min_separation=flights.nearest.min(axis=1),
-        max_separation=flights.farthest.max(axis=1),
-        out_of_band=flights.outside.sum(axis=1),
-        time_in_band=1.0 - flights.outside.sum(axis=1) / (period * len(flights.times)),
-        guard_active=flights.guarded.mean(axis=1),
-        jerk=np.sqrt(np.nanmean(steps ** 2, axis=1)),
-        tracking_error=_rms(distance - middle),
-        velocity_error=_rms(np.linalg.norm(
-            flights.velocity - flights.leader_velocity, axis=2)),
-        in_sight=flights.in_sight.mean(axis=1),
-        out_of_sight=np.array([period * _longest(~seen) for seen in flights.in_sight]),
-        detection_gap=np.array([period * _longest(~seen) for seen in flights.seen]),
-        final_distance=distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
-        max_speed=fastest, speed_share=fastest / band.v_max,
-        handover_altitude=handovers[:, 0], handover_climb=handovers[:, 1],
-        altitude_change=handovers[:, 2],
-        unasked_setpoints=flights.unasked[:, -1].astype(float))
+    outside = flights.outside.sum(axis=1)
+    return {
+        'in_band': (outside == 0.0).astype(float),
+        'min_separation': flights.nearest.min(axis=1),
+        'max_separation': flights.farthest.max(axis=1),
+        'out_of_band': outside,
+        'time_in_band': 1.0 - outside / (period * len(flights.times)),
+        'guard_active': flights.guarded.mean(axis=1),
+        'jerk': np.sqrt(np.nanmean(steps ** 2, axis=1)),
+        'tracking_error': _rms(distance - middle, axis=1),
+        'velocity_error': _rms(np.linalg.norm(
+            flights.velocity - flights.leader_velocity, axis=2), axis=1),
+        'in_sight': flights.in_sight.mean(axis=1),
+        'out_of_sight': np.array([period * _longest(~seen) for seen in flights.in_sight]),
+        'detection_gap': np.array([period * _longest(~seen) for seen in flights.seen]),
+        'final_distance': distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
+        'max_speed': fastest, 'speed_share': fastest / band.v_max,
+        'handover_altitude': handovers[:, 0], 'handover_climb': handovers[:, 1],
+        'altitude_change': handovers[:, 2],
+        'unasked_setpoints': flights.unasked[:, -1].astype(float)}
+
+
+def of_runs(rows: Measures, flights: Flights) -> Measures:
+    """Return the measures of the runs of a flock, of those of its followers, and some more."""
+    kept = _kept(flights)
+    by_run = len(flights.positions), -1
+    tracking = flights.state == STATES.index(State.TRACK)
+    squares = np.nanmean(np.sum(flights.command ** 2, axis=2), axis=1)
+    rows = {**rows, 'tracking': tracking.mean(axis=1), 'edges': flights.edges.mean(axis=1),
+            'shown': flights.shown.mean(axis=1), 'squares': squares}
+    reductions = {figure.measure: figure.over_followers for figure in FIGURES.values()}
+    runs = {name: reductions.get(name, np.mean)(values.reshape(by_run)[:, kept], axis=1)
+            for name, values in rows.items()}
+    late = flights.times > flights.times[-1] - LOST_AFTER
+    strayed = np.stack([_strayed(positions[-1], flights) for positions in flights.positions])
+    lost = ~tracking[:, late].any(axis=1).reshape(by_run) | strayed
+    runs['lost'] = lost[:, kept].sum(axis=1).astype(float)
+    runs['rms_acceleration'] = np.sqrt(runs.pop('squares'))
+    return runs
+
+
+def joined(parts: Sequence[Measures]) -> Measures:
+    """Return the measures of all runs of several parts, in their order."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def summary(runs: Measures) -> dict[str, float]:
+    """Return the figures of a scenario: extremes if safety asks for them, else means."""
+    return {'runs': len(runs['in_band']), **{
+        key: float(figure.over_runs(runs[figure.measure]))
+        for key, figure in FIGURES.items() if figure.measure in runs}}
 
 
 class BandExit(NamedTuple):
@@ -148,41 +193,6 @@ def band_exits(flights: Flights) -> list[BandExit]:
     return exits
 
 
-def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
-    """Return the measures of all runs of several parts, in their order."""
-    return RunMetrics(*(np.concatenate([getattr(part, f.name) for part in parts])
-                        for f in fields(RunMetrics)))
-
-
-def summary(runs: RunMetrics) -> dict[str, float]:
-    """Return the measures of a scenario: extremes where safety asks for them, else means."""
-    return {
-        'runs': len(runs.in_band),
-        'in_band': float(runs.in_band.mean()),
-        'min_separation_m': float(runs.min_separation.min()),
-        'max_separation_m': float(runs.max_separation.max()),
-        'out_of_band_s': float(runs.out_of_band.mean()),
-        'time_in_band': float(runs.time_in_band.mean()),
-        'time_in_sight': float(runs.in_sight.mean()),
-        'longest_out_of_sight_s': float(runs.out_of_sight.max()),
-        'guard_active': float(runs.guard_active.mean()),
-        'jerk_m_s3': float(runs.jerk.mean()),
-        'tracking_error_m': float(runs.tracking_error.mean()),
-        'velocity_error_m_s': float(runs.velocity_error.mean()),
-        'longest_detection_gap_s': float(runs.detection_gap.max()),
-        'final_distance_m': float(runs.final_distance.mean()),
-        'final_distance_lowest_m': float(runs.final_distance.min()),
-        'final_distance_highest_m': float(runs.final_distance.max()),
-        'max_speed_m_s': float(runs.max_speed.max()),
-        'max_speed_share': float(runs.speed_share.max()),
-        'too_fast': float((runs.speed_share > TOO_FAST).mean()),
-        'handover_altitude_m': float(runs.handover_altitude.max()),
-        'handover_climb_m_s': float(runs.handover_climb.max()),
-        'altitude_change_m': float(runs.altitude_change.max()),
-        'unasked_setpoints': float(runs.unasked_setpoints.sum()),
-    }
-
-
 def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float, float]:
     """
     Return the greatest of all handovers of a run, (k,) each.
@@ -200,11 +210,25 @@ def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float,
     return early, late, change
 
 
-def _rms(values: Array) -> Array:
-    return np.sqrt(np.mean(values ** 2, axis=1))
-
-
 def _longest(missing: Array) -> int:
     """Return the greatest number of True in a row."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int)))
     return int(np.max(edges[1::2] - edges[::2], initial=0))
+
+
+def _kept(flights: Flights) -> Any:
+    """Return which followers count (m,): all but the one that fails."""
+    flock = flights.scenario.company
+    return np.array([flock.fails is None or flock.fails.follower != number
+                     for number in range(1, flock.followers + 1)])
+
+
+def _strayed(positions: Array, flights: Flights) -> Any:
+    """Return which followers (m,) nobody leads to from the leader; positions (m + 1, 3), m."""
+    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
+    near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
+    near &= np.append(True, _kept(flights))  # a failed follower leads no other
+    reached = np.arange(len(positions)) == 0
+    for _ in positions:
+        reached = reached | near[:, reached].any(axis=1)
+    return ~reached[1:]

@@ -13,21 +13,17 @@
 # limitations under the License.
 
 """
-The leader of a real-time flight: on the scenario's course, or flown by an autopilot elsewhere.
+The leader of a real-time flight: on the scenario's course, or flown by an external autopilot.
 
-A flight asks where it is at times that are integer nanoseconds since the flight's start, and s of
-the scenario, see ``scenario_run``.
+Times are integer nanoseconds since the flight's start, and s of the scenario (``scenario_run``).
 """
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
-from flock_desk.closed_loop.flown_vehicle import NO_COVARIANCE
 from flock_desk.closed_loop.scenario_run import ScenarioRun
-from flock_desk.external.told_motion import ExternalMotion, LONGEST_GAP
+from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP
 from flock_desk.sensors.vio import Odometry
 from flock_follower.geometry import (
     Array,
@@ -39,28 +35,12 @@ from flock_follower.geometry import (
 )
 
 
-class FlownLeader(Protocol):
-    """What a flight needs of a leader; poses and motions are None where there is none."""
-
-    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Take where the follower is, and whether it obeys the bridge's setpoints."""
-
-    def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return its true pose."""
-
-    def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return its true motion, without covariances."""
-
-    def knows(self, time_ns: int) -> bool:
-        """Return whether the motion at a time is known, not bridged over or yet to come."""
-
-
 class ScenarioLeader:
     """
-    A leader that flies as the scenario says.
+    A leader on the scenario's course; pose and motion are None before it appears.
 
-    :param in_place: whether the follower starts where the scenario has it; else the scenario is
-        moved to its place, height and heading as soon as it is in offboard mode.
+    :param in_place: whether the follower starts at the scenario's place; else the scenario is
+        moved to its place, height and heading once it is in offboard mode.
     """
 
     def __init__(self, scenario: ScenarioRun, in_place: bool) -> None:
@@ -100,7 +80,7 @@ class ScenarioLeader:
 
 class ExternalLeader:
     """
-    A leader that an autopilot elsewhere flies: it is where that says.
+    A leader that an external autopilot flies and reports.
 
     :param motion: with the same ``origin`` as the follower's.
     :param start_ns: time zero of the flight on the clock of ``motion``.
@@ -111,24 +91,27 @@ class ExternalLeader:
         self._motion, self._start_ns, self._origin = motion, start_ns, origin
 
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Do nothing: whoever flies it does."""
+        """Do nothing: it flies by itself."""
 
     def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return the pose that was told; of a moment that is to come yet, the newest one."""
+        """Return the reported pose; of a future moment, the newest one."""
         leader = self.motion(time_ns, time)
         return None if leader is None else Transform(
             quaternion_to_matrix(leader.quaternion), leader.position)
 
     def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the motion that was told, likewise; None once its poses stall."""
+        """Return the reported motion, likewise; None once its poses stall."""
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > LONGEST_GAP:
             return None
         leader = self._motion.at(at)
         return Odometry(time, self._origin + leader.position, leader.quaternion,
                         quaternion_to_matrix(leader.quaternion).T @ leader.velocity,
-                        leader.angular, NO_COVARIANCE, NO_COVARIANCE)
+                        leader.angular)
 
     def knows(self, time_ns: int) -> bool:
-        """Return whether poses were told shortly before and after."""
+        """Return whether poses were reported shortly before and after."""
         return self._motion.knows(self._start_ns + time_ns)
+
+
+FlownLeader = ScenarioLeader | ExternalLeader

@@ -13,18 +13,18 @@
 # limitations under the License.
 
 """
-The vehicle of a real-time flight: flown by the embedded autopilot, or by one that runs elsewhere.
+The vehicle of a real-time flight: flown by the embedded autopilot, or by an external one.
 
-A flight asks for its motion at every step; times are integer nanoseconds since the flight's start.
+Times are integer nanoseconds since the flight's start.
 """
 
 from __future__ import annotations
 
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
-from flock_desk.external.told_motion import ExternalMotion
+from flock_desk.external.external_motion import ExternalMotion
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.flight_log import FlightLog
@@ -38,37 +38,29 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 
-NO_COVARIANCE = np.zeros((6, 6))
-
-
-class FlownVehicle(Protocol):
-    """What a flight needs of a vehicle."""
-
-    in_place: bool
-    """Whether it is where the scenario has it; else the scenario comes to where it is."""
-    log: FlightLog
-    """The setpoints it got, where that is known, and its motion."""
-
-    @property
-    def offboard(self) -> bool:
-        """Return whether it obeys the bridge's setpoints."""
-
-    def step(self, time_ns: int) -> Odometry:
-        """Return the true motion, without covariances, a step after that returned before."""
-
-    def knows(self, time_ns: int) -> bool:
-        """Return whether the motion at a time of the last 0.3 s is known, not bridged over."""
-
-    def blow(self, wind: Array) -> None:
-        """Let the air move with a velocity (3,), m/s, from now on."""
-
-
 #: Set up as config/px4.params recommends, where PX4's defaults are others.
 RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,
                       'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 
 
-class EmbeddedVehicle:
+class _Flown:
+    """The vehicle of a flight: its motion, step by step."""
+
+    in_place: bool
+    """Whether it is where the scenario has it; else the scenario comes to where it is."""
+    log: FlightLog
+    """The setpoints it got, if that is known, and its motion."""
+    _rotation: Array
+
+    def _moved(self, time_ns: int, position: Array, velocity: Array, rotation: Array) -> Odometry:
+        """Return the motion; the rates are those of the attitude since the step before."""
+        before, self._rotation = self._rotation, rotation
+        return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
+                        rotation.T @ velocity,
+                        matrix_to_rotation_vector(before.T @ rotation) / STEP)
+
+
+class EmbeddedVehicle(_Flown):
     """
     The vehicle of an embedded PX4, which is stepped before each step here.
 
@@ -87,43 +79,38 @@ class EmbeddedVehicle:
 
     @property
     def offboard(self) -> bool:
-        """Return whether its mode is OFFBOARD."""
+        """Return whether its mode is OFFBOARD: it obeys the bridge's setpoints."""
         return self.autopilot.controller.mode == OFFBOARD
 
     def step(self, time_ns: int) -> Odometry:
-        """Return the simulated motion."""
+        """Return the true motion, without covariances, a step after that returned before."""
         vehicle = self.autopilot.vehicle
-        before, rotation = self._rotation, vehicle.rotation
-        self._rotation = rotation
-        return Odometry(time_ns * 1e-9, vehicle.position, matrix_to_quaternion(rotation),
-                        rotation.T @ vehicle.velocity,
-                        matrix_to_rotation_vector(before.T @ rotation) / STEP,
-                        NO_COVARIANCE, NO_COVARIANCE)
+        return self._moved(time_ns, vehicle.position, vehicle.velocity, vehicle.rotation)
 
     def knows(self, time_ns: int) -> bool:
         """Return True."""
         return True
 
     def blow(self, wind: Array) -> None:
-        """Let the wind blow."""
+        """Let the air move with a velocity (3,), m/s, from now on."""
         self.autopilot.controller.wind = wind
 
 
-class ExternalVehicle:
+class ExternalVehicle(_Flown):
     """
-    The vehicle of an autopilot elsewhere, in the ENU frame of that.
+    The vehicle of an external autopilot, in the ENU frame of that.
 
     :param start_ns: time zero of the flight on the clock of ``motion``.
-    :param height: m, of the place where it was first heard of above the ground.
+    :param height: m above the ground, of its first reported place.
     """
 
     in_place = False
 
     def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
         self.offboard = False
-        """Whether it obeys the bridge's setpoints, as the bridge says; its owner sets it."""
+        """Whether it obeys the bridge's setpoints, by the bridge's state; its owner sets it."""
         self.armed, self.mode = False, ''
-        """Likewise, as HEARTBEAT says; for the log."""
+        """Likewise, by its HEARTBEAT; for the log."""
         self.log = FlightLog()
         self._motion, self._start_ns = motion, start_ns
         self.origin = np.array([0.0, 0.0, height])
@@ -131,23 +118,22 @@ class ExternalVehicle:
         self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
-        """Return the motion that was told, interpolated."""
+        """Return the reported motion, interpolated."""
         motion = self._motion.at(self._start_ns + time_ns)
-        before, rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
-        self._rotation = rotation
         position = self.origin + motion.position
         self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
                        np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
                        self.mode)
-        # Not the rates told: poses count as of when they came, unevenly, and the camera sees that.
-        return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
-                        rotation.T @ motion.velocity,
-                        matrix_to_rotation_vector(before.T @ rotation) / STEP,
-                        NO_COVARIANCE, NO_COVARIANCE)
+        # Not the reported rates: poses arrive unevenly, and the camera sees that.
+        return self._moved(time_ns, position, motion.velocity,
+                           quaternion_to_matrix(motion.quaternion))
 
     def knows(self, time_ns: int) -> bool:
-        """Return whether poses were told shortly before and after."""
+        """Return whether poses were reported shortly before and after a time of the last 0.3 s."""
         return self._motion.knows(self._start_ns + time_ns)
 
     def blow(self, wind: Array) -> None:
-        """Do nothing: the wind is that of whoever simulates the vehicle."""
+        """Do nothing: the external simulator has its own wind."""
+
+
+FlownVehicle = EmbeddedVehicle | ExternalVehicle

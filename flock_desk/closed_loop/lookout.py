@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the perception of simulated followers makes of the vehicles around them, image by image.
+The perception of simulated followers, image by image: visibility and noise, and the real filters.
 
 Every follower is a row, of n runs with m followers each: run by run, in the order of their
 numbers. Each looks for m others: the leader first, then the other followers by their numbers.
@@ -21,32 +21,42 @@ numbers. Each looks for m others: the leader first, then the other followers by 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import Flock, LEADER
-from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.sensing import (
     facing,
-    Filters,
     hidden,
     in_view,
     PerceptionNoise,
     relative_noise,
 )
 from flock_desk.sensors.vio import GaussMarkov, turned, Vio
-from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
+from flock_follower.geometry import (
+    Array,
+    IDENTITY_QUATERNION,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    Transform,
+)
 from flock_follower.messages import duplicate_name
+from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
+from flock_follower.perception.neighbor_motion import Estimate, POSITION, VELOCITY
+from flock_follower.perception.range_tracking import PlacedRange, RangeSeries, RangingParams
 
 IMAGE_STEPS = 4
 BODY = 0.25  # m: radius of a vehicle that stands in the way of a view
-YAW_NOISE = 0.02  # rad: of the yaw that an image tells of a vehicle
+YAW_NOISE = 0.02  # rad: of a vehicle's yaw measured in an image
 ASKEW = 0.02  # rad: by which its markers hang
+_USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
+_CENTRE = np.zeros(3)
 _STILL, _STANDING = np.zeros(3), 1e-4 * np.eye(3)  # m/s, and its covariance: of a print
 
 
@@ -64,7 +74,7 @@ class Scene(NamedTuple):
 
 
 def others(flock: Flock) -> Any:
-    """Return whom each follower has around it: numbers of vehicles (m, m), 0 is the leader."""
+    """Return the vehicles around each follower, by number (m, m); 0 is the leader."""
     m = flock.followers
     return np.array([[v for v in range(m + 1) if v != f] for f in range(1, m + 1)])
 
@@ -82,11 +92,11 @@ class Lookout:
         self._others = others(self._flock)
         m = self._flock.followers
         rows = [(run, number) for run in runs for number in range(1, m + 1)]
-        images = [_Images.drawn(scenario, run, number) for run, number in rows]
+        drawn = [_drawn(scenario, run, number) for run, number in rows]
         self._prints = scenario.prints
-        self._latency = np.stack([each.latency for each in images], axis=1)
-        self._drawn = np.concatenate([each.noise for each in images], axis=1)
-        self._visible = np.concatenate([each.visible for each in images], axis=1)
+        self._latency = np.stack([each[0] for each in drawn], axis=1)
+        self._drawn, self._visible = (
+            np.concatenate([each[k] for each in drawn], axis=1) for k in (1, 2))
         self._names = [[self._flock.names[v] for v in self._others[number - 1]]
                        for _, number in rows]
         errors = scenario.odometry
@@ -95,25 +105,35 @@ class Lookout:
             errors.tilt_memory, IMAGE_STEPS * STEP, errors.tilt_bias)
         self._odometry_latency = np.array(odometry_latency)
         self._turned = np.concatenate([scenario.random(run, 'attitudes', number).standard_normal(
-            (len(images[0].latency), m)) for run, number in rows], axis=1)
+            (len(self._latency), m)) for run, number in rows], axis=1)
         askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
                           for run in runs])
         self._askew = askew[:, self._others].ravel()
-        self.filters = Filters(m * len(rows))
+        self._filters = [NeighborFilter() for _ in range(m * len(rows))]
         """Of all rows, one after the other."""
+        self._radios: Radios | None = None
+        if scenario.measures_ranges:
+            draws = ['ranges', *(f'ranges of other {k}' for k in range(2, m + 1))]
+            generators = [scenario.random(run, draw, number)
+                          for run, number in rows for draw in draws]
+            self._range_latency = np.array([g.uniform(*scenario.ranges.latency)
+                                            for g in generators])
+            self._radios = Radios(scenario.ranges, generators)
+            self._series = [RangeSeries(each, _CENTRE) for each in self._filters]
         self._sight: Array | None = None
-        self._sent: deque[_Sent] = deque(maxlen=20)
+        self._images: list[_Coming[float]] = [[] for _ in rows]
+        self._coming: list[_Coming[Sighted]] = [[] for _ in rows]
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
         """Which of the others an image has shown since this was last set to False."""
         self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
-        """Which of them the newest image would show, were nobody blinded."""
+        """Those in the newest image, outages and missed detections left out."""
 
     def look(self, k: int, scene: Scene, vio: Vio, travel: Array, placed: float,
              lost: bool) -> None:
         """
         Take the images of step k.
 
-        :param travel: integral of what ``vio`` says of the velocity (rows, 3), m.
+        :param travel: integral of the velocity of ``vio`` (rows, 3), m.
         :param placed: when there is odometry of the images, or newer, s.
         :param lost: whether odometry is lost, so that nothing can be placed in its frame.
         """
@@ -133,17 +153,52 @@ class Lookout:
         drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
                                   self._drawn[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
-        walked = np.repeat(travel, m, axis=0)
-        used = self.filters.update(now, walked + offsets + drawn,
-                                    max(scale, 1e-3) ** 2 * covariance, found)
-        position = self.filters.position + np.repeat(vio.position, m, axis=0) - walked
-        velocity = (self.filters.velocity
-                    + self._sensing.velocity_noise * self._drawn[image, :, 3:])
+        measured = np.repeat(travel, m, axis=0) + offsets + drawn
+        covariance = max(scale, 1e-3) ** 2 * covariance
+        correction = vio.position - travel
+        velocity_noise = self._sensing.velocity_noise * self._drawn[image, :, 3:]
         yaws = (scene.yaws[:, self._others].ravel() + np.repeat(vio.yaw_error, m)
                 + YAW_NOISE * self._turned[image] + self._askew)
-        arrivals = np.maximum(now + self._latency[image], placed + self._odometry_latency)
-        self._sent.append(_Sent(now, arrivals, used.reshape(-1, m), position, velocity,
-                                yaws, self.filters.acceleration.copy(), {}))
+        arrivals = np.maximum(
+            now + self._latency[image], placed + self._odometry_latency).tolist()
+        for row, arrival in enumerate(arrivals):
+            self._images[row].append((arrival, now))
+        for i in np.flatnonzero(found).tolist():
+            full = YAW_NOISE ** 2 * np.eye(6)
+            full[:3, :3] = covariance[i]
+            outcome = self._filters[i].update(now, Transform(translation=measured[i]), _CENTRE,
+                                              full)
+            state = self._filters[i].newest
+            if outcome in _USED and state is not None:
+                self._send(arrivals[i // m], i, state._replace(
+                    position=state.position + correction[i // m],
+                    velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
+
+    def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None) -> None:
+        row, j = divmod(i, len(self._others))
+        self._coming[row].append((arrival, Sighted(
+            self._names[row][j], state.stamp, state.position, state.velocity, yaw,
+            state.covariance[POSITION, POSITION], state.covariance[VELOCITY, VELOCITY],
+            state.acceleration)))
+
+    def measure_ranges(self, now: float, scene: Scene, vio: Vio, travel: Array,
+                       placed: float) -> None:
+        """Measure the distances to the others by radio; parameters as of ``look``."""
+        if self._radios is None:
+            return
+        m, noise = len(self._others), RangingParams().range_noise ** 2
+        measured = self._radios.measure(np.linalg.norm(scene.offsets.reshape(-1, 3), axis=1))
+        arrivals = np.maximum(now + self._range_latency,
+                              placed + np.repeat(self._odometry_latency, m))
+        for i, distance in enumerate(measured.tolist()):
+            if not scene.present.ravel()[i % m ** 2]:
+                continue
+            row = i // m
+            own = OdometrySample(now, vio.position[row], IDENTITY_QUATERNION, vio.velocity[row],
+                                 _STILL, travel[row])
+            state = self._series[i].take(PlacedRange(now, distance, noise, travel[row]), own)
+            if state is not None:
+                self._send(float(arrivals[i]), i, state, None)
 
     def look_at_prints(self, positions: Array, rotations: Array, vio: Vio) -> None:
         """
@@ -153,7 +208,6 @@ class Lookout:
 
         :param positions: of the followers (rows, 3), m; :param rotations: theirs (rows, 3, 3).
         """
-        sent = self._sent[-1]
         for number, place in enumerate(self._prints, start=1):
             offsets = np.array(place.position) - positions
             bodies = np.tile(quaternion_to_matrix(quaternion_from_yaw(place.yaw)),
@@ -163,9 +217,10 @@ class Lookout:
             covariances = relative_noise(offsets, self._noise)
             seen_from = vio.position + turned(offsets, vio.yaw_error)
             for row in np.flatnonzero(shown).tolist():
-                sent.prints.setdefault(row, []).append(Sighted(
-                    duplicate_name(LEADER, number), sent.stamp, seen_from[row], _STILL, place.yaw,
-                    covariances[row], _STANDING, _STILL))
+                arrival, stamp = self._images[row][-1]
+                self._coming[row].append((arrival, Sighted(
+                    duplicate_name(LEADER, number), stamp, seen_from[row], _STILL, place.yaw,
+                    covariances[row], _STANDING, _STILL)))
 
     def _in_sight(self, scene: Scene) -> Any:
         n, m, _, _ = scene.offsets.shape
@@ -190,38 +245,18 @@ class Lookout:
         turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
         return turning
 
-    def estimates(self, now: float) -> list[list[Sighted]]:
-        """Return the newest estimate of each of the others that has arrived in each row."""
-        newest: list[list[Sighted]] = [[] for _ in self._names]
-        missing: Any = np.ones_like(self.seen)
-        m = missing.shape[1]
-        filters = self.filters  # their covariances are those of the last image: a little newer
-        for sent in reversed(self._sent):
-            fresh = sent.used & missing & (sent.arrivals <= now + 1e-9)[:, None]
-            missing &= ~fresh
-            for row, j in np.argwhere(fresh).tolist():
-                i = row * m + j
-                newest[row].append(Sighted(
-                    self._names[row][j], sent.stamp, sent.position[i], sent.velocity[i],
-                    float(sent.yaws[i]),
-                    filters.position_covariance[i], filters.velocity_covariance[i],
-                    sent.acceleration[i]))
-            if not missing.any():
-                break
-        if self._prints:
-            for row, found in enumerate(newest):
-                found += next((sent.prints.get(row, []) for sent in reversed(self._sent)
-                               if sent.arrivals[row] <= now + 1e-9), [])
-        return newest
+    def arrived(self, now: float) -> list[tuple[list[float], list[Sighted]]]:
+        """
+        Return the arrivals at the planner of each row since the last call.
 
-    def looked(self, now: float) -> list[list[float]]:
-        """Return the stamps of the newest images that were processed in each row, s."""
-        return [[sent.stamp for sent in self._sent if sent.arrivals[row] <= now + 1e-9]
-                for row in range(len(self._names))]
+        These are the stamps of the images processed, s, and the newest estimate of each vehicle.
+        """
+        return [(_due(images, now), [*{each.name: each for each in _due(coming, now)}.values()])
+                for images, coming in zip(self._images, self._coming)]
 
 
 class Sighted(NamedTuple):
-    """What perception says of one vehicle, in ENU, with the drift of one's own odometry."""
+    """The estimate of one vehicle, in ENU, with the drift of the own odometry."""
 
     name: str
     stamp: float
@@ -231,7 +266,7 @@ class Sighted(NamedTuple):
     velocity: Array
     """(3,), m/s."""
     yaw: float | None
-    """rad; None where it is not known."""
+    """rad; None if it is not known."""
     position_covariance: Array
     """(3, 3), m^2."""
     velocity_covariance: Array
@@ -240,55 +275,40 @@ class Sighted(NamedTuple):
     """(3,), m/s^2."""
 
 
-class _Sent(NamedTuple):
-    """What perception made of the images of one moment."""
-
-    stamp: float
-    """s."""
-    arrivals: Array
-    """When it reaches the planner of each row, s."""
-    used: Any
-    """(rows, m), of whom there is an estimate."""
-    position: Array
-    """(rows * m, 3), m."""
-    velocity: Array
-    """(rows * m, 3), m/s."""
-    yaws: Array
-    """(rows * m,), rad."""
-    acceleration: Array
-    """(rows * m, 3), m/s^2."""
-    prints: dict[int, list[Sighted]]
-    """By row, those in view."""
+T = TypeVar('T')
+_Coming = list[tuple[float, T]]
+"""What has been sent, in the order of sending, and when each arrives, s."""
 
 
-@dataclass(frozen=True)
-class _Images:
-    """What chance decides about the images of one row; there are c of them."""
+def _due(coming: _Coming[T], now: float) -> list[T]:
+    """Take out what has arrived."""
+    due = [each for arrival, each in coming if arrival <= now + 1e-9]
+    coming[:] = [each for each in coming if each[0] > now + 1e-9]
+    return due
 
-    latency: Array
-    """(c,), s."""
-    noise: Array
-    """(c, m, 6), of standard deviation 1."""
-    visible: Any
-    """(c, m), whether each of the others is found where it is in sight."""
 
-    @classmethod
-    def drawn(cls, scenario: Scenario, run: int, number: int) -> _Images:
-        sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
-        count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
-        times = np.arange(count) * IMAGE_STEPS * STEP
-        latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
-        found = [rng.random(count) < sensing.recall]
-        clear = np.ones(count, dtype=bool)
-        for outage in scenario.outages:
-            if outage.what == 'marker':
-                clear &= (times < outage.at) | (times >= outage.at + outage.duration)
-        for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
-                sensing.light_changes * scenario.duration / 60.0)):
-            clear &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
-        noise = [rng.standard_normal((count, 6))]
-        for other in range(2, scenario.company.followers + 1):
-            more = scenario.random(run, f'images of other {other}', number)
-            found.append(more.random(count) < sensing.recall)
-            noise.append(more.standard_normal((count, 6)))
-        return cls(latency, np.stack(noise, axis=1), np.stack(found, axis=1) & clear[:, None])
+def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any]:
+    """
+    Return the random draws of the c images of one row.
+
+    These are the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of the
+    others is found if it is in sight (c, m).
+    """
+    sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
+    count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
+    times = np.arange(count) * IMAGE_STEPS * STEP
+    latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
+    found = [rng.random(count) < sensing.recall]
+    clear = np.ones(count, dtype=bool)
+    for outage in scenario.outages:
+        if outage.what == 'marker':
+            clear &= (times < outage.at) | (times >= outage.at + outage.duration)
+    for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
+            sensing.light_changes * scenario.duration / 60.0)):
+        clear &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
+    noise = [rng.standard_normal((count, 6))]
+    for other in range(2, scenario.company.followers + 1):
+        more = scenario.random(run, f'images of other {other}', number)
+        found.append(more.random(count) < sensing.recall)
+        noise.append(more.standard_normal((count, 6)))
+    return latency, np.stack(noise, axis=1), np.stack(found, axis=1) & clear[:, None]

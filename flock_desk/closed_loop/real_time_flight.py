@@ -15,8 +15,8 @@
 """
 A flight of two vehicles as it goes on: the leader before, the follower as it is commanded.
 
-Whoever runs it has the vehicles flown, and takes what the sensors give: odometry after
-every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
+Its owner steps the vehicles and takes the output of the sensors: odometry after every step, an
+image when one is due. Times are integer nanoseconds since the start; no clock is
 read here.
 """
 
@@ -30,15 +30,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.camera.rig import marked_leader, second_print, T_BODY_OPTICAL
-from flock_desk.camera.scene import field_with_buildings
 from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
-from flock_desk.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
+from flock_desk.closed_loop.flown_vehicle import FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.geometry import (
@@ -55,7 +54,6 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 #: odometry and vehicle come first.
 LATEST_NS = 30_000_000
 SENSOR = Sensor(sub_poses=2)
-EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
 
 
 class RenderedImage(NamedTuple):
@@ -63,7 +61,7 @@ class RenderedImage(NamedTuple):
 
     stamp_ns: int
     due_ns: int
-    """When whoever waits for it gets it."""
+    """When it is delivered."""
     time: float
     """Of the scenario at the stamp, s; negative before it begins."""
     pixels: NDArray[np.uint8]
@@ -79,7 +77,7 @@ class RealTimeFlight:
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
     :param latest_ns: an image that is due for longer than this is left out.
-    :param leader: who flies before the follower; None: the scenario's own leader.
+    :param leader: None: the scenario's own leader.
     """
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
@@ -196,7 +194,7 @@ class RealTimeFlight:
         mixed = [(1.0 - share) * x + share * y
                  for x, y in ((a.position, b.position), (a.linear, b.linear))]
         return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular, NO_COVARIANCE, NO_COVARIANCE)
+                        b.angular)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
@@ -208,10 +206,9 @@ def _pose(state: Odometry) -> Transform:
 
 def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
     """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
-    placed = [second_print().moved(Transform.from_quaternion(
+    placed = [([second_print()], Transform.from_quaternion(
         np.array(each.position), quaternion_from_yaw(each.yaw))) for each in prints]
-    return Renderer(Camera(), SENSOR, field_with_buildings(), marked_leader(), seed, fineness=2,
-                    viewpoint=np.array([0.0, 0.0, EYE_HEIGHT]), prints=placed)
+    return Renderer(Camera(), SENSOR, seed=seed, fineness=2, prints=placed)
 
 
 def calibration(camera: Camera) -> dict[str, Any]:

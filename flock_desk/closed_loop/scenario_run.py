@@ -21,9 +21,8 @@ import math
 import numpy as np
 
 from flock_desk.camera.renderer import Light
-from flock_desk.scenarios.leader import course, STEP, turn_rate
+from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.vehicle import attitude, GRAVITY
 from flock_follower.geometry import (
@@ -40,7 +39,6 @@ BEFORE = -1.0  # s: any time before the scenario begins
 _CLOUDS = 9.0  # s from one cloud to the next, where the light changes at all
 _GLARE = Light(veil=1.2)
 _SHADOW = Light(gain=0.002)
-_NONE = np.zeros((6, 6))
 
 
 class ScenarioRun:
@@ -77,15 +75,16 @@ class ScenarioRun:
 
     def _heading(self, time: float) -> float:
         if self.scenario.leader.heading != 'away':
-            return self._course.at(time)[2]
+            return self._course.at(time)[3]
         since, heading, rate = self._turning
         return heading + rate * (time - since)
 
     def leader(self, time: float) -> Transform:
         """Return the leader's pose: it leans into its acceleration."""
-        position, heading = self._course.at(time)[0], self._heading(time)
-        up = self._acceleration(time) + np.array([0.0, 0.0, GRAVITY])
-        return Transform(attitude(up / math.sqrt(up @ up), np.array(heading)), position)
+        position, _, acceleration, _ = self._course.at(time)
+        up = acceleration + np.array([0.0, 0.0, GRAVITY])
+        return Transform(
+            attitude(up / math.sqrt(up @ up), np.array(self._heading(time))), position)
 
     def leader_odometry(self, time: float) -> Odometry:
         """Return the leader's true motion; its covariances are zero."""
@@ -95,13 +94,7 @@ class ScenarioRun:
         velocity = self._course.at(time)[1] if time > 0.0 else np.zeros(3)
         quaternion = matrix_to_quaternion(pose.rotation)
         return Odometry(time, pose.translation, quaternion,
-                        quaternion_to_matrix(quaternion).T @ velocity, rate, _NONE, _NONE)
-
-    def _acceleration(self, time: float) -> Array:
-        last = len(self._course.accelerations) - 1
-        share, k = math.modf(min(max(time / STEP, 0.0), float(last)))
-        a, b = (self._course.accelerations[min(int(k) + i, last)] for i in (0, 1))
-        return (1.0 - share) * a + share * b
+                        quaternion_to_matrix(quaternion).T @ velocity, rate)
 
     def wind(self, time: float) -> Array:
         """Return the velocity (3,) of the air, m/s."""

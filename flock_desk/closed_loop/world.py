@@ -15,7 +15,7 @@
 """
 The world around the followers of a scenario: leader, air, vehicles and sensors, stepped by STEP.
 
-Nothing here plans or reads a clock; whoever steps it hands in what the vehicles shall fly. Every
+Nothing here plans or reads a clock; the caller passes in the setpoints. Every
 follower is a row: those of the first run by their numbers, then those of the second, and so on.
 """
 
@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,13 +33,10 @@ from flock_desk.closed_loop.lookout import (
     Lookout,
     others,
     Scene,
-    Sighted,
 )
+from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.flock import facing_ahead, places
-from flock_desk.scenarios.leader import course, STEP, turn_rate
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.wind import wind_course
-from flock_desk.sensors.ranging import RangedStates, SimulatedRanging
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
 from flock_desk.vehicles.equipment import Barometer
@@ -75,8 +72,7 @@ class World:
             scenario.random(run, 'wind')) for run in runs], axis=1), m, axis=1)
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self.others = others(self._flock)
-        """Whom each follower has around it (m, m): numbers of vehicles, 0 is the leader."""
-        self._names = [[self._flock.names[v] for v in row] for row in self.others]
+        """The vehicles around each follower, by number (m, m); 0 is the leader."""
         self.starts = self._starts()
         """Where each begins (rows, 3), m ..."""
         self.yaws = np.zeros(n) if scenario.flock is None else np.tile(
@@ -97,11 +93,7 @@ class World:
             a.uniform(*scenario.odometry.latency) + b.uniform(*scenario.response.odometry_delay)
             for a, b in zip(self._random('odometry latency'), self._random('odometry delay'))]
         self.lookout = Lookout(scenario, runs, noise, self._odometry_latency)
-        self._ranging = SimulatedRanging(
-            scenario.ranges, self._random_of_pairs('ranges')) if scenario.measures_ranges else None
-        self._ranged: deque[_Ranged] = deque(maxlen=40)
-        self.told_distance: Array = np.full((n * m, m), np.nan)
-        """By ranges, of others out of sight (rows, m), m; NaN of those in sight."""
+        self._ranges_due = Due(scenario.ranges.rate) if scenario.measures_ranges else None
         self._odometry_lost = False
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n * m, 3))
@@ -111,11 +103,6 @@ class World:
     def _random(self, what: str) -> list[np.random.Generator]:
         """Return the generators of one thing that chance decides, one for each row."""
         return [self.scenario.random(run, what, number) for run, number in self._rows]
-
-    def _random_of_pairs(self, what: str) -> list[np.random.Generator]:
-        """Return likewise one for each of the others in each row, one after the other."""
-        whats = [what, *(f'{what} of other {k}' for k in range(2, len(self.others) + 1))]
-        return [self.scenario.random(run, w, number) for run, number in self._rows for w in whats]
 
     def _starts(self) -> Array:
         altitude = 0.0 if self.scenario.takes_off else self.scenario.start.altitude
@@ -147,7 +134,7 @@ class World:
 
     @property
     def distances(self) -> Array:
-        """Return the true distances (rows, m) to the others, m; infinite to who is gone."""
+        """Return the true distances (rows, m) to the others, m; infinite if one is gone."""
         positions, m = self.positions, len(self.others)
         offsets = positions[:, self.others] - positions[:, 1:, None]
         there = self.present
@@ -182,23 +169,10 @@ class World:
             self._sense(k * STEP)
         if k % IMAGE_STEPS == 0:
             self._look(k)
-        if self._ranging is not None and k % ODOMETRY_STEPS == 0 and not self._odometry_lost and (
-                self._ranging.due(k * STEP)):
-            self._measure(k * STEP, self._ranging)
-
-    def _measure(self, now: float, ranging: SimulatedRanging) -> None:
-        """Measure the distances to the others, and tell what becomes of them."""
-        m, positions, there = len(self.others), self.positions, self.present
-        travel = np.repeat(self._travel, m, axis=0)
-        offsets = positions[:, self.others] - positions[:, 1:, None]
-        states = ranging.step(
-            now, offsets.reshape(-1, 3), travel, self.lookout.filters,
-            np.tile(there[self.others].ravel(), len(positions)))
-        self.told_distance = np.where(states.told, states.distance, np.nan).reshape(-1, m)
-        position = states.position + np.repeat(self._vio.position, m, axis=0) - travel
-        arrivals = np.maximum(now + ranging.latency, self._placed(now) + np.repeat(
-            np.array(self._odometry_latency), m))
-        self._ranged.append(_Ranged(now, arrivals, states, position))
+        if self._ranges_due is not None and k % ODOMETRY_STEPS == 0 and (
+                not self._odometry_lost and self._ranges_due.at(k * STEP)):
+            self.lookout.measure_ranges(k * STEP, self._scene(), self._vio, self._travel,
+                                        self._placed(k * STEP))
 
     def _placed(self, now: float) -> float:
         """Return when there is odometry that is not older than now, s."""
@@ -221,14 +195,16 @@ class World:
             self._odometry.appendleft([OwnState(now, p, v, y) for p, v, y in zip(
                 self._vio.position, self._vio.velocity, yaw.tolist())])
 
+    def _scene(self) -> Scene:
+        positions, there = self.positions, self.present
+        leader = attitude(self._leader_axis[self._step], self._heading)
+        return Scene(positions[:, self.others] - positions[:, 1:, None],
+                     self._with_leader(self._heading, self.vehicle.yaw),
+                     self._with_leader(leader, self.vehicle.rotation), there[self.others])
+
     def _look(self, k: int) -> None:
-        now, positions, there = k * STEP, self.positions, self.present
-        leader = attitude(self._leader_axis[k], self._heading)
-        scene = Scene(positions[:, self.others] - positions[:, 1:, None],
-                      self._with_leader(self._heading, self.vehicle.yaw),
-                      self._with_leader(leader, self.vehicle.rotation), there[self.others])
         # Perception waits for the first odometry that is not older than the image.
-        self.lookout.look(k, scene, self._vio, self._travel, self._placed(now),
+        self.lookout.look(k, self._scene(), self._vio, self._travel, self._placed(k * STEP),
                           self._odometry_lost)
         if self.scenario.prints:
             self.lookout.look_at_prints(self.vehicle.position, self.vehicle.rotation, self._vio)
@@ -240,21 +216,6 @@ class World:
         return [next((states[row] for states in self._odometry
                       if states[row].stamp + late <= now + 1e-9), None)
                 for row, late in enumerate(self._odometry_latency)]
-
-    def estimates(self, now: float) -> list[list[Sighted]]:
-        """Return the newest estimate of each of the others that has arrived in each row."""
-        newest = self.lookout.estimates(now)
-        m = len(self.others)
-        missing: Any = np.ones(len(self._rows) * m, dtype=bool)
-        for ranged in reversed(self._ranged):
-            fresh = missing & ranged.states.told & (ranged.arrivals <= now + 1e-9)
-            missing &= ~fresh
-            for i in np.flatnonzero(fresh).tolist():
-                row, j = divmod(i, m)
-                told = ranged.of(i, self._names[row % m][j])
-                if not any(n.name == told.name and n.stamp >= told.stamp for n in newest[row]):
-                    newest[row].append(told)
-        return newest
 
     def flown(self) -> list[tuple[Array, Array, float, Array]]:
         """Return each vehicle's position, velocity, yaw, and the velocity its autopilot knows."""
@@ -270,33 +231,9 @@ class World:
         """
         return self._barometer.heights(self.vehicle.position[:, 2], now)
 
-    @property
-    def on_ground(self) -> Any:
-        """Return which vehicles stand on the ground (rows,)."""
-        return self.vehicle.landed
-
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""
         self._setpoints.take(self._step, setpoints)
-
-
-class _Ranged(NamedTuple):
-    """What ranges of one moment tell of those out of sight; the others of all rows in turn."""
-
-    stamp: float
-    """s."""
-    arrivals: Array
-    """When each reaches the planner (rows * m,), s."""
-    states: RangedStates
-    position: Array
-    """(rows * m, 3), m, in ENU, with the drift of the odometry."""
-
-    def of(self, i: int, name: str) -> Sighted:
-        """Return what is told of the i-th."""
-        states = self.states
-        return Sighted(name, self.stamp, self.position[i], states.velocity[i], None,
-                       states.position_covariance[i], states.velocity_covariance[i],
-                       states.acceleration[i])
 
 
 class _Delayed:

@@ -15,5 +15,6 @@
 """
 Flocks of point agents under the law and its predecessors: the simulations of the paper.
 
-numba and scipy make them faster or more exact, and are loaded only where they are used.
+They need scipy, which is imported in the functions that use it: a command without it ends with one
+line.
 """

@@ -25,8 +25,6 @@ from flock_desk.flocks.graph import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
 from flock_follower.geometry import Array
 
-_BLOCK = 1 << 20  # distances held at once
-
 
 @dataclass(frozen=True)
 class Metrics:
@@ -115,19 +113,15 @@ def metrics(time: Array, positions: Array, velocities: Array, params: FlockingPa
 
 
 def _distances(positions: Array) -> tuple[Array, Array, Array]:
-    """Return the least and greatest r^2 and the mean distance (m,), holding few at once."""
-    m, k, _ = positions.shape
-    least, greatest, total = np.full(m, np.inf), np.zeros(m), np.zeros(m)
-    rows = max(1, _BLOCK // k)
-    for first in range(0, m, rows):
-        part = slice(first, first + rows)
-        x = positions[part]
-        for i in range(k - 1):
-            r2 = np.sum((x[:, i + 1:] - x[:, i:i + 1]) ** 2, axis=2)
-            np.minimum(least[part], r2.min(axis=1), out=least[part])
-            np.maximum(greatest[part], r2.max(axis=1), out=greatest[part])
-            total[part] += np.sqrt(r2).sum(axis=1)
-    return least, greatest, total / max(1, k * (k - 1) // 2)
+    """Return the least and greatest r^2 and the mean distance (m,)."""
+    from scipy.spatial.distance import pdist
+    figures = []
+    for x in positions:
+        r2 = pdist(x, 'sqeuclidean')
+        figures.append((r2.min(initial=np.inf), r2.max(initial=0.0),
+                        np.sqrt(r2).sum() / max(1, len(r2))))
+    least, greatest, mean = np.array(figures).T
+    return least, greatest, mean
 
 
 def _longest_edge(positions: Array, graph: Graph, present: Array) -> float:

@@ -40,14 +40,9 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
 
     :param start: the state at ``times[0]``.
     :param breaks: where the acceleration jumps, s: no step straddles these.
-    :raises ImportError: without scipy.
     :raises RuntimeError: where no step is small enough, as at a singularity of the law.
     """
-    try:
-        from scipy.integrate import DOP853
-    except ImportError as error:
-        raise ImportError("integrator = 'adaptive' needs scipy: pip install scipy, or choose "
-                          "'semi_implicit'") from error
+    from scipy.integrate import DOP853
     shape = np.shape(start)
     t, y = float(times[0]), np.ravel(start)
     yield start
@@ -82,7 +77,7 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
     Each step takes the velocity forward first and the position with the new velocity (also
     called symplectic Euler): first order, and stable where explicit Euler is not.
 
-    :param acceptable: of the positions before and after a step: where it says no the step is
+    :param acceptable: of the positions before and after a step: if it returns False the step is
         halved, and lengthened again, doubling, by the steps that follow.
     :raises RuntimeError: where a step a millionth of dt long is not acceptable yet.
     """

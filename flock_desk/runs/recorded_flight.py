@@ -28,6 +28,7 @@ import math
 from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
+from flock_follower.follower import Follower, ImageOutcome, Listener
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
@@ -48,8 +49,6 @@ from flock_follower.parameters import (
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
-from flock_follower.pipeline.events import ImageOutcome, Listener
-from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.loop import PlannerLoop
 
 #: What the autopilot is taken to be while the bag was recorded.

@@ -12,11 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-How simulated followers see their leader in lock step: what is in view, noise, the filter.
-
-Each object serves n runs at once, one row each.
-"""
+"""How simulated followers see others in lock step: the view of a camera, and measurement noise."""
 
 from __future__ import annotations
 
@@ -29,13 +25,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_filter import GATE, NEAREST, RangeGate, WILD
-from flock_follower.perception.neighbor_motion import (
-    bounded_across,
-    FilterParams,
-    motion,
-    turned_along,
-)
 
 #: Where cameras look, and markers, on the body (FLU).
 DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back': (-1, 0, 0),
@@ -103,7 +92,7 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
 def facing(offsets: Array, rotations: Array, angle: float,
            faces: Sequence[str] = ('back',)) -> Any:
     """
-    Return which vehicles (n, 3, 3) show a marker to whoever looks, not too oblique (n,).
+    Return which vehicles (n, 3, 3) show a marker to the observer, not too oblique (n,).
 
     :param offsets: of the vehicles from there (n, 3), m.
     :param angle: from a marker's normal up to which it is found, rad.
@@ -118,7 +107,7 @@ def hidden(offsets: Array, present: Any, radius: float) -> Any:
     """
     Return behind which of m vehicles (..., m) another one stands in the way.
 
-    :param offsets: of all of them from whoever looks (..., m, 3), m.
+    :param offsets: of all of them from the observer (..., m, 3), m.
     :param present: which are there (..., m).
     :param radius: of a vehicle, m.
     """
@@ -129,138 +118,3 @@ def hidden(offsets: Array, present: Any, radius: float) -> Any:
     between = (along > 0.0) & (along < distance[..., None, :]) & (beside < radius ** 2)
     between &= ~np.eye(offsets.shape[-2], dtype=bool) & np.asarray(present)[..., :, None]
     return between.any(axis=-2)
-
-
-class Filters:
-    """
-    The neighbour filters of n runs.
-
-    The same estimator of position, velocity and acceleration as ``perception.neighbor_filter``:
-    on a marker at the centre of its body the two give the same numbers.
-    """
-
-    def __init__(self, count: int, params: FilterParams | None = None) -> None:
-        self.params = params or FilterParams()
-        self.stamp: Array = np.full(count, -np.inf)
-        self._state: Array = np.zeros((count, 9))
-        self._covariance: Array = np.zeros((count, 9, 9))
-        self._surprises: Array = np.zeros((count, 3))
-        self._range_gate = RangeGate(count, self.params.max_rejections)
-        self._line: Array = np.zeros((count, 3))  # on which the last distance was measured
-        self._begin: Array = np.zeros((9, 9))
-        self._begin[3:6, 3:6] = self.params.initial_speed ** 2 * np.eye(3)
-        self._begin[6:, 6:] = self.params.acceleration ** 2 * np.eye(3)
-
-    @property
-    def position(self) -> Array:
-        """Return positions (n, 3), m, at the stamps."""
-        return self._state[:, :3]
-
-    @property
-    def velocity(self) -> Array:
-        """Return velocities (n, 3), m/s."""
-        return self._state[:, 3:6]
-
-    @property
-    def acceleration(self) -> Array:
-        """Return accelerations (n, 3), m/s^2."""
-        return self._state[:, 6:]
-
-    @property
-    def position_covariance(self) -> Array:
-        """Return the covariances (n, 3, 3) of the positions, m^2."""
-        return self._covariance[:, :3, :3]
-
-    @property
-    def velocity_covariance(self) -> Array:
-        """Return the covariances (n, 3, 3) of the velocities, m^2/s^2."""
-        return self._covariance[:, 3:6, 3:6]
-
-    def update(self, stamp: float, measured: Array, covariance: Array, seen: Any) -> Any:
-        """Take in positions (n, 3), covariances (n, 3, 3), where ``seen``; return where used."""
-        state, spread, running = self._predicted(stamp)
-        innovation = measured - state[:, :3]
-        expected = np.linalg.inv(spread[:, :3, :3] + covariance)
-        doubt = np.einsum('ni,nij,nj->n', innovation, expected, innovation) / GATE
-        used = seen & running & (doubt <= WILD)
-        surprising = used & (doubt > 1.0)
-        again = surprising & (np.einsum('ni,ni->n', innovation, self._surprises) > 0.0)
-        self._surprises[used] = np.where(surprising[:, None], innovation, 0.0)[used]
-        spread = spread * np.where(again, doubt, 1.0)[:, None, None]
-        inverse = np.linalg.inv(spread[:, :3, :3] + covariance) / np.where(
-            surprising & ~again, doubt, 1.0)[:, None, None]
-
-        restart = seen & ~running
-        self._surprises[restart] = 0.0
-
-        gain = spread[:, :, :3] @ inverse
-        corrected = spread - gain @ spread[:, :3]
-        self._state[used] = (state + (gain @ innovation[:, :, None])[:, :, 0])[used]
-        self._covariance[used] = (0.5 * (corrected + corrected.transpose(0, 2, 1)))[used]
-        self._state[restart] = 0.0
-        self._state[restart, :3] = measured[restart]
-        self._covariance[restart] = self._begin
-        self._covariance[restart, :3, :3] = covariance[restart]
-        self.stamp = np.where(used | restart, stamp, self.stamp)
-        self._line[used | restart] = 0.0
-        return used | restart
-
-    def _predicted(self, stamp: float) -> tuple[Array, Array, Any]:
-        """Return states (n, 9) and covariances (n, 9, 9) at a stamp, s, and which reach there."""
-        dt = stamp - self.stamp
-        running = dt <= self.params.max_gap
-        steps, which = np.unique(np.where(running, dt, 0.0).round(6), return_inverse=True)
-        moves = [motion(float(step), self.params) for step in steps]
-        linear = np.stack([np.kron(move, np.eye(3)) for move, _ in moves])[which]
-        noise = np.stack([np.kron(jerk, np.eye(3)) for _, jerk in moves])[which]
-        state = (linear @ self._state[:, :, None])[:, :, 0]
-        spread = linear @ self._covariance @ linear.transpose(0, 2, 1) + noise
-        return state, spread, running
-
-    def along(self, stamp: float, places: Array) -> tuple[Array, Array, Array]:
-        """Return distances (n,), m, from places (n, 3), directions (n, 3), variances (n,), m^2."""
-        state, spread, _ = self._predicted(stamp)
-        sight = state[:, :3] - places
-        distance = np.linalg.norm(sight, axis=1)
-        along = sight / np.maximum(distance, NEAREST)[:, None]
-        return distance, along, np.einsum('ni,nij,nj->n', along, spread[:, :3, :3], along)
-
-    def go_on_from(self, others: Filters, which: Any) -> None:
-        """Take over, where ``which``, what other filters know."""
-        self.stamp = np.where(which, others.stamp, self.stamp)
-        self._state[which] = others._state[which]
-        self._covariance[which] = others._covariance[which]
-        self._range_gate.restart(which)
-        self._line[which] = 0.0
-
-    def update_range(self, stamp: float, distances: Array, own_positions: Array, variances: Array,
-                     given: Any) -> Any:
-        """
-        Take in distances (n,), m, from (n, 3), m, where ``given``; return where they were used.
-
-        :param variances: of the distances (n,), m^2.
-        """
-        state, prior, running = self._predicted(stamp)
-        sight = state[:, :3] - own_positions
-        length = np.linalg.norm(sight, axis=1)
-        given = given & running & (stamp > self.stamp) & (length > NEAREST)
-        along = sight / np.maximum(length, NEAREST)[:, None]
-        prior = turned_along(prior, self._line, along)
-        radial = np.einsum('ni,nij,nj->n', along, prior[:, :3, :3], along)
-        innovation = distances - length
-        used, widened, careful = self._range_gate.judge(innovation, radial + variances, given)
-        prior, radial = prior * widened[:, None, None], radial * widened
-        whole = careful * (radial + variances)
-        across = np.einsum('nij,nj->ni', prior[:, :, :3], along).reshape(-1, 3, 3)
-        shares = np.einsum('nbi,ni->nb', across, along) / whole[:, None]
-        gain = (shares[:, :, None] * along[:, None, :]).reshape(-1, 9)
-        remain = np.tile(np.eye(9), (len(gain), 1, 1))
-        remain[:, :, :3] -= gain[:, :, None] * along[:, None, :]
-        corrected = remain @ prior @ remain.transpose(0, 2, 1) + (whole - radial)[
-            :, None, None] * gain[:, :, None] * gain[:, None, :]
-        self._state[used] = (state + gain * innovation[:, None])[used]
-        self._covariance[used] = bounded_across(
-            corrected, along, length, self.params.initial_speed)[used]
-        self._line[used] = along[used]
-        self.stamp = np.where(used, stamp, self.stamp)
-        return used

@@ -43,6 +43,7 @@ from flock_follower.geometry import (
 )
 
 _BLOCK = 256  # steps whose random numbers are drawn together: it is faster
+_NO_COVARIANCE = np.zeros((6, 6))
 
 
 class Odometry(NamedTuple):
@@ -58,9 +59,9 @@ class Odometry(NamedTuple):
     """(3,), velocity in the child frame, m/s."""
     angular: Array
     """(3,), angular velocity in the child frame, rad/s."""
-    pose_covariance: Array
+    pose_covariance: Array = _NO_COVARIANCE
     """(6, 6) of x, y, z and rotations about the fixed axes x, y, z; m^2, rad^2."""
-    twist_covariance: Array
+    twist_covariance: Array = _NO_COVARIANCE
     """(6, 6) of linear and angular velocity in the child frame."""
 
 
@@ -114,7 +115,7 @@ class Vio:
 
 class VioEstimator:
     """
-    The odometry of one vehicle: what :class:`Vio` says, attitude, and covariances of it all.
+    The odometry of one vehicle: :class:`Vio`, attitude, and the covariances of both.
 
     :param start: the true motion at the start.
     :param period: between steps, s.
@@ -200,7 +201,7 @@ class GaussMarkov:
 
 
 class Due:
-    """Tells which of a simulation's steps give a sample, at most ``rate``, Hz, of them."""
+    """Selects the steps of a simulation that give a sample, at most ``rate``, Hz, of them."""
 
     def __init__(self, rate: float) -> None:
         self._period, self.next = 1.0 / rate, 0.0
@@ -229,7 +230,7 @@ def true_odometry(track: Track, time: float) -> Odometry:
     return Odometry(
         time, pose.translation.round(7), pose.quaternion.round(9),
         (quaternion_to_matrix(pose.quaternion).T @ track.velocity(time)).round(7),
-        track.rate(time).round(7), np.zeros((6, 6)), np.zeros((6, 6)))
+        track.rate(time).round(7))
 
 
 def turned(vectors: Array, angle: Array) -> Array:

@@ -29,22 +29,16 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+import struct
 from typing import Any, NamedTuple
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    QosDurability,
-)
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from flock_follower.bags.integrity import (
-    incomplete,
-    sqlite3_problem,
-)
+from flock_follower.bags.description import incomplete, is_latched, mcap_files, METADATA
 from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
-from flock_follower.bags.unfinished import mcap_files, missing_end, UnfinishedReader
+from flock_follower.bags.unfinished import missing_end, UnfinishedReader
 
 _CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
 _UNREADABLE = 'corrupt, truncated or unsupported'
@@ -196,7 +190,7 @@ def open_bag(path: str | Path) -> Bag:
     reason = incomplete(path) or cut
     with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
         for database in path.glob('*.db3') if path.is_dir() else [path]:
-            if problem := sqlite3_problem(database):
+            if problem := _sqlite3_problem(database):
                 raise BagError(f'{database}: {problem}')
         reader = _reader(path, bool(cut or (reason and path.is_dir() and mcap_files(path))))
         reader.open()
@@ -216,7 +210,7 @@ def _reader(path: Path, unfinished: bool) -> Rosbag1Reader | Rosbag2Reader | Unf
         return UnfinishedReader(path)
     if path.suffix == '.bag' and not path.is_dir():
         return Rosbag1Reader(path)
-    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+    if path.is_dir() and not (path / METADATA).is_file():
         databases = list(path.glob('*.db3'))
         if not incomplete(path) or len(databases) != 1:
             raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
@@ -251,15 +245,8 @@ def absolute(topic: str) -> str:
 
 def _topic(name: str, connections: list[Connection]) -> Topic:
     return Topic(name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
-                 any(_is_latched(c) for c in connections))
-
-
-def _is_latched(connection: Connection) -> bool:
-    if isinstance(connection.ext, ConnectionExtRosbag1):
-        return bool(connection.ext.latching)
-    return any(
-        qos.durability is QosDurability.TRANSIENT_LOCAL
-        for qos in connection.ext.offered_qos_profiles)
+                 any(c.ext.latching if isinstance(c.ext, ConnectionExtRosbag1) else is_latched(c)
+                     for c in connections))
 
 
 def _unreadable(connections: list[Connection]) -> str | None:
@@ -282,3 +269,25 @@ def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
     if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
         raise ValueError(f'a message of {topic.name} does not begin as CDR does')
     return raw
+
+
+def _sqlite3_problem(path: Path) -> str:
+    """
+    Return why a ``.db3`` file lost its end or was never closed; '' for all others.
+
+    SQLite reads a file cut in its last pages, and one whose newest rows still lie in a
+    write-ahead log, as if nothing were missing. Its header counts the pages (offsets: page
+    size 16, change counter 24, pages 28, change counter the page count is valid for 92).
+    """
+    with path.open('rb') as file:
+        header = file.read(100)
+    if path.suffix != '.db3' or len(header) < 100:
+        return ''
+    page_size, changes, pages, valid_for = struct.unpack('>16xH6xII60xI4x', header)
+    size = pages * (65536 if page_size == 1 else page_size)
+    if changes == valid_for and path.stat().st_size < size:
+        return f'truncated: {path.stat().st_size} of {size} bytes'
+    log = Path(f'{path}-wal')
+    if log.exists() and log.stat().st_size:
+        return f'recording was not closed: {log.name} holds part of it'
+    return ''

@@ -17,28 +17,34 @@ An MCAP file with an index and checksums: the one writer of bags and of recordin
 
 If wanted, what was written is on the disk after every write: a recording has to survive a kill or
 a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
-at the end (https://mcap.dev/spec, whose names of records these are). A file without its end is
-good up to its last whole chunk: ``integrity.end_mcap`` finds that.
+at the end (https://mcap.dev/spec, which names the records). A file without its end is good up to
+its last whole chunk: ``end_mcap`` finds that.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 import json
 import os
 from pathlib import Path
 import struct
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 import zlib
 
-from flock_follower.bags.integrity import MCAP_MAGIC
 from flock_follower.bags.message_types import typestore
 
+#: The first and the last bytes of every MCAP file.
+MCAP_MAGIC = b'\x89MCAP0\r\n'
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _SUMMARY_OFFSET = 0x07, 0x08, 0x0B, 0x0E
-_DATA_END = 0x0F
+_ATTACHMENT, _METADATA, _DATA_END = 0x09, 0x0C, 0x0F
+#: The records that hold data.
+_DATA = (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT, _METADATA)
+#: The end of a file without a summary: "data end", "footer" and the magic bytes.
+_END = (struct.pack('<BQI', _DATA_END, 4, 0) + struct.pack('<BQQQI', _FOOTER, 20, 0, 0, 0)
+        + MCAP_MAGIC)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # rosbag2's spelling
 
 
@@ -236,3 +242,59 @@ def type_hash(msgtype: str) -> str:
     :raises KeyError: for a type that ROS 2 Jazzy does not have.
     """
     return str(typestore().hash_rihs01(msgtype))
+
+
+def has_mcap_end(file: BinaryIO) -> bool:
+    """Return whether an MCAP file ends as a finished one does."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - len(MCAP_MAGIC), 0))
+    return size > len(_END) and file.read() == MCAP_MAGIC
+
+
+def end_mcap(path: Path) -> None:
+    """
+    Make an MCAP file whose writing broke off readable: cut it after its last whole chunk, end it.
+
+    The file has no index then; readers make one. If the disk has no room for the 50 bytes of the
+    end, the last chunk makes way.
+
+    :raises OSError: the file cannot be written at all.
+    """
+    with path.open('rb') as file:
+        if has_mcap_end(file):
+            return  # whole: something else failed
+        ends = [len(MCAP_MAGIC), *_ends_of_records(file)]
+    for end in reversed(ends):
+        try:
+            with path.open('r+b') as file:
+                file.truncate(end)
+                file.seek(end)
+                file.write(_END)
+            return
+        except OSError:
+            if end == ends[0]:
+                raise
+
+
+def _ends_of_records(file: BinaryIO) -> Iterator[int]:
+    """Yield where each record that holds data ends, up to the first that is cut or damaged."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    whole = file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+    while whole and len(header := file.read(9)) == 9:
+        kind, length = struct.unpack('<BQ', header)
+        end = file.tell() + length
+        whole = end <= size and kind in _DATA and (
+            kind != _CHUNK or _chunk_is_good(file.read(length)))
+        if whole:
+            yield end
+            file.seek(end)
+
+
+def _chunk_is_good(content: bytes) -> bool:
+    """Return whether a chunk agrees with its checksum, if it has one and is not compressed."""
+    if len(content) < 40:
+        return False
+    checksum, compression = struct.unpack_from('<II', content, 24)
+    return bool(compression or not checksum
+                or zlib.crc32(memoryview(content)[40:]) == checksum)

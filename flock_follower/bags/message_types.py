@@ -12,11 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Message types of ROS 2 Jazzy without ROS, and what becomes of those of ROS 1."""
+"""Message types of ROS 2 Jazzy without ROS, and the conversion of those of ROS 1."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -26,6 +25,8 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 _ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+_ZEROS: dict[str, Any] = {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}
+_BYTES = dict.fromkeys(('byte', 'octet', 'char'), 'uint8')
 
 
 @cache
@@ -36,34 +37,21 @@ def typestore() -> Typestore:
 
 def empty(msgtype: str) -> Any:
     """Return a message of the type store with every field zero or empty."""
-    return _maker(msgtype)()
+    fields = typestore().fielddefs[msgtype][1]
+    return typestore().types[msgtype](*[_zero(description) for _, description in fields])
 
 
-@cache
-def _maker(msgtype: str) -> Callable[[], Any]:
-    types = typestore()
-    message = types.types[msgtype]
-    zeros = [_zero(description) for _, description in types.fielddefs[msgtype][1]]
-    return lambda: message(*[zero() for zero in zeros])
-
-
-def _zero(description: Any) -> Callable[[], Any]:
+def _zero(description: Any) -> Any:
     kind, detail = description
     if kind == Nodetype.NAME:
-        return _maker(detail)
+        return empty(detail)
     if kind == Nodetype.BASE:
-        zero = {'string': '', 'bool': False}.get(detail[0], 0.0 if 'float' in detail[0] else 0)
-        return lambda: zero
+        return _ZEROS.get(detail[0], 0)
     element, length = detail
     count = length if kind == Nodetype.ARRAY else 0
     if element[0] == Nodetype.BASE and element[1][0] != 'string':
-        return lambda: np.zeros(count, dtype=_dtype(element[1][0]))
-    one = _zero(element)
-    return lambda: [one() for _ in range(count)]
-
-
-def _dtype(name: str) -> str:
-    return {'byte': 'uint8', 'octet': 'uint8', 'char': 'uint8'}.get(name, name)
+        return np.zeros(count, dtype=_BYTES.get(element[1][0], element[1][0]))
+    return [_zero(element) for _ in range(count)]
 
 
 def ros2_type(msgtype: str) -> str:

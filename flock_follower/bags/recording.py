@@ -32,11 +32,19 @@ import re
 import shutil
 import time
 
-from flock_follower.bags.description import Facts, facts_of, finish, metadata, replace
-from flock_follower.bags.integrity import incomplete, mark_incomplete
+from flock_follower.bags.description import (
+    describe,
+    Facts,
+    facts_of,
+    finish,
+    incomplete,
+    mark_incomplete,
+    mcap_files,
+    METADATA,
+    replace,
+)
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.schedule import NANOSECONDS
-from flock_follower.bags.unfinished import mcap_files
 
 _NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
 _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
@@ -86,19 +94,15 @@ class FlightRecording:
         self._written: dict[Path, float] = {}
         self._ahead: float | None = None  # the time of day of the last message less ``now``, s
         try:
-            self._take_up(now, clock)
+            for earlier in self._recordings():
+                for file in mcap_files(earlier):
+                    self._written[file] = now - max(clock - file.stat().st_mtime, 0.0)
+                if incomplete(earlier):
+                    with suppress(OSError):  # a full disk, or not ours: it can be read as it is
+                        finish(earlier)
         except OSError:
             os.close(self._lock)
             raise
-
-    def _take_up(self, now: float, clock: float) -> None:
-        """Look at the recordings there are, and finish those that were broken off."""
-        for earlier in self._recordings():
-            for file in mcap_files(earlier):
-                self._written[file] = now - max(clock - file.stat().st_mtime, 0.0)
-            if incomplete(earlier):
-                with suppress(OSError):  # a full disk, or not ours: it can be read as it is
-                    finish(earlier)
 
     def note(self, name: str, text: str) -> None:
         """
@@ -158,11 +162,10 @@ class FlightRecording:
             os.close(self._lock)
 
     def _end(self) -> None:
-        path = self.path
         self._close_file()
-        self.path, self._last = None, 0
+        path, self.path, self._last = self.path, None, 0
         if path is not None:
-            finish(path, self._facts)
+            finish(path)
 
     def _opened(self, stamp_ns: int, now: float) -> McapFile:
         """Return the file to write to."""
@@ -189,21 +192,13 @@ class FlightRecording:
             return
         with suppress(OSError):  # without its summary it is read, too
             file.close()
-        if file.counts:
-            self._facts[file.path] = Facts(
-                {topic._replace(source=''): count for topic, count in file.counts.items()},
-                file.start_ns, file.end_ns)
-        else:
-            self._written.pop(file.path, None)
-            with suppress(OSError):
-                file.path.unlink()
-        if self.path is not None:
-            with suppress(OSError):
-                self._describe(self.path)
+        with suppress(OSError):
+            if not file.counts:
+                self._delete(file.path)
+            else:
+                self._describe(file.path.parent)
 
     def _recordings(self) -> list[Path]:
-        if not self.folder.is_dir():
-            return []
         return sorted((path for path in self.folder.iterdir()
                        if _NAME.fullmatch(path.name) and path.is_dir()),
                       key=lambda path: int(path.name.partition('_')[0]))
@@ -215,29 +210,29 @@ class FlightRecording:
         :raises OSError: too little is free, and there is nothing more to delete.
         """
         limits = self._limits
-        present = self._file.path if self._file is not None else None
         sizes = {file: file.stat().st_size for path in self._recordings()
                  for file in mcap_files(path)}
         used = sum(sizes.values())
-        sizes.pop(present or Path(), None)
+        if self._file is not None:
+            sizes.pop(self._file.path)
         # Where somebody else fills the disk, to delete what is new would only lose that, too.
         helps = _free(self.folder) + sum(sizes.values()) > _MEGABYTE * (
             limits.disk_free + limits.file_size)
-        while True:
-            oldest = next(iter(sizes), None)
-            too_little = _free(self.folder) < limits.disk_free * _MEGABYTE
-            old = oldest is not None and now - self._written.get(oldest, now) > limits.kept
-            if oldest is not None and ((too_little and (helps or old)) or (
-                    old and used > limits.disk_used * _MEGABYTE)):
-                size = sizes.pop(oldest)
-                with suppress(OSError):  # not ours: the next one, then
-                    self._delete(oldest)
-                    used -= size
-            elif too_little:
-                self._close_file()
-                raise OSError(errno.ENOSPC, f'less than {self._limits.disk_free:.0f} MB free')
-            else:
-                return
+        for oldest, size in sizes.items():
+            old = now - self._written.get(oldest, now) > limits.kept
+            if not (self._little_room and (helps or old)) and not (
+                    old and used > limits.disk_used * _MEGABYTE):
+                break
+            with suppress(OSError):  # not ours: the next one, then
+                self._delete(oldest)
+                used -= size
+        if self._little_room:
+            self._close_file()
+            raise OSError(errno.ENOSPC, f'less than {limits.disk_free:.0f} MB free')
+
+    @property
+    def _little_room(self) -> bool:
+        return _free(self.folder) < self._limits.disk_free * _MEGABYTE
 
     def _delete(self, file: Path) -> None:
         file.unlink()
@@ -245,18 +240,17 @@ class FlightRecording:
         self._facts.pop(file, None)
         if file.parent != self.path and not mcap_files(file.parent):
             shutil.rmtree(file.parent, ignore_errors=True)
-        elif (file.parent / 'metadata.yaml').exists():
+        elif (file.parent / METADATA).exists():
             self._describe(file.parent)
 
     def _describe(self, path: Path) -> None:
         """Write the ``metadata.yaml`` of a recording, of all files but the one under way."""
-        present = self._file.path if self._file is not None else None
         for file in mcap_files(path):
-            if file != present and file not in self._facts and (found := facts_of(file)):
+            if (self._file is None or file != self._file.path) and file not in self._facts and (
+                    found := facts_of(file)):
                 self._facts[file] = found
-        replace(path / 'metadata.yaml', metadata({
-            file: facts for file in mcap_files(path)
-            if (facts := self._facts.get(file)) is not None}).encode())
+        describe(path, {file: self._facts[file] for file in mcap_files(path)
+                        if file in self._facts})
 
 
 def _free(folder: Path) -> int:

@@ -34,7 +34,8 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import parse_qos
 
-from flock_follower.bags.integrity import has_mcap_end, MCAP_MAGIC
+from flock_follower.bags.description import mcap_files, METADATA
+from flock_follower.bags.mcap_file import has_mcap_end, MCAP_MAGIC
 
 _NOTHING = 'cut short before its first message'
 
@@ -50,15 +51,9 @@ def missing_end(path: Path) -> str:
         with file.open('rb') as opened:
             if opened.read(len(MCAP_MAGIC)) in (MCAP_MAGIC, b'') and not has_mcap_end(opened):
                 return f'{file.name} was cut short'
-    if files and path.is_dir() and not (path / 'metadata.yaml').is_file():
+    if files and path.is_dir() and not (path / METADATA).is_file():
         return 'no metadata.yaml in it'
     return ''
-
-
-def mcap_files(folder: Path) -> list[Path]:
-    """Return the MCAP files of a recording in the order in which they were written."""
-    return sorted((file for file in folder.iterdir() if file.suffix == '.mcap'),
-                  key=lambda file: (len(file.name), file.name))
 
 
 class UnfinishedReader:

@@ -23,9 +23,8 @@ import shutil
 from typing import Any
 
 from flock_follower.bags.bag import absolute, BagError, failures, reason_of, serialize
-from flock_follower.bags.description import Facts, metadata, replace
-from flock_follower.bags.integrity import end_mcap, MARK, mark_incomplete
-from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
+from flock_follower.bags.description import describe, Facts, MARK, mark_incomplete
+from flock_follower.bags.mcap_file import end_mcap, McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import typestore
 
 #: Messages of so many bytes are written at once.
@@ -110,8 +109,8 @@ class BagWriter:
             self._file.close()
             if not self._fault and not reason:
                 file = self._file
-                replace(self.path / 'metadata.yaml', metadata({
-                    file.path: Facts(file.counts, file.start_ns, file.end_ns)}).encode())
+                describe(self.path, {
+                    file.path: Facts(file.counts, file.start_ns, file.end_ns)})
                 (self.path / MARK).unlink()
         except OSError as error:
             self._fault = self._fault or f'{self.path}: {reason_of(error)}'

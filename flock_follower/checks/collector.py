@@ -12,43 +12,39 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Takes messages one by one, from a node or a bag, and keeps what the checks judge."""
+"""Takes messages one by one, from a node or a bag, and keeps the observations in them."""
 
 from __future__ import annotations
 
 from collections import Counter
+import math
 from typing import Any, Final
 
 import numpy as np
 
 from flock_follower.checks.image_motion import shift, small
-from flock_follower.checks.observations import (
-    Observations,
-    odometry_row,
-    Picture,
-    Told,
-    TopicSeen,
-)
+from flock_follower.checks.observations import Observations, Picture, Told, TopicSeen
 from flock_follower.checks.pictures import camera_model
-from flock_follower.checks.sightings import sightings
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
-from flock_follower.messages import stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.markers import Detections, dictionary_names, NeighborConfig
+from flock_follower.perception.measurement import PosePrior
+from flock_follower.perception.pose import locate, target
 from flock_follower.perception.search import everywhere
 
-#: Images that are looked at for markers, and how far apart they are at least, s; at least so many,
-#: and for more only so many bytes are kept.
+#: Number of images that are searched for markers, and least time between them, s. At least so
+#: many, and for more only so many bytes, are kept.
 MOST_PICTURES: Final = 30
 PICTURE_PERIOD: Final = 0.1
 FEWEST_PICTURES: Final = 20
 MOST_BYTES: Final = 60e6
-#: Two images whose shift is measured are so far apart, s; so many pairs are wanted.
+#: Time between two images whose shift is measured, s, and the number of pairs.
 PAIR: Final = (0.03, 0.16)
 PAIRS: Final = 60
-#: Dictionaries to look in where no marker of ours is found: each family's largest.
+#: Dictionaries to search if no marker of ours is found: the largest of each family.
 OTHERS: Final = ('DICT_4X4_1000', 'DICT_5X5_1000', 'DICT_6X6_1000', 'DICT_7X7_1000',
                  'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_25h9', 'DICT_APRILTAG_36h11')
 SEARCHED: Final = 6  # pictures
@@ -59,107 +55,45 @@ class Collector:
     """
     Fills ``observations``.
 
-    :param duration: how long what comes will last, s: of a long bag few images are looked at.
+    :param duration: length of the observation, s: of a long bag few images are searched.
     """
 
     def __init__(self, observations: Observations, duration: float) -> None:
         self.observations = observations
         self._duration = duration
-        self._pair_period = duration / PAIRS
         self._kept: list[tuple[Picture, GrayImage]] = []
-        self._next_picture = self._next_pair = -np.inf
+        self._next_picture = self._next_pair = -math.inf
         self._small: tuple[float, Array] | None = None
 
-    def heard(self, topic: str, arrival: float, stamp: float = 0.0) -> None:
-        """Take that a message came; times in s."""
-        seen = self.observations.topics.setdefault(topic, TopicSeen())
-        seen.arrivals.append(arrival)
-        seen.stamps.append(stamp)
+    def take(self, name: str, topic: str, message: Any, arrival: float) -> None:
+        """
+        Take a message that arrived at a time, s.
 
-    def take(self, name: str, message: Any, arrival: float) -> None:
-        """Take a message of one of our topics, or of /diagnostics; others are only heard."""
+        :param name: our name of the topic; '' if its content is not used.
+        :param message: None if only its arrival counts.
+        """
+        seen, header = self.observations, getattr(message, 'header', None)
+        stamp = 0.0 if header is None else stamp_to_nanoseconds(header.stamp) / NANOSECONDS
+        known = seen.topics.setdefault(topic, TopicSeen())
+        known.arrivals.append(arrival)
+        known.stamps.append(stamp)
+        if message is None:
+            return
         if name == 'odom':
-            self.odometry(message, arrival)
+            frames = [message.header.frame_id, message.child_frame_id]
+            if seen.frames[-1:] != [frames]:
+                seen.frames.append(frames)
+            if seen.own is None:
+                seen.odometry.append((to_nanoseconds(arrival), message))
         elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
-            self.image(message, arrival)
+            self._image(message, arrival, stamp)
         elif name == 'camera_info':
-            self.camera_info(message)
+            seen.calibration = message
         elif name == 'mavlink/odom':
-            self.autopilot(message, arrival)
-        elif name == 'diagnostics':
+            q = message.pose.pose.orientation
+            seen.autopilot.append((stamp, np.array([q.x, q.y, q.z, q.w])))
+        elif name == '/diagnostics':
             self.diagnostics(message)
-
-    def odometry(self, message: Any, arrival: float) -> None:
-        """Take an Odometry of ``odom``."""
-        self.frames(message)
-        self.observations.odometry.append(odometry_row(message, arrival))
-
-    def frames(self, message: Any) -> None:
-        """Take the frames of an Odometry of ``odom``."""
-        frames = [message.header.frame_id, message.child_frame_id]
-        if self.observations.frames[-1:] != [frames]:
-            self.observations.frames.append(frames)
-
-    def autopilot(self, message: Any, arrival: float) -> None:
-        """Take an Odometry of ``mavlink/odom``."""
-        self.observations.autopilot.append(odometry_row(message, arrival))
-
-    def camera_info(self, message: Any) -> None:
-        """Take a CameraInfo."""
-        roi = message.roi
-        self.observations.calibration = {
-            'width': int(message.width), 'height': int(message.height),
-            'model': str(message.distortion_model),
-            **{name: [float(x) for x in getattr(message, name)] for name in 'kdp'},
-            'window': [int(x) for x in (
-                roi.x_offset, roi.y_offset, roi.width or message.width,
-                roi.height or message.height, max(message.binning_x, 1),
-                max(message.binning_y, 1))]}
-
-    def image(self, message: Any, arrival: float) -> None:
-        """Take an Image or CompressedImage; only some are decoded."""
-        pair_due = arrival >= self._next_pair
-        picture_due = pair_due and arrival >= self._next_picture  # each image is decoded once
-        if not picture_due and not pair_due:
-            return
-        picture = Picture(
-            stamp_to_nanoseconds(message.header.stamp) * 1e-9, getattr(message, 'width', 0),
-            getattr(message, 'height', 0), getattr(message, 'encoding', '') or message.format,
-            len(message.data))
-        try:
-            pixels = decode_image(message)
-        except ValueError as error:
-            picture.fault = str(error)
-            if picture_due:
-                self._next_picture = arrival + self._picture_period(0)
-                self.observations.pictures.append(picture)
-            return
-        if pair_due:
-            self._pair(picture.stamp, arrival, pixels)
-        if picture_due:
-            self._next_picture = arrival + self._picture_period(pixels.size)
-            picture.height, picture.width = pixels.shape
-            coarse = pixels[::4, ::4]
-            picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
-            self._kept.append((picture, pixels))
-
-    def _picture_period(self, size: int) -> float:
-        """Return how far apart images of so many bytes are looked at, s."""
-        room = int(MOST_BYTES / max(size, 1))
-        count = min(max(room, FEWEST_PICTURES), MOST_PICTURES)
-        return max(PICTURE_PERIOD, self._duration / count)
-
-    def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
-        """Measure how the image moved since the one before, if that is about as old."""
-        reduced, before = small(pixels), self._small
-        if before is not None and stamp - before[0] < PAIR[0]:
-            return  # the next one is further off
-        if before is None or stamp - before[0] > PAIR[1]:
-            self._small = stamp, reduced
-            return
-        right, down, quality = shift(before[1], reduced, pixels.shape[1])
-        self.observations.shifts.append([before[0], stamp, right, down, quality])
-        self._small, self._next_pair = None, arrival + self._pair_period
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -169,18 +103,59 @@ class Collector:
                 level[0] if isinstance(level, bytes) else int(level), status.message,
                 {item.key: item.value for item in status.values})
 
+    def _image(self, message: Any, arrival: float, stamp: float) -> None:
+        """Take an Image or CompressedImage; only some are decoded."""
+        if arrival < self._next_pair:
+            return
+        picture_due = arrival >= self._next_picture  # each image is decoded once
+        picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
+                          getattr(message, 'encoding', '') or message.format, len(message.data))
+        try:
+            pixels = decode_image(message)
+        except ValueError as error:
+            picture.fault = str(error)
+            if picture_due:
+                self._next_picture = arrival + self._picture_period(0)
+                self.observations.pictures.append(picture)
+            return
+        self._pair(stamp, arrival, pixels)
+        if picture_due:
+            self._next_picture = arrival + self._picture_period(pixels.size)
+            picture.height, picture.width = pixels.shape
+            coarse = pixels[::4, ::4]
+            picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
+            self._kept.append((picture, pixels))
+
+    def _picture_period(self, size: int) -> float:
+        """Return the time between images of so many bytes that are searched, s."""
+        count = min(max(int(MOST_BYTES / max(size, 1)), FEWEST_PICTURES), MOST_PICTURES)
+        return max(PICTURE_PERIOD, self._duration / count)
+
+    def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
+        """Measure the shift since the image before, if the time between them suits."""
+        reduced, before = small(pixels), self._small
+        if before is not None and stamp - before[0] < PAIR[0]:
+            return  # the next one is further off
+        if before is None or stamp - before[0] > PAIR[1]:
+            self._small = stamp, reduced
+            return
+        self.observations.shifts.append(
+            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1])])
+        self._small, self._next_pair = None, arrival + self._duration / PAIRS
+
     def finish(self, config: NeighborConfig) -> None:
-        """Look for the markers in the images that were kept."""
-        seen = self.observations
+        """Search the images that were kept for markers."""
+        seen, markers = self.observations, config.by_marker()
         seen.dictionary = config.dictionary
-        seen.wanted_markers = {number: marker.neighbor.name
-                               for number, marker in config.by_marker().items()}
-        seen.marker_sides = {number: of.marker.side_length
-                             for number, of in config.by_marker().items()}
-        camera = self._camera()
+        seen.wanted_markers = {number: of.neighbor.name for number, of in markers.items()}
+        seen.marker_sides = {number: of.marker.side_length for number, of in markers.items()}
+        try:
+            camera = camera_model(seen)
+        except ValueError:
+            camera = None  # reported with the calibration
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary, False)
-            if not set(found.ids.tolist()) & set(seen.wanted_markers):  # a third of the time
+            if not markers.keys() & set(found.ids.tolist()):  # a third of the time
                 found = everywhere(pixels, config.dictionary, True)
             picture.markers = _sides(found)
             picture.repeated = sorted(number for number, times in Counter(
@@ -188,17 +163,34 @@ class Collector:
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):
                 seen.sightings += sightings(picture.stamp, pixels, camera, found, config)
-        if not any(set(picture.markers) & set(seen.wanted_markers) for picture in seen.pictures):
+        if not any(markers.keys() & picture.markers.keys() for picture in seen.pictures):
             every = max(1, len(self._kept) // SEARCHED)
             seen.strangers = _strangers([pixels for _, pixels in self._kept[::every]],
                                         config.dictionary)
         self._kept.clear()
 
-    def _camera(self) -> CameraModel | None:
-        try:
-            return camera_model(self.observations)
-        except (KeyError, ValueError):
-            return None  # told where calibrations are looked at
+
+def sightings(stamp: float, image: GrayImage, camera: CameraModel, found: Detections,
+              config: NeighborConfig) -> list[list[float]]:
+    """
+    Return a row for each marker of ours whose edges show its position.
+
+    Stamp, s; id; position (3), m, its deviation, m, and attitude (x, y, z, w) of the marker in
+    the camera (optical).
+    """
+    rows, by_marker = [], config.by_marker()
+    for number, corners in zip(found.ids.tolist(), found.corners):
+        if number not in by_marker:
+            continue
+        neighbor, marker = by_marker[number]
+        measured = locate(image, camera, target(neighbor, config.dictionary),
+                          neighbor.markers.index(marker), corners, PosePrior())
+        if measured is not None and measured.spacing is not None:
+            T_camera_marker = measured.T_camera_body @ marker.T_body_marker
+            rows.append([stamp, float(number), *T_camera_marker.translation.tolist(),
+                         math.sqrt(float(measured.covariance[:3, :3].trace())),
+                         *T_camera_marker.quaternion.tolist()])
+    return rows
 
 
 def _sides(found: Detections) -> dict[int, float]:
@@ -209,15 +201,12 @@ def _sides(found: Detections) -> dict[int, float]:
 
 
 def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]:
-    """Return the markers of other dictionaries that are in at least two images, by dictionary."""
-    found: dict[str, list[int]] = {}
+    """Return the markers that are in at least two images, of the first dictionary with any."""
     known = dictionary_names()
     for name in (dictionary, *(other for other in OTHERS if other in known)):
         count = Counter(number for image in images
                         for number in _sides(everywhere(image, name, True)))
-        often = sorted(number for number, times in count.items()
-                       if times >= min(SEEN_TWICE, len(images)))
-        if often:
-            found[name] = often
-            break
-    return found
+        if often := sorted(number for number, times in count.items()
+                           if times >= min(SEEN_TWICE, len(images))):
+            return {name: often}
+    return {}

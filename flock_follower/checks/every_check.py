@@ -18,18 +18,17 @@ from __future__ import annotations
 
 from flock_follower.checks.connections import check_connections
 from flock_follower.checks.findings import Finding, without_consequences
-from flock_follower.checks.machine import check_machine
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.own_motion import check_own_motion
 from flock_follower.checks.pictures import check_pictures
+from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.timing import check_timing
-from flock_follower.checks.words_of_nodes import check_words
 
 
 def judge_all(seen: Observations) -> list[Finding]:
-    """Return what every check has found, without what only follows from another finding."""
+    """Return the findings of every check, without those that only follow from another one."""
     if seen.nothing_there:
         return list(check_connections(seen))
     return without_consequences(finding for check in (
         check_connections, check_timing, check_pictures, check_own_motion, check_machine,
-        check_words) for finding in check(seen))
+        check_diagnostics) for finding in check(seen))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a check has found: one line a tired reader gets at once, and what to do about it."""
+"""The result of one check: a row that names the property, its value and the action to take."""
 
 from __future__ import annotations
 
@@ -23,18 +23,16 @@ OK: Final = 'ok'
 WARNING: Final = 'warning'
 ERROR: Final = 'error'
 UNMEASURED: Final = 'not measured'
-LEVELS: Final = (OK, WARNING, ERROR, UNMEASURED)
-#: Without a measurement of these nothing is ready; all else may be measured on the next occasion.
+#: The system is not ready while one of these is unmeasured. All others may be measured later.
 ESSENTIAL: Final = frozenset({
     'images rate', 'odom rate', 'relative_pose says', 'planner says', 'mavlink_bridge says',
     'ready to arm'})
 _CAMERA: Final = ('images', 'camera_info', 'calibration')
-#: What follows from what: a row is left out if one of its causes is an error.
+_AXES: Final = (*_CAMERA, 'odom', 'odom up', 'odom ahead')
+#: The causes of each property: its row is left out if one of them is an error.
 CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     'odom ahead': (*_CAMERA, 'odom', 'odom up'),
-    'camera time offset': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
-    'marker size': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
-    'camera mounting': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
+    'camera time offset': _AXES, 'marker size': _AXES, 'camera mounting': _AXES,
     'images rate': ('images',), 'odom rate': ('odom',),
     'images processed': (*_CAMERA, 'odom'),
     'relative_pose says': (*_CAMERA, 'odom'),
@@ -44,42 +42,52 @@ CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at: ``level`` is one of ``LEVELS``; the rest is for people."""
+    """
+    One row: ``level`` is OK, WARNING, ERROR or UNMEASURED.
+
+    ``what`` is the property, as 'odom rate'; ``wanted`` is the value that it should have;
+    ``advice`` is the action to take, '' if there is none.
+    """
 
     level: str
     what: str
-    """What was looked at, as 'odom rate'."""
     measured: str
     wanted: str
-    """What it should be."""
     advice: str = ''
-    """What to do; '' where it is as it should be."""
 
     @property
     def line(self) -> str:
-        """Return all of it in one line."""
-        told = f'{self.level}: {self.what}: {self.measured}; should be: {self.wanted}'
-        return f'{told}; do: {self.advice}' if self.advice else told
+        """Return the row as one line."""
+        line = f'{self.level}: {self.what}: {self.measured}; should be: {self.wanted}'
+        return f'{line}; do: {self.advice}' if self.advice else line
 
 
 def ok(what: str, measured: str, wanted: str) -> Finding:
-    """Return that something is as it should be."""
+    """Return that a property is as it should be."""
     return Finding(OK, what, measured, wanted)
 
 
 def warning(what: str, measured: str, wanted: str, advice: str) -> Finding:
-    """Return that something could be better; it flies nevertheless."""
+    """Return that a property should be better; it does not prevent a flight."""
     return Finding(WARNING, what, measured, wanted, advice)
 
 
 def error(what: str, measured: str, wanted: str, advice: str) -> Finding:
-    """Return that something keeps it from flying."""
+    """Return that a property prevents a flight."""
     return Finding(ERROR, what, measured, wanted, advice)
 
 
 def unmeasured(what: str, why: str, wanted: str) -> Finding:
-    """Return that something could not be measured, and why."""
+    """Return that a property could not be measured, and why."""
     return Finding(UNMEASURED, what, why, wanted)
+
+
+def judged(bad: bool, poor: bool, what: str, measured: str, wanted: str,
+           advice: str) -> Finding:
+    """Return an error if ``bad``, a warning if only ``poor``, else OK without the advice."""
+    if bad or poor:
+        return Finding(ERROR if bad else WARNING, what, measured, wanted, advice)
+    return ok(what, measured, wanted)
 
 
 def without_consequences(findings: Iterable[Finding]) -> list[Finding]:
@@ -87,15 +95,15 @@ def without_consequences(findings: Iterable[Finding]) -> list[Finding]:
     findings = list(findings)
     faulty = {finding.what for finding in findings if finding.level == ERROR}
     return [finding for finding in findings if not faulty.intersection(
-        set(CAUSES.get(finding.what, ())) - {finding.what})]
+        CAUSES.get(finding.what, ()))]
 
 
 def still_needed(findings: Iterable[Finding]) -> list[str]:
-    """Return the names of what was not measured, and has to be."""
+    """Return the essential properties that were not measured."""
     return [finding.what for finding in findings
             if finding.level == UNMEASURED and finding.what in ESSENTIAL]
 
 
 def ready(findings: Sequence[Finding]) -> bool:
-    """Return whether nothing keeps it from flying, or a bag from being used, as far as needed."""
+    """Return whether nothing prevents a flight, or the use of a bag."""
     return not still_needed(findings) and all(finding.level != ERROR for finding in findings)

@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-How images moved, against how the odometry turned: it tells of axes and of stamps.
+Image motion compared with the rotation by odometry: it shows the axes and the time offset.
 
 A camera that turns by a small rotation vector r (its own axes: x right, y down, z ahead) sees the
-scene move by (-f r_y, f r_x) px, wherever the scene is. What it moves by besides, since the camera
-moves, is nearer to zero on average. So the shift of the middle of the image tells two of the three
-parts of r, each image pair, and both tell how body and camera lie to each other: of the 24 ways to
-lay three axes onto three others the one that explains the shifts best.
+scene move by (-f r_y, f r_x) px, at any distance. The motion of the camera adds a shift whose mean
+is nearer to zero. So the shift of the middle of the image gives two of the three components of r
+for each pair of images. Many pairs give the rotation between body and camera: of the 24 rotations
+that lay three axes onto three others, the one that explains the shifts best.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import Array, R_FLU_OPTICAL
+from flock_follower.geometry import Array
 from flock_follower.perception.images import GrayImage
 
-#: Images are looked at so wide, px, in so many parts.
+#: Width, px, at which images are compared, in so many parts.
 WIDTH = 192
 ROWS, COLUMNS = 2, 3
-#: Least quality of a match, 0 to 1, that counts.
+#: Least quality of a match, 0 to 1.
 RESPONSE = 0.05
-#: So many pairs, moved by so much (RMS, share of the focal length), can tell something.
+#: Number of pairs, and their RMS shift as a share of the focal length, needed for a result.
 FEW = 12
 LEAST = 0.003
-#: How far stamps are searched for, s, and in which steps.
+#: Largest time offset that is tried, and the step, s.
 FURTHEST, STEP = 0.2, 0.01
-#: The 24 rotations that lay axes onto axes.
+#: The 24 rotations that lay axes onto axes, the identity first.
 _QUARTER_TURNS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
                   if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
 
-#: Attitudes (m, 4) at stamps (m,), s, and where they are known (m,).
+#: Returns attitudes (m, 4) at stamps (m,), s, and where they are known (m,).
 Attitude = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
 
 
 def small(image: GrayImage) -> Array:
-    """Return an image at ``WIDTH`` px, as :func:`shift` takes it."""
+    """Return an image reduced to ``WIDTH`` px, the input of :func:`shift`."""
     height, width = image.shape
     size = WIDTH, max(round(height * WIDTH / width), 16)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -63,9 +63,9 @@ def small(image: GrayImage) -> Array:
 
 def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]:
     """
-    Return by how much the scene moved right and down, px of images so wide, and the quality.
+    Return the shift of the scene right and down, px of images of that width, and its quality.
 
-    The middle of what the parts of the image say: one of them may be full of the leader.
+    It is the median over the parts of the image: the leader may fill one of them.
     """
     if before.shape != after.shape:
         return 0.0, 0.0, 0.0
@@ -84,20 +84,18 @@ def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]
 
 class AxesFit(NamedTuple):
     """
-    How well turning explains the shifts: shares of their squares, 1 is all of it.
+    How well rotation explains the shifts: shares of their squares, 1 is all of it.
 
-    ``configured`` as the axes are configured, ``best`` with the best way to lay them, which is
-    ``turn`` (3, 3): R_base_configured, the identity where none is better; both with the offset of
-    stamps that suits them. ``offset``, s, is that of ``best``, the camera's stamps minus those of
-    the odometry for one moment; ``together`` the share without any offset. ``moved``: RMS, px.
-    ``zoom``: how many times as far images move as the focal length says, ``zoomed`` the share
-    with that.
+    ``configured`` is the share with the configured axes, ``best`` that with the best rotation
+    ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset
+    that suits it. ``offset``, s, is that of ``best``: the camera's stamps minus those of the
+    odometry; ``together`` is the share without an offset. ``zoom``: ratio of the shifts to those
+    expected from the focal length, ``zoomed`` the share with that ratio.
     """
 
     configured: float
     best: float
     turn: Array
-    moved: float
     offset: float
     together: float
     zoom: float
@@ -107,69 +105,63 @@ class AxesFit(NamedTuple):
 def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float,
              R_base_optical: Array, up: Array | None = None) -> AxesFit | None:
     """
-    Return how the axes fit, or None where the images hardly moved.
+    Return how the axes fit, or None if the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, shift right and down, px, and its quality.
     :param attitude: returns ``q_odom_base``, see :func:`interpolated`.
     :param focal: focal length, px.
-    :param up: (3,), what is up in base_link as configured: only what makes that z counts, besides
-        leaving it as it is. None: it is z already, but everything may be the wrong way up.
+    :param up: (3,), the upward direction in base_link as configured: besides the identity only
+        rotations that make it z are tried. None: it is z already, and all rotations are tried.
     """
     rows = np.array([row for row in shifts if row[4] >= RESPONSE]).reshape(-1, 5)
-    seen = rows[:, 2:4]
-    moved = float(np.sqrt(np.mean(np.sum(seen**2, axis=1)))) if len(rows) else 0.0
-    if len(rows) < FEW or moved < LEAST * focal:
+    if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST * focal:
         return None
-    turns = [turn for turn in _QUARTER_TURNS if up is None or turn[2].dot(up) > 0.5
-             or np.array_equal(turn, np.eye(3))]
-    own = next(n for n, turn in enumerate(turns) if np.array_equal(turn, np.eye(3)))
+    turns = [turn for n, turn in enumerate(_QUARTER_TURNS)
+             if n == 0 or up is None or turn[2].dot(up) > 0.5]
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
     shares = np.full((len(offsets), len(turns)), -1.0)
     for n, offset in enumerate(offsets.tolist()):
         turned, seen = _turned(rows, attitude, offset)
         if len(seen) >= FEW:
-            shares[n] = [_explained(turned @ turn.T @ R_base_optical, seen, focal)
+            shares[n] = [_share(_expected(turned @ turn.T @ R_base_optical, focal), seen)
                          for turn in turns]
     if shares.max() < 0.0:
         return None
-    # Of those alike, as where it only turned about one axis, the configured one.
-    best = own if shares[:, own].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
+    # If several are equal, as when it only turned about one axis, the configured one wins.
+    best = 0 if shares[:, 0].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
     curve = shares[:, best]
     peak = int(curve.argmax())
     offset = _summit(offsets, curve, peak)
     turned, seen = _turned(rows, attitude, offset)
     expected = _expected(turned @ turns[best].T @ R_base_optical, focal)
     zoom = float(np.sum(expected * seen) / np.sum(expected**2))
-    return AxesFit(float(shares[:, own].max()), float(curve[peak]), turns[best], moved, offset,
+    return AxesFit(float(shares[:, 0].max()), float(curve[peak]), turns[best], offset,
                    float(curve[len(offsets) // 2]), zoom, _share(zoom * expected, seen))
 
 
 def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:
-    """Return rotation vectors in base_link (n, 3), and shifts (n, 2), where both are known."""
+    """Return rotation vectors in base_link (n, 3), and shifts (n, 2), if both are known."""
     (q1, known1), (q2, known2) = (attitude(rows[:, k] - offset) for k in (0, 1))
     known = known1 & known2
     v1, w1, v2, w2 = q1[known, :3], q1[known, 3:], q2[known, :3], q2[known, 3:]
     turned = w1 * v2 - w2 * v1 - np.cross(v1, v2)
     cosine = w1 * w2 + np.sum(v1 * v2, axis=1, keepdims=True)
-    # Images follow one another so soon that sine and angle are alike.
+    # The angle between two images is so small that it equals its sine.
     return 2.0 * np.sign(cosine) * turned, rows[known, 2:4]
 
 
-def _explained(turned: Array, seen: Array, focal: float) -> float:
-    """Return the share of the squares of shifts that rotation vectors in optical axes explain."""
-    return _share(_expected(turned, focal), seen)
-
-
 def _expected(turned: Array, focal: float) -> Array:
+    """Return the shifts (n, 2) by rotation vectors (n, 3) in optical axes."""
     return focal * np.column_stack([-turned[:, 1], turned[:, 0]])
 
 
 def _share(expected: Array, seen: Array) -> float:
+    """Return the share of the squares of the shifts that the expected ones explain."""
     return 1.0 - float(np.sum((seen - expected)**2) / np.sum(seen**2))
 
 
 def _summit(offsets: Array, curve: Array, peak: int) -> float:
-    """Return where a parabola through the three points about the peak is highest."""
+    """Return the maximum of the parabola through the three points about the peak."""
     if not 0 < peak < len(curve) - 1:
         return float(offsets[peak])
     before, top, after = curve[peak - 1:peak + 2].tolist()
@@ -177,16 +169,11 @@ def _summit(offsets: Array, curve: Array, peak: int) -> float:
     return float(offsets[peak]) + (0.0 if bend >= 0.0 else STEP * 0.5 * (before - after) / bend)
 
 
-def optical(camera_rotation: Array) -> Array:
-    """Return ``R_base_optical`` of a camera mounted so (FLU axes on base_link)."""
-    return camera_rotation @ R_FLU_OPTICAL
-
-
 def interpolated(stamps: Array, quaternions: Array, longest: float = 0.3) -> Attitude:
     """
-    Return the attitudes at any stamps (m,) from those (n, 4) at ``stamps`` (n,), s, in order.
+    Return a function that interpolates attitudes (n, 4) at ``stamps`` (n,), s, in order.
 
-    With them comes where they are known (m,): between two that are at most ``longest`` s apart.
+    An attitude is known between two that are at most ``longest`` s apart.
     """
     same = np.cumprod(np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1, 1))
     smooth = quaternions * np.concatenate([[1.0], same])[:, None]

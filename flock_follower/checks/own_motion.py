@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The odometry: twist, axes, what it lacks, jumps; and whether the autopilot says the same."""
+"""The odometry: velocity, jumps and gaps in it, its axes, and whether the autopilot agrees."""
 
 from __future__ import annotations
 
@@ -22,118 +22,121 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.axes import check_axes, LEAN
-from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
-from flock_follower.checks.image_motion import interpolated
-from flock_follower.checks.marker_size import check_marker_size
-from flock_follower.checks.observations import Observations, odometry_message, OwnMotion
+from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
+from flock_follower.checks.image_motion import AxesFit, fit_axes, interpolated
+from flock_follower.checks.observations import Observations, OwnMotion
+from flock_follower.checks.pictures import camera_model
+from flock_follower.checks.resting_marker import check_resting_marker
 from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
     quaternion_to_matrix,
-    Transform,
+    R_FLU_OPTICAL,
+    rpy_from_matrix,
     wrap_angle,
     yaw_from_quaternion,
 )
-from flock_follower.messages import to_nanoseconds
+from flock_follower.messages import OdometryState
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM
 from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters.spec import filled, NAMES
+from flock_follower.parameters.files import COMMON
+from flock_follower.parameters.spec import filled
 
-#: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
+#: rad: difference between the yaws of odometry and autopilot, from which on there is a warning;
+#: the bridge refuses above the second.
 YAWS: Final = (0.12, 0.35)
-#: Share of the messages that say nothing, above which nobody can fly by the rest.
+#: Share of unusable messages above which nobody can fly by the rest.
 LOST: Final = 0.02
-
-
-def read(seen: Observations, params: SourceParams) -> OwnMotion:
-    """Read the odometry of a running system: how is known once its nodes have answered."""
-    motion = OwnMotion(OdometrySource(params))
-    if seen.static_child and not any(params.child_position) and not any(params.child_rpy):
-        motion.source.place_child(
-            Transform.from_quaternion(seen.static_child[:3], seen.static_child[3:]))
-    frame, child = seen.frames[-1]
-    for row in seen.odometry:
-        motion.take(odometry_message(row, frame, child), to_nanoseconds(row[0]))
-    return motion
+#: deg: mean lean of base_link from which on there is a warning, and an error.
+LEAN, LYING = 20.0, 40.0
+#: The image motion is conclusive if rotation explains this share of it. Other axes, or an offset
+#: of stamps, are reported if they reduce the rest by these factors.
+EXPLAINED: Final = 0.6
+TURNED, SHIFTED = 0.4, 0.8
+#: s: offset of the camera's stamps from which on there is a warning, and an error. At 20, 30 and
+#: 50 ms the squared errors of a neighbour's position are 10, 30 and 350 times its covariance.
+OFFSET, BAD_OFFSET = 0.010, 0.030
+#: s: between attitudes farther apart the rotation is not known well enough to find an offset.
+SLOW: Final = 0.06
+#: Relative error of a focal length that is reported, and the share that it must explain.
+ZOOM, ZOOMED = 0.2, 0.9
+TURN_MOVES: Final = 'images move as odometry turns'
+IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
+DERIVED: Final = 'works: derived from the positions, which is noisier'
 
 
 def check_own_motion(seen: Observations) -> Iterator[Finding]:
-    """Yield what is to be said of the odometry."""
+    """Check the odometry."""
     if not seen.frames or not (seen.odometry or seen.own):
         return
     try:
         params = filled(SourceParams(), seen.parameters['relative_pose'], 'odom_')
     except (KeyError, ValueError):
         params = SourceParams()
-    motion = seen.own or read(seen, params)
+    motion = seen.own or _read(seen, params)
+    count = motion.lost + len(motion.states)
     if motion.lost:
-        count = motion.lost + len(motion.states)
-        say = error if motion.lost > LOST * count else warning
-        yield say('odom', f'{motion.lost} of {count} say nothing: {motion.why}',
-                  'position and attitude', 'wait until its source is initialised; more texture, '
-                  'light; rtabmap: publish_null_when_lost:=false')
+        yield judged(motion.lost > LOST * count, True, 'odom',
+                     f'{motion.lost} of {count} say nothing: {motion.why}',
+                     'position and attitude', 'wait until its source is initialised; more '
+                     'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return
     yield from _parameters_alike(seen)
     yield _frames(seen)
-    yield from _survived(motion)
+    if jumps := motion.events['odom jumped']:
+        yield warning('odom jumps', f'{jumps} in {len(motion.states)} messages', 'none',
+                      'turn off loop closure and relocalisation, or take the frame without them')
     yield _twist(motion)
     yield from _lacking(motion)
-    yield from check_axes(seen, motion.states, motion.source.period, params)
-    yield from check_marker_size(seen, motion.states)
+    yield from _axes(seen, motion, params)
+    yield from check_resting_marker(seen, motion.states)
     yield from _against_autopilot(seen, motion)
 
 
+def _read(seen: Observations, params: SourceParams) -> OwnMotion:
+    """Read the odometry as our nodes read it."""
+    motion = OwnMotion(OdometrySource(params))
+    if seen.static_child is not None and not any((*params.child_position, *params.child_rpy)):
+        motion.source.place_child(seen.static_child)
+    for arrival, message in seen.odometry:
+        motion.take(message, arrival)
+    return motion
+
+
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
-    """Yield parameters of the odometry that our nodes do not have alike."""
-    of_cameras = sorted({name for own in seen.parameters.values() for name in own
-                         if name == NAMES or name.startswith('camera.')})
-    for name in ('odom_child_position', 'odom_child_rpy', 'odom_twist_frame', 'odom_std',
-                 *of_cameras):
-        told = {node: own[name] for node, own in seen.parameters.items() if name in own}
-        if len({str(value) for value in told.values()}) > 1:
-            shown = ', '.join(f'{value} in {node}' for node, value in told.items())
-            yield error(name, shown, 'the same in every node', 'set it under /** in one file')
-    rpy = {node: seen.parameters[node]['camera_rpy'] for node in ('relative_pose', 'planner')
-           if 'camera_rpy' in seen.parameters.get(node, {})}
-    if len({str(value) for value in rpy.values()}) > 1:
-        yield error('camera_rpy', ', '.join(f'{v} in {node}' for node, v in rpy.items()),
-                    'the same in relative_pose and planner', 'set both')
+    """Report parameters of odometry and cameras that our nodes do not have alike."""
+    shared = (*COMMON, 'camera_rpy')
+    for name in sorted({name for own in seen.parameters.values() for name in own
+                        if name in shared or name.startswith('camera.')}):
+        values = {node: own[name] for node, own in seen.parameters.items() if name in own}
+        if len(set(map(str, values.values()))) > 1:
+            yield error(name, ', '.join(f'{value} in {node}' for node, value in values.items()),
+                        'the same in every node', 'set it under /** in one file')
 
 
 def _frames(seen: Observations) -> Finding:
     what, wanted = 'odom frames', 'one pair, both named'
     header, child = seen.frames[-1]
-    told = f'{header or "(none)"} to {child or "(none)"}'
+    measured = f'{header or "(none)"} to {child or "(none)"}'
     if len(seen.frames) > 1:
-        return error(what, f'changed {len(seen.frames) - 1} times, now {told}', wanted,
+        return error(what, f'changed {len(seen.frames) - 1} times, now {measured}', wanted,
                      'is it published by two sources? Every change starts perception anew')
-    if not header:
-        return warning(what, told, wanted, 'have its source fill header.frame_id')
-    return ok(what, told, wanted)
-
-
-def _survived(motion: OwnMotion) -> Iterator[Finding]:
-    jumps = motion.events['odom jumped']
-    if jumps:
-        yield warning('odom jumps', f'{jumps} in {len(motion.states)} messages', 'none',
-                      'turn off loop closure and relocalisation, or take the frame without them')
-    if back := motion.events['odom stamp jumped back']:
-        yield warning('odom stamps', f'jumped back {back} times', 'each later than before',
-                      'is an old bag played into it, or is its clock set?')
+    return judged(False, not header, what, measured, wanted,
+                  'have its source fill header.frame_id')
 
 
 def _twist(motion: OwnMotion) -> Finding:
     twist = motion.source.twist
     what, wanted = 'odom velocity', 'as its positions move'
     if 'velocity' in motion.source.missing:
-        return warning(what, 'none (not finite)', wanted,
-                       'works: derived from the positions, which is noisier')
+        return warning(what, 'none (not finite)', wanted, DERIVED)
     if twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted):
         return error(what, f'read in {twist.wanted}, the positions say {twist.found}', wanted,
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
         return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
-                       'works: derived from the positions, which is noisier; look at the source')
+                       f'{DERIVED}; look at the source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
@@ -143,52 +146,122 @@ def _twist(motion: OwnMotion) -> Finding:
 
 def _lacking(motion: OwnMotion) -> Iterator[Finding]:
     missing = motion.source.missing
-    what = 'odom angular rate'
-    rates = np.array([state.angular_velocity for state in motion.states])
-    if 'angular velocity' in missing:
-        yield warning(what, 'always zero', 'that of the gyroscope',
-                      'works: derived from the attitudes, which is noisier; have it sent if its '
-                      'source can')
+    fastest = max(float(np.abs(state.angular_velocity).max()) for state in motion.states)
+    zero = 'angular velocity' in missing
+    yield judged(False, zero, 'odom angular rate', 'always zero' if zero else
+                 f'up to {math.degrees(fastest):.0f} deg/s', 'that of the gyroscope',
+                 'works: derived from the attitudes, which is noisier; have it sent if its source '
+                 'can')
+    parts = sorted({name.rsplit(' ', 1)[-1] for name in missing if 'covariance' in name})
+    yield judged(False, bool(parts), 'odom covariances',
+                 f'none, or not all, of {" and ".join(parts)}' if parts else 'there',
+                 'those of its filter',
+                 'works: odom_std stands in; set that to what your odometry errs by')
+
+
+def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterator[Finding]:
+    """Check that up is up and ahead is ahead, the time offset and the focal length."""
+    up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
+    fit = _fit(seen, motion.states, up if lean >= LYING else None)
+    turned = fit is not None and fit.best >= EXPLAINED and (
+        1.0 - fit.best < TURNED * (1.0 - fit.configured))
+    what, wanted = 'odom up', "base_link's z up"
+    R = (np.eye(3) if fit is None else fit.turn) @ quaternion_to_matrix(
+        quaternion_from_rpy(*params.child_rpy))
+    rpy = f'[{",".join(str(round(angle, 4) + 0.0) for angle in rpy_from_matrix(R).tolist())}]'
+    if lean >= LYING:
+        largest = int(np.argmax(np.abs(up)))
+        axis = f'{"-" if up[largest] < 0.0 else "+"}{"xyz"[largest]}'
+        yield error(what, f'{axis} of base_link is up (leans {lean:.0f} deg)', wanted,
+                    f'odom_child_rpy:={rpy} fits the images' if turned else
+                    'its child frame is a camera or its IMU (x right, y down): '
+                    'odom_child_rpy:=[-1.5708,0.0,-1.5708]' if axis == '-y' else
+                    'its child frame is not base_link: set odom_child_rpy to how it sits on the '
+                    'body (child_frame_id tells which it is), see docs/sensors.md')
+    elif turned and fit is not None and fit.turn[2, 2] < -0.5:
+        yield error(what, 'images turn the other way round: its z is down', wanted,
+                    'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
+                    'the camera upside down (camera_rpy)?')
+        return
     else:
-        yield ok(what, f'up to {math.degrees(float(np.abs(rates).max())):.0f} deg/s',
-                 'that of the gyroscope')
-    lacking = sorted(name for name in missing if 'covariance' in name)
-    if lacking:
-        parts = sorted({name.rsplit(' ', 1)[-1] for name in lacking})
-        yield warning('odom covariances', f'none, or not all, of {" and ".join(parts)}',
-                      'those of its filter',
-                      'works: odom_std stands in; set that to what your odometry errs by')
+        yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,
+                     'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
+    if fit is None:
+        yield unmeasured('odom ahead', 'turned too little: turn it by hand, 30 deg', TURN_MOVES)
+        yield unmeasured('camera time offset', 'turned too little', IN_TIME)
+        return
+    what, share = 'odom ahead', f'turning explains {max(fit.configured, 0.0):.0%} of it'
+    if turned and lean < LYING:
+        yield error(what, f'{share}; with other axes {fit.best:.0%}', TURN_MOVES,
+                    f'check camera_rpy; if that is right, set odom_child_rpy:={rpy}')
+    elif fit.configured >= EXPLAINED:
+        yield ok(what, share, TURN_MOVES)
+    elif not turned:
+        yield unmeasured(what, f'{share}; turn it by hand', TURN_MOVES)
+    period = motion.source.period
+    if fit.best >= EXPLAINED and period <= SLOW:
+        yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))
     else:
-        yield ok('odom covariances', 'there', 'those of its filter')
+        yield unmeasured('camera time offset', share if period <= SLOW else
+                         f'odometry comes only every {period:.2f} s', IN_TIME)
+    # The parts of a fisheye image that are compared move less than its middle does.
+    if (fit.zoomed >= ZOOMED and abs(fit.zoom - 1.0) > ZOOM
+            and seen.calibration.distortion_model != 'equidistant'):
+        yield warning('focal length', f'images move {fit.zoom:.2f} times as far as it says',
+                      'once', 'is the calibration of this lens, and for this size of images?')
+
+
+def _offset(fit: AxesFit, known: float) -> Finding:
+    """Check the time offset; ``known``, s, is the parameter ``time_offset``."""
+    off = f'about {1e3 * abs(fit.offset):.0f} ms'
+    side, rest = 'later' if fit.offset > 0.0 else 'earlier', abs(fit.offset + known)
+    if abs(fit.offset) <= OFFSET or 1.0 - fit.best >= SHIFTED * (1.0 - fit.together):
+        return ok('camera time offset', off, IN_TIME)
+    return judged(rest > BAD_OFFSET, rest > OFFSET, 'camera time offset',
+                  f'images are stamped {off} {side} than odometry' if rest > OFFSET else
+                  f'{off} {side}, as time_offset says', IN_TIME,
+                  'have the driver stamp the middle of the exposure, by one clock; '
+                  f'else set time_offset:={-fit.offset:.3f} of relative_pose')
+
+
+def _fit(seen: Observations, states: list[OdometryState], up: Array | None) -> AxesFit | None:
+    try:
+        camera = camera_model(seen)
+    except ValueError:
+        return None
+    mounted = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
+    attitude = interpolated(np.array([state.stamp * 1e-9 for state in states]),
+                            np.array([state.quaternion for state in states]))
+    return fit_axes(seen.shifts, attitude, float(camera.matrix[0, 0]),
+                    quaternion_to_matrix(quaternion_from_rpy(*mounted)) @ R_FLU_OPTICAL, up)
 
 
 def _against_autopilot(seen: Observations, motion: OwnMotion) -> Iterator[Finding]:
-    """Yield whether odometry and autopilot agree which way is east, and up."""
+    """Check that odometry and autopilot agree about east and up."""
     if len(seen.autopilot) < 3:
         return
-    theirs = interpolated(np.array([row[1] for row in seen.autopilot]),
-                          np.array([row[5:9] for row in seen.autopilot]))
-    yaws, leans = [], []
-    others, known = theirs(np.array([state.stamp * 1e-9 for state in motion.states]))
-    for state, other, there in zip(motion.states, others, known):
-        if there:
-            yaws.append(wrap_angle(yaw_from_quaternion(state.quaternion)
-                                   - yaw_from_quaternion(other)))
-            ups = quaternion_to_matrix(state.quaternion)[2], quaternion_to_matrix(other)[2]
-            leans.append(math.acos(min(1.0, max(-1.0, float(ups[0].dot(ups[1]))))))
-    if not yaws:
+    stamps, quaternions = zip(*seen.autopilot)
+    others, known = interpolated(np.array(stamps), np.array(quaternions))(
+        np.array([state.stamp * 1e-9 for state in motion.states]))
+    pairs = [(state.quaternion, other)
+             for state, other, there in zip(motion.states, others, known) if there]
+    if not pairs:
         return
+    yaws = [wrap_angle(yaw_from_quaternion(own) - yaw_from_quaternion(other))
+            for own, other in pairs]
     yaw = math.atan2(float(np.mean(np.sin(yaws))), float(np.mean(np.cos(yaws))))
-    told, wanted = f'{math.degrees(yaw):+.0f} deg', f'within {math.degrees(YAWS[0]):.0f} deg'
-    if abs(yaw) > YAWS[1]:
-        yield error('odom and autopilot', f'yaws differ by {told}', wanted, 'have the autopilot '
-                    'fuse this odometry (forward_odometry:=true), or start it facing as it does')
-    elif abs(yaw) > YAWS[0]:
-        yield warning('odom and autopilot', f'yaws differ by {told}', wanted,
-                      'a compass near iron? Above 20 deg the bridge refuses to fly')
-    else:
-        yield ok('odom and autopilot', f'yaws differ by {told}', wanted)
-    if (lean := math.degrees(float(np.median(leans)))) > LEAN:
+    yield judged(abs(yaw) > YAWS[1], abs(yaw) > YAWS[0], 'odom and autopilot',
+                 f'yaws differ by {math.degrees(yaw):+.0f} deg',
+                 f'within {math.degrees(YAWS[0]):.0f} deg',
+                 'have the autopilot fuse this odometry (forward_odometry:=true), or start it '
+                 'facing as it does' if abs(yaw) > YAWS[1] else
+                 'a compass near iron? Above 20 deg the bridge refuses to fly')
+    ups = [float(quaternion_to_matrix(own)[2].dot(quaternion_to_matrix(other)[2]))
+           for own, other in pairs]
+    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(np.median(ups))))))
+    if lean > LEAN:
         yield error('odom and autopilot', f'lean differently by {lean:.0f} deg', 'the same',
                     'the pose of the IMU on the body (odom_child_rpy), or that of the autopilot, '
                     'is wrong')

@@ -12,26 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Images: their calibration, what can be seen on them, the marker in sight and how large it is."""
+"""Images: their calibration, their brightness, and the markers in them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, judged, ok, warning
 from flock_follower.checks.observations import Observations, Picture
 from flock_follower.perception.camera import CameraModel
 
-#: Sides of a marker, px: smaller its range gets noisy; smaller still it is lost.
+#: Sides of a marker, px: below the first its range is noisy, below the second it is lost.
 SMALL, TINY = 18.0, 12.0
-#: Mean grey levels: darker, brighter shows nothing; a deviation below this is a wall, or a cap.
+#: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
-#: A marker in fewer of the images than this share is hardly in sight.
+#: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
-#: Images that show a marker twice: one may err.
+#: Number of images that show a marker twice: a single one may be a false detection.
 TWICE: Final = 2
 
 
@@ -39,108 +39,105 @@ def camera_model(seen: Observations) -> CameraModel:
     """
     Return the camera of the newest CameraInfo, as relative_pose has it.
 
-    :raises ValueError: naming what is wrong with the calibration.
+    :raises ValueError: there is no calibration, or it is wrong.
     """
-    told: dict[str, Any] = seen.calibration
+    info = seen.calibration
+    if info is None:
+        raise ValueError('no calibration')
     return CameraModel.from_calibration(
-        told['k'], told['d'], told['model'], told['width'], told['height'], told['p'],
-        rectified=bool(seen.value('relative_pose', 'rectified', False))).scaled(*told['window'])
+        info.k, info.d, info.distortion_model, info.width, info.height, info.p,
+        rectified=bool(seen.value('relative_pose', 'rectified', False))).scaled(
+            info.roi.x_offset, info.roi.y_offset, info.roi.width or info.width,
+            info.roi.height or info.height, max(info.binning_x, 1), max(info.binning_y, 1))
 
 
 def check_pictures(seen: Observations) -> Iterator[Finding]:
-    """Yield what is to be said of calibration, images and markers."""
+    """Check calibration, images and markers."""
     good = [picture for picture in seen.pictures if not picture.fault]
     if faults := [picture.fault for picture in seen.pictures if picture.fault]:
         yield error('images', faults[0], 'an encoding that can be read',
                     'set the format of the camera driver to mono8, rgb8 or bgr8')
-    yield from _calibration(seen, good)
+    if seen.calibration is not None:  # else it is reported as a missing topic
+        yield _calibration(seen, good)
     if good:
         yield _exposure(good)
         yield _marker(seen, good)
         yield from _duplicates(seen, good)
 
 
-def _calibration(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:
-    if not seen.calibration:
-        return  # told as a topic that is missing
-    wanted = 'a calibration of these images'
+def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
+    what, wanted = 'calibration', 'a calibration of these images'
     calibrate = 'calibrate the camera at this size (camera_calibration), give its driver the file'
     try:
         camera = camera_model(seen)
     except ValueError as problem:
-        yield error('calibration', str(problem), wanted, calibrate)
-        return
-    sizes = sorted({(picture.width, picture.height) for picture in pictures})
-    for width, height in sizes:
-        if (width, height) != (camera.width, camera.height):
-            yield error('calibration', f'for {camera.width}x{camera.height}, images are '
-                        f'{width}x{height}', wanted, calibrate)
-            return
-    told = f'{camera.width}x{camera.height} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
+        return error(what, str(problem), wanted, calibrate)
+    size = f'{camera.width}x{camera.height}'
+    if others := {f'{picture.width}x{picture.height}' for picture in pictures} - {size}:
+        return error(what, f'for {size}, images are {min(others)}', wanted, calibrate)
+    measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     if straight and not rectified and np.any(camera.distortion):
-        yield error('calibration', f'{told}, distorted, but the topic says rectified', wanted,
-                    'start relative_pose with rectified:=true')
-    elif rectified and not straight and any(seen.calibration['d']):
-        yield warning('calibration', f'{told}; rectified is true, the topic does not say so',
-                      wanted, 'rectified:=true only for images whose distortion was removed')
-    else:
-        yield ok('calibration', told, wanted)
+        return error(what, f'{measured}, distorted, but the topic says rectified', wanted,
+                     'start relative_pose with rectified:=true')
+    if rectified and not straight and any(seen.calibration.d):
+        return warning(what, f'{measured}; rectified is true, the topic does not say so', wanted,
+                       'rectified:=true only for images whose distortion was removed')
+    return ok(what, measured, wanted)
 
 
 def _exposure(pictures: list[Picture]) -> Finding:
-    first = pictures[-1]
+    newest = pictures[-1]
     brightness = float(np.median([picture.brightness for picture in pictures]))
     contrast = float(np.median([picture.contrast for picture in pictures]))
-    told = (f'{first.width}x{first.height} {first.encoding}, grey level {brightness:.0f} '
-            f'± {contrast:.0f}')
+    measured = (f'{newest.width}x{newest.height} {newest.encoding}, grey level {brightness:.0f} '
+                f'± {contrast:.0f}')
     wanted = f'grey level {DARK:.0f} to {BRIGHT:.0f}'
     if brightness < DARK:
-        return error('images', f'{told}: black', wanted,
+        return error('images', f'{measured}: black', wanted,
                      'take off the cap; more light, or a longer exposure')
     if brightness > BRIGHT:
-        return error('images', f'{told}: white', wanted, 'expose less (automatic exposure on)')
+        return error('images', f'{measured}: white', wanted, 'expose less (automatic exposure on)')
     if contrast < FLAT:
-        return warning('images', f'{told}: one grey', wanted, 'is something before the lens?')
-    return ok('images', told, wanted)
+        return warning('images', f'{measured}: one grey', wanted, 'is something before the lens?')
+    return ok('images', measured, wanted)
 
 
 def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
-    ids = ', '.join(map(str, sorted(seen.wanted_markers)))
-    what, ours = 'marker', f'marker {ids} of {seen.dictionary}'
-    wanted = f'{ours}, {SMALL:.0f} px'
-    sides = [side for picture in pictures for number, side in picture.markers.items()
-             if number in seen.wanted_markers]
+    ours = f'marker {", ".join(map(str, sorted(seen.wanted_markers)))} of {seen.dictionary}'
+    what, wanted = 'marker', f'{ours}, {SMALL:.0f} px'
+    found = [[side for number, side in picture.markers.items() if number in seen.wanted_markers]
+             for picture in pictures]
+    sides = [side for each in found for side in each]
+    if not sides and seen.strangers:
+        name, numbers = next(iter(seen.strangers.items()))
+        return error(what, f'marker {", ".join(map(str, numbers[:4]))} of {name} in sight, '
+                     f'not {ours}', wanted, 'write dictionary and marker_id of the print into '
+                     'config/neighbors.yaml, or print that one')
     if not sides:
-        if seen.strangers:
-            name, numbers = next(iter(seen.strangers.items()))
-            told = f'marker {", ".join(map(str, numbers[:4]))} of {name}'
-            return error(what, f'{told} in sight, not {ours}', wanted, 'write dictionary and '
-                         'marker_id of the print into config/neighbors.yaml, or print that one')
         return warning(what, f'not in sight in {len(pictures)} images', wanted,
                        'hold the leader before the camera; is the print flat, its margin white?')
-    share = sum(bool(set(p.markers) & set(seen.wanted_markers)) for p in pictures) / len(pictures)
-    side = float(np.median(sides))
-    told = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
+    share, side = sum(map(bool, found)) / len(pictures), float(np.median(sides))
+    measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
     if side < TINY:
-        return error(what, told, wanted,
+        return error(what, measured, wanted,
                      'come nearer, print it larger, or use a longer lens or a finer image')
     if side < SMALL:
-        return warning(what, told, wanted,
+        return warning(what, measured, wanted,
                        'come nearer, or print it larger: a small one is lost easily')
     if share < SELDOM:
-        return warning(what, told, f'{wanted}, most of the time',
+        return warning(what, measured, f'{wanted}, most of the time',
                        'keep it in sight: light, blur, a cut-off margin')
-    return ok(what, told, wanted)
+    return ok(what, measured, wanted)
 
 
 def _duplicates(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:
-    """Yield which neighbours' markers were seen more than once in an image."""
+    """Report the neighbours' markers that were seen more than once in an image."""
     for number, name in sorted(seen.wanted_markers.items()):
         count = sum(number in picture.repeated for picture in pictures)
         if count >= TWICE:
-            yield (error if seen.live else warning)(
-                'marker id', f'marker {number} twice in {count} of {len(pictures)} images',
-                'each id once',
-                f'cover the print that is not on {name}, or give {name} another id')
+            yield judged(seen.live, True, 'marker id',
+                         f'marker {number} twice in {count} of {len(pictures)} images',
+                         'each id once', f'cover the print that is not on {name}, or give {name} '
+                         'another id')

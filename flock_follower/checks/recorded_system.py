@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a bag holds of a system, read as the node that listens reads what it hears."""
+"""The observations in a bag: the checks judge them as those of a running system."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast, Final
+from typing import Any, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.checks.collector import Collector
@@ -33,7 +33,7 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
-from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras_table import alone
@@ -41,20 +41,21 @@ from flock_follower.parameters.spec import filled
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
-#: Of a longer bag only the beginning is looked at, s.
+#: s: of a longer bag only the beginning is checked.
 LONGEST: Final = 300.0
 DIAGNOSTICS: Final = '/diagnostics'
-#: Of the other topics it is only counted how many messages there are.
-READ: Final = ('odom', 'camera_info', 'mavlink/odom', 'diagnostics')
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
+#: Of the other topics only the messages are counted.
+READ: Final = (*_IMAGES, 'odom', 'camera_info', 'mavlink/odom', DIAGNOSTICS)
+_AFTER_STAMP: Final = 12  # bytes: CDR's header, and the stamp
 
 
 class RecordedSystem:
     """
-    The rules of ``check`` on a bag: takes its messages one by one, in order, and judges them.
+    Takes the messages of a bag one by one, in order, and judges them.
 
     :param values: the parameters with which the bag is to be used, by node.
-    :param camera: the one of several to look at; '': the first.
+    :param camera: the one of several to check; '': the first.
     :param remaps: names of topics in the bag, by ours, if they differ.
     :param own: filled by the caller, who reads the odometry anyway; None: it is read here.
     :raises ValueError: for a camera that does not exist, or a neighbours file that is wrong.
@@ -82,27 +83,27 @@ class RecordedSystem:
         self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
         self._calibration = b''
         self.stop_ns = bag.start_ns + round(LONGEST * NANOSECONDS)
-        """What comes later is not looked at."""
+        """What comes later is not checked."""
         self.topics = {full: name for name, full in names.items()
-                       if full in bag.topics and bag.topics[full].msgtype == TYPES[name]
-                       and bag.topics[full].count
+                       if full in self.seen.topics and bag.topics[full].msgtype == TYPES[name]
                        and (name not in _IMAGES or name == self.seen.image_name)}
         """Our names of the topics to take, by their full names."""
-        if (told := bag.topics.get(DIAGNOSTICS)) is not None and told.count:
-            self.topics[DIAGNOSTICS] = 'diagnostics'
+        if DIAGNOSTICS in self.seen.topics:
+            self.topics[DIAGNOSTICS] = DIAGNOSTICS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> Any:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        Return its fields if they were read. Of bytes that are no message of the type the bag is
-        said to be incomplete.
+        Return its fields if they were read. If the bytes are no message of the type, the bag is
+        reported as incomplete.
         """
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
             return None
-        time, message = time_ns / NANOSECONDS, cast(Any, None)
-        if name in _IMAGES or (name in READ and not self._is_known(name, data)):
+        message: Any = None
+        repeated = name == 'camera_info' and data[_AFTER_STAMP:] == self._calibration
+        if name in READ and not repeated:
             try:
                 message = read_odometry(data) if msgtype == ODOMETRY else (
                     deserialize(data, msgtype))
@@ -111,35 +112,24 @@ class RecordedSystem:
                     self._own.lost, self._own.why = self._own.lost + 1, str(problem)
                 self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
                 return None
-        header = getattr(message, 'header', None)
-        self._collector.heard(topic, time, 0.0 if header is None else (
-            stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
-        if name == 'odom':
-            self._collector.frames(message)
-            if self._reads:
-                self._own.take(message, time_ns)
-        elif message is not None:
-            self._collector.take(name, message, time)
+        if name == 'camera_info':
+            self._calibration = data[_AFTER_STAMP:]
+        elif name == 'odom' and self._reads:
+            self._own.take(message, time_ns)
+        self._collector.take(name, topic, message, time_ns / NANOSECONDS)
         return message
 
     def findings(self) -> list[Finding]:
-        """Return what the rules find in all that was taken."""
+        """Return the findings in all messages that were taken."""
         self._collector.finish(self._neighbors)
         return judge_all(self.seen)
-
-    def _is_known(self, name: str, data: bytes) -> bool:
-        """Return whether this is the calibration of the message before."""
-        if name != 'camera_info':
-            return False
-        before, self._calibration = self._calibration, data[12:]  # without its stamp
-        return before == self._calibration
 
 
 def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = '',
               namespace: str = '', remaps: Mapping[str, str] | None = None
               ) -> tuple[Observations, list[Finding]]:
     """
-    Return what a bag holds, and what the rules find in it; see :class:`RecordedSystem`.
+    Return the observations in a bag and the findings; the arguments are those of RecordedSystem.
 
     :raises BagError: if the bag cannot be read at all.
     """

@@ -13,53 +13,82 @@
 # limitations under the License.
 
 """
-A marker at rest, seen while the camera moves: it tells its size, and how the camera is mounted.
+A marker at rest, seen by a moving camera: it shows its size, and how the camera is mounted.
 
-By odometry and image it has to stay where it is. Where it comes nearer by more, or less, than the
-camera moved towards it, its size (or the focal length) is another one; where it swings as the
-camera turns, the camera looks elsewhere than told. With y, from the camera to the marker as seen,
-q the camera's place by odometry, both along odom's axes, and s how many times too far all is seen,
+By odometry and image it must stay in place. If it approaches by more, or less, than the camera
+moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns, the
+mounting is wrong. With y from the camera to the marker as seen, q the position of the camera by
+odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
 
-    y = c - s q - turn x y - ...    (least squares; c is s times where the marker is)
+    y = c - s q - turn x y - ...    (least squares; c is s times the position of the marker)
 
-A leader that moves can look just so: one that goes ahead by half of what the follower does is like
-a marker told too small. From relative positions alone this cannot be known. So it is told only
-where a single s explains nearly all that y changes by, and the marker keeps its attitude, as it
-does where it stands on the ground and the camera is carried before it.
+A leader that moves can look the same: if it goes ahead by half of the follower's way, it looks
+like a marker whose configured size is too small. Relative positions alone cannot tell. So a result
+is given only if a single s explains nearly all changes of y, and the marker keeps its attitude, as
+it does if it stands on the ground and the camera is carried before it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from flock_follower.checks.findings import Finding, judged, ok, unmeasured
+from flock_follower.checks.image_motion import interpolated
+from flock_follower.checks.observations import Observations
 from flock_follower.geometry import (
     Array,
     matrix_to_rotation_vector,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    R_FLU_OPTICAL,
     rotation_vector_to_matrix,
+    rpy_from_matrix,
     skew,
 )
+from flock_follower.messages import NANOSECONDS, OdometryState
 
-#: Sightings, at least.
+#: Least number of sightings.
 FEW: Final = 12
-#: Deviations of what is estimated besides, so that it is not taken for the former two: creeping
-#: of marker or odometry, m/s; the camera's place on the body, m; offset of its stamps, s.
+#: Prior deviations of nuisance parameters: creep of marker or odometry, m/s; position of the
+#: camera on the body, m; offset of its stamps, s.
 CREEP, PLACE, LATE = 0.02, 0.05, 0.02
-#: Deviations before anything was seen, of s and of the turn, rad.
+#: Prior deviations of s and of the turn, rad.
 SCALE, TURN = 1.0, 0.5
-#: Deviations of odometry, m, and of what is seen, share of the distance, at least.
+#: Least deviations of odometry, m, and of a sighting, share of the distance.
 ODOMETRY, SHARE = 0.005, 0.003
-#: Errors of odometry that last are partly fitted as if they were motion: deviations were half.
+#: Lasting errors of odometry are partly fitted as motion, so deviations came out half as large.
 WIDENED: Final = 2.0
 _PASSES = 6
 _HUBER = 2.0  # deviations
 _CORRELATED = 0.9  # of neighbouring residuals, at most
 
+#: m RMS: least motion of the camera.
+MOVED: Final = 0.1
+#: A marker is at rest if the residual is at most this share of the camera's motion, and it sways
+#: by less, rad, half the time: a leader on its course does not keep to a multiple of the
+#: follower's motion.
+LEFT, SWAYED = 0.15, 0.1
+SCALES: Final = (0.4, 2.5)
+#: Relative errors of the size: of a warning, of an error; it must be known to 3 deviations.
+SIZE, BAD_SIZE = 0.05, 0.1
+SURE: Final = 3.0
+#: The same of the mounting, rad.
+LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(10.0)
+#: rad: a larger error of the mounting is another order of axes, which has a row of its own.
+OTHER_AXES: Final = 0.7
+HOW: Final = 'stand the leader on the ground, and carry the camera before it by 1 m, to and fro'
+_FAR: Final = 'as far as odometry moves'
+_MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
+
 
 class OwnPath(NamedTuple):
     """
-    One's own motion at the n images.
+    The own motion at the n images.
 
     ``times`` (n,), s; of base_link in odom ``positions`` (n, 3), m, ``velocities`` (n, 3), m/s,
     ``rotations`` (n, 3, 3), and ``rates`` (n, 3), rad/s, along its own axes.
@@ -74,10 +103,10 @@ class OwnPath(NamedTuple):
 
 class Sightings(NamedTuple):
     """
-    The marker as seen in n images, along base_link's axes as the camera is told to be mounted.
+    The marker as seen in n images, along base_link's axes with the camera mounted as configured.
 
     ``arms`` (n, 3), m, from the camera to it, ``deviations`` (n,) of these, m; ``attitudes``
-    (n, 3, 3). ``camera`` (3,), m: where the camera is on base_link.
+    (n, 3, 3). ``camera`` (3,), m: position of the camera on base_link.
     """
 
     arms: Array
@@ -88,13 +117,13 @@ class Sightings(NamedTuple):
 
 class RestFit(NamedTuple):
     """
-    What explains the sightings as those of a marker at rest.
+    The fit of a marker at rest to the sightings.
 
-    ``scale``: how many times too far it is seen; ``turn`` (3,), rad, along base_link's axes: the
-    camera is mounted by exp(turn) otherwise than told; ``deviation`` and ``turn_deviations`` (3,)
-    of them. ``moved``: RMS of the camera's way from its middle, m; ``left``: RMS, m, of what is
-    left unexplained; ``swayed``: how far, rad, the marker's attitude is from its mean, half the
-    time.
+    ``scale``: ratio of the distance seen to the true one; ``turn`` (3,), rad, along base_link's
+    axes: the camera is mounted by exp(turn) otherwise than configured; ``deviation`` and
+    ``turn_deviations`` (3,) of them. ``moved``: RMS distance of the camera from its mean position,
+    m; ``left``: RMS residual, m; ``swayed``: median angle of the marker from its mean attitude,
+    rad.
     """
 
     scale: float
@@ -105,9 +134,93 @@ class RestFit(NamedTuple):
     left: float
     swayed: float
 
+    @property
+    def at_rest(self) -> bool:
+        """Return whether the marker was at rest, and the camera moved."""
+        return (self.moved >= MOVED and SCALES[0] <= self.scale <= SCALES[1]
+                and self.left <= LEFT * min(self.scale, 1.0) * self.moved
+                and self.swayed <= SWAYED and float(np.abs(self.turn).max()) < OTHER_AXES)
+
+
+def check_resting_marker(seen: Observations, states: list[OdometryState]) -> Iterator[Finding]:
+    """
+    Check the size of the marker and the mounting of the camera.
+
+    :param states: the odometry, as our nodes read it.
+    """
+    if not seen.sightings:
+        return
+    number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
+    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
+    fit = _fit(seen, states, number, quaternion_to_matrix(quaternion_from_rpy(*rpy)))
+    if fit is None or not fit.at_rest:
+        why = 'the leader moves' if fit is not None and fit.moved >= MOVED else HOW
+        yield unmeasured('marker size', why, _FAR)
+        yield unmeasured('camera mounting', why, _MOUNTED)
+    else:
+        yield _size(fit, number, seen.marker_sides.get(number, 0.0))
+        yield _mounting(fit, rpy)
+
+
+def _size(fit: RestFit, number: int, side: float) -> Finding:
+    """Check the size of a marker whose configured side is ``side``, m."""
+    if SURE * fit.deviation > 3.0 * SIZE:
+        return unmeasured('marker size', HOW, _FAR)
+    off = abs(fit.scale - 1.0)
+    wrong = off > max(SIZE, SURE * fit.deviation)
+    return judged(
+        wrong and off > BAD_SIZE, wrong, 'marker size',
+        f'moves {fit.scale:.2f} ± {fit.deviation:.2f} times as far', _FAR,
+        f'measure marker {number}, its black square from edge to edge: {side / fit.scale:.3f} m '
+        f'would fit, config/neighbors.yaml says {side:g}. If that is right: is the calibration '
+        'of this lens, and the scale of the odometry right?')
+
+
+def _mounting(fit: RestFit, rpy: list[float]) -> Finding:
+    what, known = 'camera mounting', SURE * fit.turn_deviations < LOOKS
+    if not known.any():
+        return unmeasured(what, f'turned too little; {HOW}, and turn it', _MOUNTED)
+    turn = np.where(known & (np.abs(fit.turn) > SURE * fit.turn_deviations), fit.turn, 0.0)
+    off = float(np.linalg.norm(turn))
+    if off <= LOOKS:
+        return ok(what, f'off by {math.degrees(off):.0f} deg', _MOUNTED)
+    ways = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
+            ('looks further right', 'looks further left'))
+    looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
+                      for way, angle in zip(ways, turn.tolist()) if abs(angle) > 0.5 * LOOKS)
+    fitting = rpy_from_matrix(rotation_vector_to_matrix(turn)
+                              @ quaternion_to_matrix(quaternion_from_rpy(*rpy)))
+    shown = ','.join(str(round(angle, 3) + 0.0) for angle in fitting.tolist())
+    return judged(
+        off > BAD_LOOKS, True, what, f'camera {looks} than told', _MOUNTED,
+        f'camera_rpy:=[{shown}] would fit, in relative_pose and planner; or is the pose of the '
+        'odometry on the body (odom_child_rpy) wrong?')
+
+
+def _fit(seen: Observations, states: list[OdometryState], number: int,
+         camera_rotation: Array) -> RestFit | None:
+    """Return the fit to the sightings of a marker."""
+    rows = np.array(sorted(row for row in seen.sightings if row[1] == number))
+    start = states[0].stamp
+    stamps = np.array([(state.stamp - start) / NANOSECONDS for state in states])
+    # Near zero, floats resolve a nanosecond.
+    times = rows[:, 0] - start / NANOSECONDS
+    quaternions, known = interpolated(
+        stamps, np.array([state.quaternion for state in states]))(times)
+    rows, times = rows[known], times[known]
+    motion = np.array([[*s.position, *s.velocity, *s.angular_velocity] for s in states])
+    own = np.column_stack([np.interp(times, stamps, column) for column in motion.T])
+    R_base_optical = camera_rotation @ R_FLU_OPTICAL
+    return fit_rest(Sightings(
+        rows[:, 2:5] @ R_base_optical.T, rows[:, 5],
+        np.array([R_base_optical @ quaternion_to_matrix(q) for q in rows[:, 6:10]]),
+        np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0]))),
+        OwnPath(times, own[:, :3], own[:, 3:6],
+                np.array([quaternion_to_matrix(q) for q in quaternions[known]]), own[:, 6:]))
+
 
 def fit_rest(seen: Sightings, own: OwnPath) -> RestFit | None:
-    """Return what explains the sightings best, None where they are too few."""
+    """Return the least-squares fit to the sightings, None if they are too few."""
     count = len(seen.arms)
     if count < FEW:
         return None
@@ -164,9 +277,9 @@ def _composed(turn: Array, more: Array) -> Array:
 
 def _spread(residual: Array, weights: Array) -> float:
     """
-    Return by how much residuals (n, 3) are larger than their variances, and alike in time.
+    Return the factor on the variance: residuals (n, 3) may exceed it, and be correlated in time.
 
-    Errors of odometry last: as neighbours err alike, there are fewer that are independent.
+    Errors of odometry last, so fewer residuals are independent.
     """
     squares = np.sum(residual**2, axis=1)
     chi2 = float(np.sum(weights * squares)) / (3 * len(residual) - 14)
@@ -176,7 +289,7 @@ def _spread(residual: Array, weights: Array) -> float:
 
 
 def _sway(attitudes: Array) -> float:
-    """Return how far attitudes (n, 3, 3) are from their mean half the time, rad."""
+    """Return the median angle of attitudes (n, 3, 3) from their mean, rad."""
     u, _, v = np.linalg.svd(attitudes.mean(axis=0))
     mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     cosines = 0.5 * (np.einsum('nij,ij->n', attitudes, mean) - 1.0)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Rates, latencies, clocks: whether it comes often enough, soon enough, and on one clock."""
+"""Timing: rates, latencies and clocks of images and odometry."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
-from flock_follower.checks.observations import Observations, OURS, TopicSeen
+from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
+from flock_follower.checks.observations import Observations, TopicSeen
 
-#: Stamps that differ by more, s, from when they came are of another clock.
+#: s: stamps that differ by more from the arrival are of another clock.
 OTHER_CLOCK: Final = 10.0
-#: Stamps so far in the future, s, are told; so far, and nothing fits any more.
+#: s: stamps in the future: from which on there is a warning, and an error.
 AHEAD: Final = (0.003, 0.03)
-#: A topic has stopped if it sent nothing for so long, s, and for so many of its gaps, before the
-#: newest message of any topic.
+#: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
+#: before the newest message of any topic.
 STOPPED: Final = (1.0, 3.0)
-#: Share of stamps that are repeated, or step back, from which on it is told.
+#: Share of stamps that repeat or step back, from which on there is a warning.
 DISORDER: Final = 0.01
 
 
 class _Limits(NamedTuple):
-    """What a topic has to keep: (told from, too bad from) each; Hz and s."""
+    """Limits of a topic: a warning and an error beyond each pair, Hz and s; longest gap, s."""
 
     rate: tuple[float, float]
     latency: tuple[float, float]
@@ -45,131 +45,103 @@ class _Limits(NamedTuple):
     sooner: str
 
 
-class _Heard(NamedTuple):
-    """How a topic came; seconds."""
-
-    number: int
-    rate: float
-    gap: float
-    latency: float
-    late: float
-    """95 % came sooner than this."""
-
-
 def check_timing(seen: Observations) -> Iterator[Finding]:
-    """Yield what is to be said of the times of images and odometry, and of clocks."""
-    yield from _clock_source(seen)
+    """Check rates and latencies of images and odometry, and the clocks."""
+    if seen.live:
+        yield from _clock_source(seen)
     odom_timeout = float(seen.value('planner', 'odom_timeout', 0.3))
-    limits = {
-        seen.image_name: _Limits(
-            (10.0, 3.0), (0.2, 0.4), float(seen.value('planner', 'perception_timeout', 0.2)),
-            'raise the frame rate of the camera; less exposure time where it is dark',
-            'send smaller images, or grey ones; have the camera on this computer'),
-        'odom': _Limits(
-            (18.0, 8.0), (0.5 * odom_timeout, 0.8 * odom_timeout),
-            float(seen.value('relative_pose', 'max_gap', 0.25)),
-            'raise the output rate of the odometry (IMU rate, where its driver offers that)',
-            'give its source more processor time, or smaller images; have it publish per IMU '
-            'message where it can')}
     newest = max((topic.arrivals[-1] for topic in seen.topics.values() if topic.arrivals),
                  default=0.0)
-    for name, limit in limits.items():
-        topic = seen.topic(name)
-        if topic.arrivals:
-            silence = newest - topic.arrivals[-1]
-            if seen.live and silence > max(STOPPED[0], STOPPED[1] * _heard(topic).gap):
-                yield error('odom' if name == 'odom' else 'images',
-                            f'stopped: none in the last {silence:.1f} s', 'messages to the end',
-                            'see the log of its driver; is it still running?')
-            yield from _judge('odom' if name == 'odom' else 'images', topic, limit, seen.live)
+    yield from _stream('images', seen.topic(seen.image_name), newest, seen.live, _Limits(
+        (10.0, 3.0), (0.2, 0.4), float(seen.value('planner', 'perception_timeout', 0.2)),
+        'raise the frame rate of the camera; less exposure time where it is dark',
+        'send smaller images, or grey ones; have the camera on this computer'))
+    yield from _stream('odom', seen.topic('odom'), newest, seen.live, _Limits(
+        (18.0, 8.0), (0.5 * odom_timeout, 0.8 * odom_timeout),
+        float(seen.value('relative_pose', 'max_gap', 0.25)),
+        'raise the output rate of the odometry (IMU rate, where its driver offers that)',
+        'give its source more processor time, or smaller images; have it publish per IMU '
+        'message where it can'))
     yield from _one_clock(seen)
 
 
-def _judge(name: str, topic: TopicSeen, limit: _Limits, live: bool) -> Iterator[Finding]:
-    stamps = np.array(topic.stamps)
-    heard = _heard(topic)
-    wanted = f'{limit.rate[0]:g} Hz or more'
-    if heard.number > 2:
-        rate = f'{heard.rate:.1f} Hz'
-        if heard.rate < limit.rate[1]:
-            yield error(f'{name} rate', rate, wanted, limit.faster)
-        elif heard.rate < limit.rate[0]:
-            yield warning(f'{name} rate', rate, wanted, limit.faster)
-        elif heard.gap > max(limit.gap, 2.5 / heard.rate):
-            yield warning(f'{name} rate', f'{rate}, but once nothing for {heard.gap:.2f} s',
-                          f'{wanted}, no gap above {limit.gap:g} s',
-                          'find what stops it: USB, a full disk, too little processor time')
-        else:
-            yield ok(f'{name} rate', rate, wanted)
+def _stream(name: str, topic: TopicSeen, newest: float, live: bool,
+            limits: _Limits) -> Iterator[Finding]:
+    """
+    Check rate, stamps and latency of a topic.
+
+    :param newest: arrival of the newest message of any topic, s.
+    """
+    if not topic.arrivals:
+        return
+    gap = float(np.max(np.diff(topic.arrivals), initial=0.0))
+    silence = newest - topic.arrivals[-1]
+    if live and silence > max(STOPPED[0], STOPPED[1] * gap):
+        yield error(name, f'stopped: none in the last {silence:.1f} s', 'messages to the end',
+                    'see the log of its driver; is it still running?')
+    wanted, rate = f'{limits.rate[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
+    if len(topic.arrivals) <= 2:
+        yield unmeasured(f'{name} rate', f'{len(topic.arrivals)} messages are too few', wanted)
+    elif topic.rate >= limits.rate[0] and gap > max(limits.gap, 2.5 / topic.rate):
+        yield warning(f'{name} rate', f'{rate}, but once nothing for {gap:.2f} s',
+                      f'{wanted}, no gap above {limits.gap:g} s',
+                      'find what stops it: USB, a full disk, too little processor time')
     else:
-        yield unmeasured(f'{name} rate', f'{heard.number} messages are too few', wanted)
-    if not stamps.all():
-        yield error(f'{name} stamps', f'{int(np.sum(stamps == 0.0))} of {len(stamps)} are zero',
+        yield judged(topic.rate < limits.rate[1], topic.rate < limits.rate[0], f'{name} rate',
+                     rate, wanted, limits.faster)
+    if zeros := topic.stamps.count(0.0):
+        yield error(f'{name} stamps', f'{zeros} of {len(topic.stamps)} are zero',
                     'the time of the measurement', 'have its driver fill header.stamp')
         return
-    disorder = float(np.mean(np.diff(stamps) <= 0.0)) if len(stamps) > 1 else 0.0
+    disorder = float(np.mean(np.diff(topic.stamps) <= 0.0)) if len(topic.stamps) > 1 else 0.0
     if disorder > DISORDER:
         yield warning(f'{name} stamps', f'{disorder:.0%} repeat the one before, or step back',
                       'each later than the one before',
                       'is it published twice, or by two drivers? Repetitions are dropped')
-    yield _latency(name, heard, limit, live)
+    yield _latency(f'{name} latency', topic, limits, live)
 
 
-def _heard(topic: TopicSeen) -> _Heard:
-    arrivals, stamps = np.array(topic.arrivals), np.array(topic.stamps)
-    late = arrivals - stamps
-    return _Heard(len(arrivals), topic.rate,
-                  float(np.max(np.diff(arrivals), initial=0.0)),
-                  float(np.median(late)), float(np.percentile(late, 95)))
-
-
-def _latency(name: str, heard: _Heard, limit: _Limits, live: bool) -> Finding:
-    what, wanted = f'{name} latency', f'below {limit.latency[0]:g} s after its stamp'
-    middle = heard.latency
+def _latency(what: str, topic: TopicSeen, limits: _Limits, live: bool) -> Finding:
+    late = np.array(topic.arrivals) - np.array(topic.stamps)
+    middle, most = float(np.median(late)), float(np.percentile(late, 95))
+    wanted = f'below {limits.latency[0]:g} s after its stamp'
     if abs(middle) > OTHER_CLOCK:
-        when = 'before' if middle > 0.0 else 'after'
-        advice = ('set use_sim_time alike in all nodes, and the clocks of all computers; have '
-                  'the driver stamp by the clock of ROS' if live else
-                  'record it anew with stamps of the clock of ROS (a replayed bag: '
-                  'ros2 bag record --use-sim-time)')
-        return error(what, f'stamped {_span(abs(middle))} {when} it came: another clock', wanted,
-                     advice)
+        return error(
+            what, f'stamped {_span(abs(middle))} {"before" if middle > 0.0 else "after"} it '
+            'came: another clock', wanted,
+            'set use_sim_time alike in all nodes, and the clocks of all computers; have the '
+            'driver stamp by the clock of ROS' if live else 'record it anew with stamps of the '
+            'clock of ROS (a replayed bag: ros2 bag record --use-sim-time)')
     if middle < -AHEAD[0]:
-        say = error if middle < -AHEAD[1] else warning
-        return say(what, f'stamped {-1e3 * middle:.0f} ms in the future', wanted,
-                   'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of '
-                   'ROS')
-    measured = f'{1e3 * middle:.0f} ms, 95 % within {1e3 * heard.late:.0f} ms'
-    if middle > limit.latency[1]:
-        return error(what, measured, wanted, limit.sooner)
-    if middle > limit.latency[0] or heard.late > limit.latency[1]:
-        return warning(what, measured, wanted, limit.sooner)
-    return ok(what, measured, wanted)
+        return judged(middle < -AHEAD[1], True, what,
+                      f'stamped {-1e3 * middle:.0f} ms in the future', wanted, 'synchronise the '
+                      'clocks (chrony, PTP); have the driver stamp by the clock of ROS')
+    return judged(middle > limits.latency[1], middle > limits.latency[0]
+                  or most > limits.latency[1], what,
+                  f'{1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms', wanted,
+                  limits.sooner)
 
 
 def _clock_source(seen: Observations) -> Iterator[Finding]:
-    """Yield whether every node goes by the clock that there is."""
-    if not seen.live:
-        return
-    simulated = {node: bool(seen.value(node, 'use_sim_time', False)) for node in OURS
-                 if 'use_sim_time' in seen.parameters.get(node, {})}
-    wanted = 'use_sim_time where /clock is'
-    if seen.clock:
-        if forgotten := sorted(node for node, value in simulated.items() if not value):
-            yield error('clock', f'/clock is published, {", ".join(forgotten)} '
-                        f'{"goes" if len(forgotten) == 1 else "go"} by the time of day', wanted,
-                        'start with -p use_sim_time:=true; or end what publishes /clock')
-        elif simulated:
-            yield ok('clock', '/clock, and all our nodes go by it', wanted)
-    elif waiting := sorted(node for node, value in simulated.items() if value):
-        yield error('clock', f'{", ".join(waiting)}: use_sim_time is true, but nobody publishes '
-                    '/clock', wanted, 'start without use_sim_time; or replay with /clock')
+    """Check that every node runs on simulated time if there is a /clock, and only then."""
+    simulated = {node: bool(own['use_sim_time']) for node, own in seen.parameters.items()
+                 if 'use_sim_time' in own}
+    wrong = sorted(node for node, value in simulated.items() if value != seen.clock)
+    names, wanted = ', '.join(wrong), 'use_sim_time where /clock is'
+    if wrong and seen.clock:
+        yield error('clock', f'/clock is published, {names} {"goes" if len(wrong) == 1 else "go"} '
+                    'by the time of day', wanted,
+                    'start with -p use_sim_time:=true; or end what publishes /clock')
+    elif wrong:
+        yield error('clock', f'{names}: use_sim_time is true, but nobody publishes /clock',
+                    wanted, 'start without use_sim_time; or replay with /clock')
     elif simulated:
-        yield ok('clock', 'the time of day, in all our nodes', wanted)
+        yield ok('clock', '/clock, and all our nodes go by it' if seen.clock
+                 else 'the time of day, in all our nodes', wanted)
 
 
 def _one_clock(seen: Observations) -> Iterator[Finding]:
-    """Yield whether images and odometry are stamped by one clock."""
+    """Check that images and odometry are stamped by one clock."""
     images, odometry = ([stamp for stamp in seen.topic(name).stamps if stamp]
                         for name in (seen.image_name, 'odom'))
     if not images or not odometry:
@@ -185,7 +157,7 @@ def _one_clock(seen: Observations) -> Iterator[Finding]:
 
 
 def _span(seconds: float) -> str:
-    """Return a time in words, of the unit that suits it."""
+    """Return a time in words, in a suitable unit."""
     for unit, length in (('years', 365.25 * 86400.0), ('days', 86400.0), ('hours', 3600.0)):
         if seconds > 2.0 * length:
             return f'{seconds / length:.0f} {unit}'

@@ -41,8 +41,6 @@ from flock_follower.flock.peers import (
     FUTURE,
     is_covariance,
     leapt,
-    malformed,
-    own_point,
     position_covariance,
     POSITION_STD_MAX,
     refusal,
@@ -51,8 +49,9 @@ from flock_follower.flock.peers import (
     sender_of,
     SENDERS_MAX,
     SenderStatus,
-    sighting_point,
+    too_fast,
     Track,
+    track_point,
     TrackPoint,
     WORD_AGE_MAX,
     WRONG,
@@ -106,7 +105,7 @@ class Sharing:
 
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
-        if problem := malformed(state):
+        if problem := too_fast(state):
             return self._refuse(f'own odometry {problem[0]}', problem[1])
         before = self._own
         if before is not None:
@@ -120,7 +119,7 @@ class Sharing:
                 self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
                 self._align_all_anew(forget_senders=back > 0)
         self._own = state
-        self._remember(self.name, self.name, own_point(state))
+        self._remember(self.name, self.name, track_point(state, True))
         return None
 
     def take_seen(self, state: OdometryState) -> None:
@@ -130,7 +129,7 @@ class Sharing:
             return None  # a print is no vehicle
         if own is None:
             return self._refuse('sighting before own odometry', name)
-        problem = malformed(state)
+        problem = too_fast(state)
         if problem or name == self.name or state.frame != own.frame:
             return self._refuse('unusable sighting', problem[1] if problem else (
                 f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
@@ -145,7 +144,7 @@ class Sharing:
         if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
             return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
         self._seen[name] = state
-        self._relate(self.name, name, sighting_point(state))
+        self._relate(self.name, name, track_point(state, False))
         return None
 
     def take_word(self, state: OdometryState, received: int) -> None:
@@ -188,8 +187,7 @@ class Sharing:
             self.frames.set_anchor(sender.name, state.position)
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         sender.states[state.child] = state
-        fits = self._relate(sender.name, state.child,
-                            own_point(state) if of_itself else sighting_point(state))
+        fits = self._relate(sender.name, state.child, track_point(state, of_itself))
         if leap or not fits:
             sender.doubted.add(state.child)
         else:

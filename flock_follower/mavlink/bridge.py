@@ -28,10 +28,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.mavlink import commands, estimator_health
-from flock_follower.mavlink.commands import Request
+from flock_follower.mavlink.commands import NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
+from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -42,7 +43,7 @@ from flock_follower.mavlink.permission import (
     NO_AUTOPILOT,
     Restarted,
 )
-from flock_follower.mavlink.requests import NOT_RECEIVED, Requests
+from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
@@ -79,6 +80,7 @@ class Bridge:
     :param recommendations: these three are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: when the bridge itself ends a flight.
+    :param ground_station: the reports to the pilot's ground station; None: nothing is reported.
     """
 
     def __init__(self, link: Link, gate: Gate, *, now: float,
@@ -87,7 +89,8 @@ class Bridge:
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None,
-                 wind_compensation: str = 'auto', end: EndParams | None = None) -> None:
+                 wind_compensation: str = 'auto', end: EndParams | None = None,
+                 ground_station: GroundStationReport | None = None) -> None:
         self.link = link
         self.telemetry = link.telemetry
         self.gate = gate
@@ -102,12 +105,13 @@ class Bridge:
                                  self.end, require_failsafe)
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
+        self.ground_station = ground_station
         gate.fused = forwarder is not None
         self._wind_compensation = wind_compensation
         self._start = self._streaming_since = now
         self._last_sent = -math.inf
         self._blind_action = blind_action
-        self._last_number = 0
+        self._last_command: AcceptedCommand | None = None
         self._armed: bool | None = None
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
@@ -166,6 +170,15 @@ class Bridge:
         obstacle = self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
         return '' if obstacle is None else obstacle.reason
 
+    def unready(self, now: float) -> str | None:
+        """Return what it reports against the service ``arm``, '' for nothing; None: unknown."""
+        status, dialect = self.status(now), self.telemetry.dialect
+        if status is None or dialect is None or status.armed or (
+                not self.housekeeping.has_reasons(now)):
+            return None
+        against = self.texts.unready(now, dialect.arming_mode(status.mode))
+        return against and estimator_health.explained(against, self.telemetry.estimator, now)
+
     # The setpoint thread.
 
     def receive(self, now: float) -> list[Any]:
@@ -214,7 +227,6 @@ class Bridge:
     def cycle(self, now: float) -> Cycle:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
-        request = self.requests.pending
         if self.telemetry.dialect is not None:
             self.gate.compensates_wind = self._wind_compensation == 'always' or (
                 self._wind_compensation == 'auto' and not self.telemetry.dialect.compensates_wind)
@@ -228,28 +240,27 @@ class Bridge:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
-        sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
+        sent = setpoint.kind != NONE and not late and self.link.send(
+            self._message(setpoint.acceleration, setpoint, now))
+        if sent:
+            self._streaming_since = now if not self._streaming_for(now) else self._streaming_since
+            self._last_sent = now
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
-        if request is not None:
-            self.requests.step(request, self._streaming_for(now), now)
+        self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
-        first = None
-        if sent and accepted and accepted.number != self._last_number:
-            first = accepted
-            self._last_number = first.number
+        self._report_to_ground_station(now)
+        first = accepted if sent and accepted is not self._last_command else None
+        self._last_command = first or self._last_command
         return Cycle(setpoint, sent, first)
 
-    def _send(self, setpoint: Setpoint, now: float) -> bool:
-        """Send a setpoint at ``now``, s; return whether it left."""
-        if not self.link.send(encode_setpoint(
-                setpoint.acceleration, setpoint.yaw, round((now - self._start) * 1e3) % 2**32,
-                self.link.target_system, self.link.target_component)):
-            return False
-        if not self._streaming_for(now):
-            self._streaming_since = now
-        self._last_sent = now
-        return True
+    def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
+        return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
+                               self.link.target_system, self.link.target_component)
+
+    def _boot_time(self, now: float) -> int:
+        """Return the ``time_boot_ms`` of messages sent at ``now``, s: ms since the start."""
+        return round((now - self._start) * 1e3) % 2**32
 
     def _streaming_for(self, now: float) -> float:
         """Return how long setpoints have been sent without a gap, s."""
@@ -258,7 +269,12 @@ class Bridge:
 
     def _fell_silent(self, now: float) -> None:
         # A landing that has ended the permission is the end of the flight, not a loss.
-        if self._blind_action == 'land' and self.gate.permission.reason.startswith(FELL_SILENT):
+        reason = self.gate.permission.reason
+        if not reason.startswith(FELL_SILENT):
+            return
+        if self.ground_station is not None:
+            self.ground_station.take_handover(reason)
+        if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.LAND, now))
 
@@ -286,13 +302,22 @@ class Bridge:
         held = ''
         if self.handover is not None and dialect is not None and (
                 self.handover.outcome is not None and self.handover.outcome.success):
-            through = self.handover.current.through
-            held = through(dialect)[0] if through is not None else ''
+            modes = self.handover.current.modes
+            held = modes(dialect)[0] if modes is not None else ''
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
-        if ask is not None and not self.requests.stopping:
-            goal = commands.HOLD if ask.action == HOLD else commands.LAND
-            self.handover = self.requests.begin(goal, now, why=ask.why)
+        if ask and not self.requests.stopping:
+            goal = commands.HOLD if ask == HOLD else commands.LAND
+            self.handover = self.requests.begin(goal, now, why=self.end.why)
+            if self.ground_station is not None:
+                self.ground_station.take_handover(self.end.why)
+
+    def _report_to_ground_station(self, now: float) -> None:
+        # On a line too slow for all, setpoints go first.
+        if self.ground_station is None or not self.alive(now) or self.link.transport.congested():
+            return
+        for message in self.ground_station.due(self._boot_time(now), now):
+            self.link.send(message)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -330,10 +355,8 @@ class Bridge:
         if self.withheld():
             return
         setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
-        if setpoint.kind == NONE:
-            return
-        level = setpoint._replace(acceleration=np.zeros(3))
-        self._send(level, now)
+        if setpoint.kind != NONE:
+            self.link.send(self._message(np.zeros(3), setpoint, now))
 
     def _look(self, status: VehicleStatus, now: float) -> None:
         """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""

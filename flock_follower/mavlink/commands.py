@@ -13,12 +13,14 @@
 # limitations under the License.
 
 """
-Requests a mode, arming or a take-off of the autopilot, and checks that it happened.
+One request to the autopilot: a mode, arming, a take-off, a landing.
 
 An ACK is not enough: PX4 answers DO_SET_MODE with two ACKs, and the first is always ACCEPTED. A
 request succeeds when the vehicle shows the result (the mode in HEARTBEAT, the height after a
 take-off). If it does not, the result in the ACK and the autopilot's STATUSTEXT give the reason. A
 HEARTBEAT from before the command was sent does not count.
+
+``Goal`` is what a request asks for, ``Request`` the state machine that pursues it.
 """
 
 from __future__ import annotations
@@ -26,50 +28,45 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
-#: How long to wait for HEARTBEAT (1 Hz) to show what was asked for, s.
+#: How long to wait for HEARTBEAT (1 Hz) to show the result, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
 #: An unanswered command is sent again after this, s.
 RESEND_PERIOD: Final[float] = 1.0
 #: After a refusal, wait this long for the text that explains it, s.
 REASON_WAIT: Final[float] = 0.5
-#: Time to get going, and slowest climb, of a take-off, s and m/s; ArduPilot spools up for seconds.
+#: Delay and slowest climb of a take-off, s and m/s; ArduPilot spools up for seconds.
 TAKEOFF_DELAY: Final[float] = 10.0
 SLOWEST_CLIMB: Final[float] = 0.3
-#: The stream must be running; where it does not start within this, s, the request fails.
+#: A request fails if the setpoint stream, or HEARTBEAT, does not start within this, s.
 STREAM_TIMEOUT: Final[float] = 3.0
-_RESULT_PREFIX: Final[str] = 'MAV_RESULT_'
-
-
-def result_words(result: int) -> str:
-    """Return a MAV_RESULT in words: 'temporarily rejected'."""
-    entry = mavlink.enums['MAV_RESULT'].get(result)
-    if entry is None or not entry.name.startswith(_RESULT_PREFIX):
-        return f'result {result}'
-    return str(entry.name.removeprefix(_RESULT_PREFIX).lower().replace('_', ' '))
+NOT_RECEIVED: Final[str] = 'no HEARTBEAT from the autopilot'
+_SET_MODE: Final[int] = mavlink.MAV_CMD_DO_SET_MODE
+_ARM: Final[int] = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+TAKEOFF: Final[int] = mavlink.MAV_CMD_NAV_TAKEOFF
 
 
 class Vehicle(NamedTuple):
-    """What is known of the vehicle while it is heard."""
+    """State of the vehicle while HEARTBEAT is fresh."""
 
     dialect: Dialect
     status: VehicleStatus
     altitude: float | None = None
     """m above the origin of its local frame."""
-    heard: float = math.inf
-    """When it showed that last, by HEARTBEAT or CURRENT_MODE, s."""
+    shown_time: float = math.inf
+    """When it last showed what the request is about, by HEARTBEAT or CURRENT_MODE, s."""
     airborne: bool = True
     """Whether it flies, as far as it reports."""
 
 
 class Outcome(NamedTuple):
-    """How a request ended, in words for people."""
+    """The result of a request, in words for people."""
 
     success: bool
     message: str
@@ -77,40 +74,50 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked for, how, and how the vehicle shows that it has come about."""
+    """What is requested, by which command, and how the vehicle shows that it is reached."""
 
     name: str
     command: int
     params: Callable[[Dialect], tuple[float, ...]]
     reached: Callable[[Vehicle], bool]
-    needs_stream: bool = False
-    """Whether setpoints have to be flowing first, see ``Dialect.stream_before_offboard``."""
+    modes: Callable[[Dialect], tuple[str, ...]] | None = None
+    """The modes that it leads through; None: any. In another mode the pilot has taken over."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
     insists: bool = False
-    """Whether it is asked for even where the vehicle seems to be so already."""
+    """Whether it is requested even if the vehicle already shows it."""
     timeout: float = CONFIRM_TIMEOUT
     """How long to wait for the vehicle to show it, s."""
     before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
-    """What has to be reached first, by what is known of the vehicle when it is begun."""
+    """What has to be reached first, by the state of the vehicle when the request begins."""
     instead: Callable[[Dialect], Goal | None] = lambda dialect: None
-    """What is asked for where the autopilot refuses it."""
-    abandoned: Goal | None = None
-    """What is asked for where it was accepted, and by the end of its time neither came about nor
-    left the vehicle in Hold."""
-    through: Callable[[Dialect], tuple[str, ...]] | None = None
-    """The modes it leads through from that at the beginning; None: any. Another is the pilot's."""
-    needs_arming: bool = False
-    """Whether it is in vain once the vehicle is disarmed."""
+    """What is requested if the autopilot refuses it."""
+
+
+def _mode_goal(name: str, mode: Callable[[Dialect], str], **options: Any) -> Goal:
+    """Return the goal of entering the mode that ``mode`` returns for a dialect."""
+    return Goal(name, _SET_MODE, lambda dialect: dialect.set_mode_parameters(mode(dialect)),
+                **{'reached': lambda vehicle: vehicle.status.mode == mode(vehicle.dialect),
+                   'modes': lambda dialect: (mode(dialect),), **options})
 
 
 def enter(mode: str, *others: str, ends_flight: bool = False) -> Goal:
-    """Return the goal of a mode, by its name, or where that is refused of the next."""
-    return Goal(
-        mode, mavlink.MAV_CMD_DO_SET_MODE, lambda dialect: dialect.set_mode_parameters(mode),
-        lambda vehicle: vehicle.status.mode == mode, ends_flight=ends_flight,
-        through=lambda dialect: (mode,),
+    """Return the goal of a mode; if that is refused, of the next one."""
+    return _mode_goal(
+        mode, lambda dialect: mode, ends_flight=ends_flight,
         instead=lambda dialect: enter(*others, ends_flight=ends_flight) if others else None)
+
+
+#: The mode that obeys our setpoints: OFFBOARD, GUIDED.
+OFFBOARD: Final[Goal] = _mode_goal('offboard', lambda dialect: dialect.offboard)
+#: Out of that mode, into the one that keeps the position; PX4 has none without a global origin.
+HOLD: Final[Goal] = _mode_goal(
+    'hold', lambda dialect: dialect.hold, ends_flight=True,
+    reached=lambda vehicle: not vehicle.status.offboard,
+    instead=lambda dialect: enter(*dialect.hold_instead, ends_flight=True))
+#: Landing here: reached when the vehicle descends, not when it is down.
+LAND: Final[Goal] = _mode_goal(
+    'land', lambda dialect: dialect.land, ends_flight=True, insists=True)
 
 
 def arm(value: bool, streaming: bool = False) -> Goal:
@@ -123,34 +130,12 @@ def arm(value: bool, streaming: bool = False) -> Goal:
     def armable(vehicle: Vehicle) -> Goal | None:
         mode, dialect = vehicle.status.mode, vehicle.dialect
         stuck = mode in dialect.unarmable_modes and not vehicle.status.armed
-        return enter(*dialect.arming_modes) if stuck and not (
+        return enter(*dialect.arming_modes) if value and stuck and not (
             streaming and mode == dialect.offboard) else None
 
-    return Goal('arm' if value else 'disarm', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
-                lambda dialect: (1.0 if value else 0.0,),
+    return Goal('arm' if value else 'disarm', _ARM, lambda dialect: (float(value),),
                 lambda vehicle: vehicle.status.armed == value, ends_flight=not value,
-                insists=not value, before=armable if value else lambda vehicle: None)
-
-
-#: The mode that obeys our setpoints: OFFBOARD, GUIDED.
-OFFBOARD: Final[Goal] = Goal(
-    'offboard', mavlink.MAV_CMD_DO_SET_MODE,
-    lambda dialect: dialect.set_mode_parameters(dialect.offboard),
-    lambda vehicle: vehicle.status.offboard, needs_stream=True,
-    through=lambda dialect: (dialect.offboard,))
-#: Out of that mode, into the one that keeps the position; PX4 has none without a global origin.
-HOLD: Final[Goal] = Goal(
-    'hold', mavlink.MAV_CMD_DO_SET_MODE,
-    lambda dialect: dialect.set_mode_parameters(dialect.hold),
-    lambda vehicle: not vehicle.status.offboard, ends_flight=True,
-    through=lambda dialect: (dialect.hold,),
-    instead=lambda dialect: enter(*dialect.hold_instead, ends_flight=True))
-#: Landing here: reached when the vehicle descends, not when it is down.
-LAND: Final[Goal] = Goal(
-    'land', mavlink.MAV_CMD_DO_SET_MODE,
-    lambda dialect: dialect.set_mode_parameters(dialect.land),
-    lambda vehicle: vehicle.status.mode == vehicle.dialect.land, ends_flight=True, insists=True,
-    through=lambda dialect: (dialect.land,))
+                insists=not value, before=armable)
 
 
 def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
@@ -166,65 +151,69 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
     """
     enough = altitude + height - max(0.2, 0.1 * height)
     return Goal(
-        'takeoff', mavlink.MAV_CMD_NAV_TAKEOFF,
-        lambda dialect: dialect.takeoff_parameters(
-            height, sea_level_altitude, above_home),
+        'takeoff', TAKEOFF,
+        lambda dialect: dialect.takeoff_parameters(height, sea_level_altitude, above_home),
         lambda vehicle: (vehicle.airborne and vehicle.altitude is not None
                          and vehicle.altitude >= enough),
+        modes=lambda dialect: dialect.takeoff_modes,
         timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
-        before=lambda vehicle: replace(OFFBOARD, needs_stream=False)
-        if vehicle.dialect.setpoints_end_takeoff else None,
-        # Whatever it climbs to by now, it is not what was asked for.
-        through=lambda dialect: dialect.takeoff_modes, needs_arming=True, abandoned=LAND)
+        # A copy of OFFBOARD, which needs no setpoint stream.
+        before=lambda vehicle: (
+            replace(OFFBOARD) if vehicle.dialect.setpoints_end_takeoff else None))
+
+
+def result_words(result: int) -> str:
+    """Return a MAV_RESULT in words: 'temporarily rejected'."""
+    entry = mavlink.enums['MAV_RESULT'].get(result)
+    return entry.name.removeprefix('MAV_RESULT_').lower().replace('_', ' ') if entry else (
+        f'result {result}')
 
 
 class Request:
     """
     One request to the autopilot, stepped until it has an ``outcome``.
 
-    Feed it every COMMAND_ACK and call ``step`` often; it says when to send which command.
+    Feed it every COMMAND_ACK and call ``step`` often; it returns when to send which command.
 
-    :param superseded: what was still being asked for, and may come about yet.
-    :param own: whether the bridge itself asks for it.
+    :param superseded: the goal that was still requested, and may be reached yet.
+    :param own: whether the bridge itself makes the request.
     """
 
     def __init__(self, goal: Goal, now: float, superseded: Goal | None = None,
                  own: bool = False) -> None:
         self.goal = goal
         self.own = own
+        self.begun = now
         self.outcome: Outcome | None = None
+        self._superseded = superseded
+        self._next: Goal | None = None
+        self._refused: list[str] = []
+        self._known: Vehicle | None = None
+        self._advice = ''
+        self._mode = ''
+        self._begin(goal, now)
+
+    def _begin(self, goal: Goal, now: float) -> None:
         self.current = goal
         """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
-        self._then: Goal | None = None
-        self._refused: list[str] = []
-        self._failed = False
-        self._superseded = superseded
-        self._prepared = False
-        self._known: Vehicle | None = None
-        self._untold = ''
-        self._mode = ''
-        self.begun = self._start = now
-        self._first_sent: float | None = None
-        self._last_sent = now
+        self._since = self._last_sent = now  # since the beginning, then since the first command
         self._attempts = 0
-        self._answered = False
         self._result: int | None = None
         self._refused_at: float | None = None
 
     @property
     def sent(self) -> bool:
-        """Return whether the command of the goal has been sent."""
-        return self._first_sent is not None
+        """Return whether the command of ``current`` has been sent."""
+        return self._attempts > 0
 
     def acknowledge(self, command: int, result: int, now: float) -> bool:
         """Take a COMMAND_ACK; return whether it is the first that refuses."""
-        if command != self.current.command or self._first_sent is None:
+        if command != self.current.command or not self.sent:
             return False
-        self._answered = True
-        if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            return False
-        self._result = result
-        if result == mavlink.MAV_RESULT_ACCEPTED or self._refused_at is not None:
+        refuses = result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
+        if refuses or self._result is None:
+            self._result = result
+        if not refuses or self._refused_at is not None:
             return False
         self._refused_at = now
         return True
@@ -234,163 +223,127 @@ class Request:
         """
         Return the confirmation count with which to send the command of ``current`` now, or None.
 
-        :param vehicle: as known now, None where no HEARTBEAT is fresh.
+        :param vehicle: its state now, None if no HEARTBEAT is fresh.
         :param streaming_for: how long setpoints have been going out without a gap, s.
         """
         if self.outcome is not None:
             return None
         self._known = vehicle or self._known
-        if vehicle is not None and not self._prepared:
-            self._prepared = True
+        if vehicle is not None and not self._mode:
             self._mode = vehicle.status.mode
             before = self.goal.before(vehicle)
-            self._then = self.goal if before else None
-            self._begin_step(before or self.goal, now)
-        if vehicle is not None and self.current.reached(vehicle):
-            if vehicle.heard > (self._start if self._first_sent is None else self._first_sent):
-                if self._first_sent is not None or not self._insists():
-                    self._reached(vehicle, now)
-                    return None
-            elif self._first_sent is None and not self._insists() and (
-                    now - self._start < STREAM_TIMEOUT):
-                return None  # the next HEARTBEAT tells whether it is so still
+            self._next = self.goal if before else None
+            self._begin(before or self.goal, now)
+        insists = self.current.insists or self._superseded is not None
+        if vehicle is not None and self.current.reached(vehicle) and (self.sent or not insists):
+            if vehicle.shown_time > self._since:
+                self._reached(vehicle, now)
+                return None
+            if not self.sent and now - self._since < STREAM_TIMEOUT:
+                return None  # the next HEARTBEAT shows whether it is still so
         if vehicle is not None and (reason := self._overtaken(vehicle)):
             self.refuse(reason)
             return None
-        if self._first_sent is None:
-            return self._begin(vehicle, streaming_for, now)
+        if not self.sent:
+            return self._first(vehicle, streaming_for, now)
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._give_up(self._refusal(texts), vehicle, now)
-        elif now - self._first_sent >= self._patience():
-            why = self._unconfirmed(vehicle, texts)
-            safe = self.current.abandoned
-            holds = vehicle is not None and vehicle.status.mode == vehicle.dialect.hold
-            if safe is not None and self._answered and not holds:
-                self._abandon(why, safe, vehicle, now)
-            else:
-                self._give_up(why, vehicle, now)
-        elif now - self._last_sent >= RESEND_PERIOD and self._unheeded():
+            self._fail(self._refusal(texts), vehicle, False, now)
+        elif now - self._since >= (CONFIRM_TIMEOUT if self._result is None
+                                   else self.current.timeout):
+            self._fail(self._unconfirmed(vehicle, texts), vehicle, True, now)
+        elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
+                # An ACK of a mode command may answer an earlier one: it does not say. If it was
+                # this one's, the pilot may have left the mode between two HEARTBEATs: only what
+                # ends a flight is sent again.
+                self.current.ends_flight and self.current.command == _SET_MODE)):
             return self._send(now)
         return None
 
     def refuse(self, message: str) -> Request:
-        """End without having asked the autopilot, and return self."""
+        """End the request with a reason, and return self."""
         self._finish(False, f'{self.goal.name} refused: {message}')
         return self
 
-    def _begin_step(self, goal: Goal, now: float) -> None:
-        self.current = goal
-        self._start = self._last_sent = now
-        self._first_sent = self._result = self._refused_at = None
-        self._attempts = 0
-        self._answered = False
-
     def _reached(self, vehicle: Vehicle, now: float) -> None:
-        if self._then is not None:
+        if self._next is not None:
             self._mode = vehicle.status.mode
-            goal, self._then = self._then, None
-            self._begin_step(goal, now)
-        elif self._first_sent is None:
-            self._finish(True, f'{self.current.name}: {_shown(vehicle)}, already')
-        else:
-            self._finish(True, f'{self.current.name}: {_shown(vehicle)}, '
-                               f'after {now - self._first_sent:.1f} s')
+            goal, self._next = self._next, None
+            self._begin(goal, now)
+            return
+        duration = f'after {now - self._since:.1f} s' if self.sent else 'already'
+        self._finish(True, f'{self.current.name}: {_shown(vehicle)}, {duration}')
 
-    def _give_up(self, why: str, vehicle: Vehicle | None, now: float) -> None:
-        """Ask for what is to be asked for instead, or end."""
+    def _fail(self, why: str, vehicle: Vehicle | None, late: bool, now: float) -> None:
+        """Request something else after a refusal, or after the time is over (``late``); or end."""
         instead = self.current.instead(vehicle.dialect) if vehicle is not None else None
-        if instead is None or not self._answered:
-            self._finish(False, '; '.join(filter(None, (why, self._untold))))
+        if late and self.current.command == TAKEOFF and not (
+                vehicle is not None and vehicle.status.mode == vehicle.dialect.hold):
+            instead = LAND  # it may climb on
+        if instead is None or self._result is None:
+            self._finish(False, '; '.join(filter(None, (why, self._advice))))
             return
         self._refused.append(why)
-        self._begin_step(instead, now)
-
-    def _abandon(self, why: str, instead: Goal, vehicle: Vehicle | None, now: float) -> None:
-        """Ask for something safe, whatever becomes of it: the goal has failed."""
-        self._refused.append(why)
-        self._failed = True
-        if vehicle is not None:
-            self._mode = vehicle.status.mode
-        self._begin_step(instead, now)
-
-    def _insists(self) -> bool:
-        return self.current.insists or self._superseded is not None
-
-    def _unheeded(self) -> bool:
-        # An ACK of a mode command may answer this request or an earlier one: it does not say. If
-        # it was this one's, the pilot may have left the mode between two HEARTBEATs: only what
-        # ends a flight is asked for again.
-        return not self._answered or (
-            self.current.ends_flight and self.current.command == mavlink.MAV_CMD_DO_SET_MODE)
+        self._mode = vehicle.status.mode if vehicle is not None else self._mode
+        self._begin(instead, now)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""
-        goal, status = self.current, vehicle.status
-        if goal.needs_arming and not status.armed:
+        status, dialect = vehicle.status, vehicle.dialect
+        if self.current.command == TAKEOFF and not status.armed:
             return 'disarmed meanwhile'
-        if goal.through is None:
+        if self.current.modes is None:
             return ''
-        expected = {self._mode, *goal.through(vehicle.dialect)}
-        if self._superseded is not None and self._superseded.through is not None:
-            expected.update(self._superseded.through(vehicle.dialect))
-        if self._mode in vehicle.dialect.takeoff_modes:  # one leads on to the next
-            expected.update(vehicle.dialect.takeoff_modes)
-        if status.mode in expected:
-            return ''
-        return f'the mode was changed to {status.mode} meanwhile'
+        expected = {self._mode, *self.current.modes(dialect)}
+        if self._superseded is not None and self._superseded.modes is not None:
+            expected.update(self._superseded.modes(dialect))
+        if self._mode in dialect.takeoff_modes:  # one leads on to the next
+            expected.update(dialect.takeoff_modes)
+        return '' if status.mode in expected else (
+            f'the mode was changed to {status.mode} meanwhile')
 
-    def _begin(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
-        waited = now - self._start
-        if vehicle is None:
-            if self.current.ends_flight:  # it may hear us though we do not hear it
-                self._first_sent = now
-                return self._send(now)
-            if waited >= STREAM_TIMEOUT:
-                self._finish(False, f'{self.current.name}: no HEARTBEAT from the autopilot')
-            return None
-        needed = vehicle.dialect.stream_before_offboard
-        if self.current.needs_stream and streaming_for < needed:
-            if waited >= STREAM_TIMEOUT:
-                self._finish(False, f'{self.current.name}: no setpoint stream has been running '
-                                    f'for {needed} s')
-            return None
-        self._first_sent = now
-        return self._send(now)
+    def _first(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
+        """Send the command for the first time if its conditions are met; else wait, or end."""
+        missing = ''
+        if vehicle is None and not self.current.ends_flight:
+            missing = NOT_RECEIVED
+        elif vehicle is not None and self.current is OFFBOARD and (
+                streaming_for < vehicle.dialect.stream_before_offboard):
+            missing = ('no setpoint stream has been running for '
+                       f'{vehicle.dialect.stream_before_offboard} s')
+        if not missing:
+            self._since = now
+            return self._send(now)
+        if now - self._since >= STREAM_TIMEOUT:
+            self._finish(False, f'{self.current.name}: {missing}')
+        return None
 
     def _send(self, now: float) -> int:
         self._last_sent = now
         self._attempts += 1
         return min(self._attempts - 1, 255)
 
-    def _patience(self) -> float:
-        return self.current.timeout if self._answered else CONFIRM_TIMEOUT
-
-    def _said(self, texts: StatusTexts) -> str:
-        said = [] if self._first_sent is None else texts.since(self._first_sent)
-        return f': {"; ".join(said)}' if said else ''
-
     def _refusal(self, texts: StatusTexts) -> str:
         goal, vehicle, mode = self.current, self._known, ''
-        if vehicle is not None and not (
-                goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
-            mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
-        reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
-        self._untold = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
+        if vehicle is not None and not (goal.ends_flight and goal.command == _ARM):
+            mode = goal.modes(vehicle.dialect)[0] if goal.modes else vehicle.status.mode
+        reasons = texts.why(self._since, mode)
+        self._advice = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
         result = 'no result' if self._result is None else result_words(self._result)
         return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
-        goal = self.current
-        if not self._answered:
-            unreceived = ', and no HEARTBEAT' if vehicle is None else ''
-            return (f'{goal.name}: no answer to {self._attempts} commands{unreceived}'
-                    f'{self._said(texts)}')
-        now_is = 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle)
-        return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'
+        name = self.current.name
+        if self._result is None:
+            told = f'{name}: no answer to {self._attempts} commands' + (
+                ', and no HEARTBEAT' if vehicle is None else '')
+        else:
+            told = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
+                'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
+        return ': '.join(filter(None, (told, '; '.join(texts.since(self._since)))))
 
     def _finish(self, success: bool, message: str) -> None:
-        self.outcome = Outcome(success and not self._failed,
-                               '; '.join([*self._refused, message]))
+        abandoned = self.current is LAND and self.goal is not LAND
+        self.outcome = Outcome(success and not abandoned, '; '.join([*self._refused, message]))
 
 
 def _shown(vehicle: Vehicle) -> str:

@@ -89,7 +89,7 @@ class Dialect:
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it accepts, with the child BODY_FRD."""
     estimator_status: int
-    """Message id of the status of its estimator, see ``velocity_check.estimator_status``."""
+    """Message id of the status of its estimator, see ``estimator_health``."""
     gps_switch: str
     """Parameter that is 0 if it uses no GPS; '' if zeros are no origin for it."""
     origin_has_height: bool
@@ -117,10 +117,12 @@ class Dialect:
         return (names.get(main << 16 | sub << 24) or names.get(main << 16)
                 or f'mode {main}.{sub}')
 
+    def arming_mode(self, mode: str) -> str:
+        """Return the mode that a vehicle is armed in: another one if it does not arm in this."""
+        return self.arming_modes[0] if mode in self.unarmable_modes else mode
+
     def set_mode_parameters(self, name: str) -> tuple[float, ...]:
-        """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
-        if name not in self.modes:
-            raise ValueError(f'mode = {name!r}: must be one of {", ".join(self.modes)}')
+        """Return the parameters of MAV_CMD_DO_SET_MODE for the name of a mode."""
         code, flag = self.modes[name], float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
         if self.sub_modes:
             return flag, float(code >> 16 & 0xFF), float(code >> 24)
@@ -206,10 +208,7 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
 
     :param autopilot: 'auto' follows the HEARTBEAT; a name requires this firmware, and accepts one
         that HEARTBEAT does not name.
-    :raises ValueError: for a value that is not in ``AUTOPILOTS``.
     """
-    if autopilot not in AUTOPILOTS:
-        raise ValueError(f'autopilot = {autopilot!r}: must be one of {", ".join(AUTOPILOTS)}')
     sender = next((d for d in DIALECTS.values() if d.firmware == heartbeat.autopilot), None)
     if sender is ARDUPILOT and heartbeat.type not in _MULTIROTORS:
         return None

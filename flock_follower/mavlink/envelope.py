@@ -13,20 +13,16 @@
 # limitations under the License.
 
 """
-What the gate is told to keep to: its limits and timeouts, their defaults and ranges.
-
-The safety envelope: heights and a radius that no setpoint leads out of, whatever is commanded.
+The limits of the gate, and the safety envelope: heights and a radius that setpoints stay within.
 
 Each bound limits the acceleration towards it, so that the vehicle can still stop in front of it. A
-vehicle that is beyond a bound all the same is to be handed to the autopilot's hold mode. Vectors
-are ENU; height is above the place of arming, see ``height``.
+vehicle beyond a bound is handed to the autopilot's hold mode. Vectors are ENU.
 
-Height above the place of arming, by a sensor that no odometry of ours is fused into.
-
-That is the autopilot's barometer, or its rangefinder where no barometer is reported. An observer
-with two poles at -BANDWIDTH follows the sensor. Between two samples it goes by a vertical velocity
-of the vehicle, whose constant error it finds. A sensor that jumps while that velocity does not (a
-gust, a door, a table below) is taken to be wrong by the jump: the reference is shifted.
+``HeightEstimator`` estimates the height above the place of arming by a sensor that our odometry is
+not fused into: the autopilot's barometer, or its rangefinder if no barometer is reported. An
+observer with two poles at -BANDWIDTH follows the sensor. Between two samples it integrates a
+vertical velocity of the vehicle, whose constant error it estimates. If the sensor jumps and that
+velocity does not (a gust, a door, a table below), the reference is shifted by the jump.
 """
 
 from __future__ import annotations
@@ -64,7 +60,7 @@ class GateLimits(Checked):
     blind_timeout: float = parameter(
         2.0, Range(0.2, 10.0, 's'),
         'After this long without a velocity that was known before, the stream stops, s; sooner '
-        'where there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``.')
+        'if there is one that cannot be used, see ``velocity_check.LOSS_TIMEOUT``.')
     speed_horizon: float = parameter(
         0.3, Range(0.02, 2.0, 's'),
         "The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a "
@@ -184,16 +180,16 @@ def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float)
     return -outward, (closing - speed) / horizon
 
 
-def exceeded(limits: GateLimits, place: Location) -> str:
-    """Return which bound the vehicle is beyond, in words, or ''."""
+def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
+    """Return which bound the vehicle is beyond by more than a tolerance, m, in words, or ''."""
     if place.height is not None:
-        if place.height < limits.height_min - TOLERANCE:
+        if place.height < limits.height_min - tolerance:
             return f'height {place.height:.2f} m: below height_min = {limits.height_min:g} m'
-        if place.height > limits.height_max + TOLERANCE:
+        if place.height > limits.height_max + tolerance:
             return f'height {place.height:.2f} m: above height_max = {limits.height_max:g} m'
     if place.offset is not None:
         distance = math.hypot(*place.offset.tolist())
-        if distance > limits.radius_max + TOLERANCE:
+        if distance > limits.radius_max + tolerance:
             return (f'{distance:.2f} m from where it became ACTIVE: beyond radius_max = '
                     f'{limits.radius_max:g} m')
     return ''
@@ -205,11 +201,7 @@ def outside(limits: GateLimits, height: float | None) -> str:
         return ('the height above the place of arming is not known: neither barometer '
                 '(SCALED_PRESSURE) nor rangefinder (DISTANCE_SENSOR), or armed before the bridge '
                 'started and no HOME_POSITION')
-    if height < limits.height_min:
-        return f'height = {height:.2f} m: must be at least height_min = {limits.height_min:g} m'
-    if height > limits.height_max:
-        return f'height = {height:.2f} m: must be at most height_max = {limits.height_max:g} m'
-    return ''
+    return exceeded(limits, Location(height), 0.0)
 
 
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.

@@ -13,13 +13,11 @@
 # limitations under the License.
 
 """
-What the autopilot's own estimate rests on, and so whether its velocity may be believed.
+Whether the autopilot's velocity may be used, and whether its messages arrive often enough.
 
-An estimator whose last source is gone integrates its gyros and accelerometers, and goes on telling
-a velocity for seconds: braking on it speeds the vehicle up. Measured on PX4 1.16, whose vision had
-been lost: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
-
-How steadily the autopilot's messages arrive, and when to ask for them again.
+An estimator that has lost its last source integrates gyros and accelerometers, and reports a
+velocity for seconds: braking on it speeds the vehicle up. Measured on PX4 1.16 after the loss of
+vision: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
 """
 
 from __future__ import annotations
@@ -48,7 +46,7 @@ _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_POS_HORIZ_ABS: 'POS_HORIZ_ABS',
     mavlink.ESTIMATOR_POS_VERT_ABS: 'POS_VERT_ABS',
     mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
-#: How PX4's arming check is worded that misses a global position, see ``px4_events``.
+#: Part of the text of PX4's arming check for a global position, see ``status_texts``.
 NO_GLOBAL_POSITION: Final[str] = 'no global position'
 UNALIGNED: Final[str] = ('its estimator lacks no flag: its yaw is not aligned; restart it, and '
                          'set EKF2_MAG_TYPE to 5 where it flies without GPS')

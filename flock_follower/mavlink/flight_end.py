@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.ranges import Checked, parameter, Range
@@ -96,14 +96,6 @@ class EndParams(Checked):
     battery_action: str = parameter(HOLD, ACTIONS, 'what follows on a low battery', live=False)
 
 
-class EndRequest(NamedTuple):
-    """What the bridge has to request of the autopilot now."""
-
-    action: str
-    """'hold' or 'land'."""
-    why: str
-
-
 class FlightEnd:
     """Follows one bridge's flights; times are monotonic, s."""
 
@@ -164,9 +156,9 @@ class FlightEnd:
         return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
-             status: VehicleStatus, now: float) -> EndRequest | None:
+             status: VehicleStatus, now: float) -> str:
         """
-        Return what to request of the autopilot at ``now``, if anything.
+        Return what to request of the autopilot at ``now``: HOLD, LAND or '' for nothing.
 
         :param flies: whether the vehicle, as far as known, flies our setpoints.
         :param pending: whether a request that ends the flight is open.
@@ -177,16 +169,16 @@ class FlightEnd:
         if flies:
             why, action = (why, action) if why else (self.why, self._action)
             if not why or pending or now - self._asked < RETRY_PERIOD:
-                return None
+                return ''
             self.why, self._action, self._asked = why, action, now
             self._held_since = math.inf
-            return EndRequest(HOLD, why)
+            return HOLD
         if not self.why or self._action != LAND or pending:
-            return None
+            return ''
         self._held_since = min(self._held_since, now)
         if status.mode != held_mode or not status.armed:
             self._action = HOLD  # somebody has decided otherwise
         elif now - self._held_since >= LANDING_DELAY:
             self._action = HOLD
-            return EndRequest(LAND, self.why)
-        return None
+            return LAND
+        return ''

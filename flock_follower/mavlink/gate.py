@@ -15,14 +15,12 @@
 """
 The setpoint gate: whether a setpoint may be sent (``permission``), and which one.
 
-It stores the newest of each input with its time, and passes them to ``setpoint_rules.decide``. The
-same object decides in the bridge, in ``evaluate`` and in ``flights``; nothing here knows MAVLink
-messages or reads a clock.
+It stores the newest of each input with its time, and passes them to ``setpoint_rules.decide``.
+Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a clock.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 import math
 from typing import Final
@@ -30,10 +28,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import envelope, setpoint_rules
-from flock_follower.mavlink import setpoint_rules as disturbance
-from flock_follower.mavlink import velocity_check as displacement
+from flock_follower.geometry import Array
+from flock_follower.mavlink import envelope, setpoint_rules, velocity_check
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
 from flock_follower.mavlink.permission import (
@@ -48,21 +44,22 @@ from flock_follower.mavlink.permission import (
 from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
+    displaced,
     finite_vector,
     KnownMotion,
     Motion,
     ODOM,
     Path,
+    refusal,
+    Source,
     VELOCITIES_DISAGREE,
     VelocityComparison,
 )
-from flock_follower.messages import Command, FUTURE_TOLERANCE, SANE
+from flock_follower.messages import Command, SANE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
 VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
-#: Yaws of the autopilot are kept for this long, s: odometry is compared with them as it comes.
-YAW_MEMORY: Final[float] = 1.0
 #: Braking keeps the height that the vehicle reaches after this time, s.
 HEIGHT_LEAD: Final[float] = 0.3
 #: A height that is lost while the autopilot is received hands the vehicle over after this, s.
@@ -82,32 +79,6 @@ class AcceptedCommand:
     """When it applies, s."""
     source_time: float
     """When the image it rests on was taken, s."""
-    number: int
-
-
-class _Source:
-    """The newest of what one source reports, and the times at which it was so, s."""
-
-    def __init__(self) -> None:
-        self.velocity: Array = np.zeros(3)
-        self.velocity_time = -math.inf
-        self.yaws: deque[tuple[float, float]] = deque()
-        self.path = Path()
-        self.std = 0.0
-        """Standard deviation of the position, m."""
-
-    def yaw(self, time: float) -> tuple[float, float]:
-        """Return the yaw nearest to a time, rad, and the time at which it was so."""
-        if not self.yaws:
-            return 0.0, -math.inf
-        # A copy: diagnostics read it from another thread.
-        near = min(tuple(self.yaws), key=lambda known: abs(known[0] - time))
-        return near[1], near[0]
-
-    @property
-    def newest_yaw(self) -> tuple[float, float]:
-        """Return the newest yaw, rad, and the time at which it was so."""
-        return self.yaw(math.inf) if not self.yaws else self.yaws[-1][::-1]
 
 
 class Gate:
@@ -123,16 +94,12 @@ class Gate:
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
-        if velocity_source not in VELOCITY_SOURCES:
-            raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
-                             f'{", ".join(VELOCITY_SOURCES)}')
         self.limits = self.full_limits = limits or GateLimits()
         self.velocity_source = velocity_source
         self.compensates_wind = False
         """Whether setpoints offset the wind."""
         self.fused = False
-        """Whether the autopilot's estimate rests on our odometry: to compare them proves
-        nothing."""
+        """Whether the autopilot's estimate rests on our odometry, so that it proves nothing."""
         self.heights = HeightEstimator()
         self.new_command = False
         """Whether a command was accepted since the last decision."""
@@ -146,8 +113,7 @@ class Gate:
         self._airborne: bool | None = None
         self._landed_since = math.inf
         self._command: AcceptedCommand | None = None
-        self._accepted = 0
-        self._sources = {ODOM: _Source(), AUTOPILOT: _Source()}
+        self._sources = {ODOM: Source(), AUTOPILOT: Source()}
         self._height_path = Path()
         self._start: Array | None = None
         self._comparison = VelocityComparison()
@@ -201,16 +167,15 @@ class Gate:
         a = finite_vector(command.acceleration)
         if a is None or not math.isfinite(command.yaw):
             return 'not finite'
-        if refused := _refusal(age, self.limits.planner_timeout):
+        if refused := refusal(age, self.limits.planner_timeout):
             return refused
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
-        self._accepted += 1
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
-            command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
+            command._replace(acceleration=a), now - max(age, 0.0), now - source)
         return ''
 
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
@@ -218,7 +183,7 @@ class Gate:
         v = finite_vector(velocity)
         if v is None:
             return 'not finite'
-        if refused := _refusal(age, self.limits.odom_timeout):
+        if refused := refusal(age, self.limits.odom_timeout):
             return refused
         known = self._sources[source]
         known.velocity, known.velocity_time = v, now - max(age, 0.0)
@@ -256,11 +221,7 @@ class Gate:
 
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
-        known = self._sources[source].yaws
-        if math.isfinite(yaw) and (not known or time >= known[-1][0]):
-            known.append((time, wrap_angle(yaw)))
-            while time - known[0][0] > YAW_MEMORY:
-                known.popleft()
+        self._sources[source].take_yaw(yaw, time)
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
@@ -298,12 +259,12 @@ class Gate:
         """Return how often a position or a height has jumped."""
         return self.heights.steps + sum(source.path.jumps for source in self._sources.values())
 
-    def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
+    def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
         if now - self._disturbance.excess_since <= longer:
             return ''
         return (f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
-                f'more than setpoints offset ({disturbance.OFFSET_MAX:g}): check the load, the '
+                f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
                 'battery, MPC_THR_HOVER or MOT_THST_HOVER')
 
     def speed(self, now: float) -> float | None:
@@ -321,12 +282,12 @@ class Gate:
 
     def handover(self, now: float) -> str:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        if now - self._displaced_since > displacement.HANDOVER_TIME:
+        if now - self._displaced_since > velocity_check.HANDOVER_TIME:
             return self._displaced
         if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
             return 'no height from the autopilot'
         return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
-            now, disturbance.HANDOVER_TIME)
+            now, setpoint_rules.HANDOVER_TIME)
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
@@ -381,10 +342,6 @@ class Gate:
         if now - self._landed_since >= LANDED_TIME:
             self.permit(Landed())
 
-    def blind(self, now: float) -> bool:
-        """Return whether there has been no velocity to believe for too long."""
-        return self._known(now).blind(self.limits)
-
     def _source(self) -> str:
         if self.velocity_source != 'auto':
             return self.velocity_source
@@ -410,32 +367,17 @@ class Gate:
             distrusted_for=now - self._distrusted_since)
 
     def _compare(self, engaged: bool, now: float) -> None:
-        """Compare what the sources report of velocity and displacement."""
-        self._comparison.take(self._known(now).velocity_difference(self.limits),
+        """Compare the velocities and the displacements of the sources."""
+        known, odom = self._known(now), self._sources[ODOM]
+        self._comparison.take(known.velocity_difference(self.limits),
                               self.limits.velocity_tolerance, engaged, now)
-        self._displaced = self._displacement(now)
+        # An estimate that rests on our odometry, or on nothing, proves nothing.
+        proves = not self.fused and math.isinf(self._distrusted_since)
+        self._displaced = '' if known.source != ODOM else displaced(
+            odom, self._sources[AUTOPILOT] if proves else None,
+            known.yaw_difference(self.limits) or 0.0, self._height_path, now)
         self._displaced_since = min(self._displaced_since, now) if engaged and (
             self._displaced) else math.inf
-
-    def _displacement(self, now: float) -> str:
-        """Return that odom and another source report other displacements, or ''."""
-        odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
-        if self._source() != ODOM:
-            return ''
-        if not self.fused and math.isinf(self._distrusted_since):
-            turned = self._known(now).yaw_difference(self.limits)
-            off = displacement.difference(odom.path, autopilot.path, -(turned or 0.0), now)
-            most = max(displacement.TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
-            if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
-                return (f'displacements of odom and of the autopilot differ by {distance:.1f} m '
-                        f'in {displacement.WINDOW:g} s')
-        off = displacement.difference(odom.path, self._height_path, 0.0, now)
-        most = max(displacement.TOLERANCE, 3.0 * math.hypot(
-            displacement.BAROMETER_STD, odom.std))
-        if off is not None and abs(climb := float(off[2])) > most:
-            return (f'displacements of odom and of the barometer differ by {climb:.1f} m in '
-                    f'{displacement.WINDOW:g} s')
-        return ''
 
     def _hold(self, known: KnownMotion, place: Location, engaged: bool, now: float) -> None:
         """Note what braking keeps, and where the radius counts from."""
@@ -456,12 +398,3 @@ class Gate:
                 self._last_yaw = yaw
                 break
         self._held = Held(self._last_yaw, height)
-
-
-def _refusal(age: float, timeout: float) -> str:
-    """Return why an input of an age, s, is refused, or ''."""
-    if not math.isfinite(age):
-        return 'not finite'
-    if age > timeout:
-        return 'too old'
-    return 'from the future' if age < -FUTURE_TOLERANCE else ''

@@ -169,7 +169,7 @@ class Housekeeping:
                  estimate_rate: float, origin: tuple[float, float, float] | None,
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
-        self.parameters: ParameterCheck | None = None
+        self.parameters = ParameterCheck((), bytewise=False)
         self.alive_since = math.inf
         """When the autopilot was first heard, s."""
         self._link = link
@@ -188,7 +188,7 @@ class Housekeeping:
     def take(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s."""
         kind = message.get_type()
-        if kind == 'PARAM_VALUE' and self.parameters is not None:
+        if kind == 'PARAM_VALUE':
             self.parameters.take(message)
         elif kind == 'TIMESYNC':
             answer = self.timesync.take(message, round(now * 1e9))
@@ -214,9 +214,8 @@ class Housekeeping:
                 self.timesync.question(round(now * 1e9))):
             self._timesync_sent = now
         self._send_origin(now)
-        if self.parameters is not None:
-            for name in self.parameters.step(now):
-                self._link.request_parameter(name)
+        for name in self.parameters.step(now):
+            self._link.request_parameter(name)
         status = self._link.telemetry.status
         if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
             self._why_asked = now
@@ -232,24 +231,15 @@ class Housekeeping:
         """Return whether the autopilot was asked what keeps it from arming, and had the time."""
         return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
-    def _new_check(self) -> ParameterCheck | None:
+    def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
         if dialect is None:
-            return None
-        return ParameterCheck(self._recommendations.get(dialect.name, ()),
-                              bytewise=dialect.bytewise_parameters,
-                              needed=[
-                                  *(rule.name for rule in rules(dialect, self.without_gps)),
-                                  *filter(None, (
-                                      dialect.minimum_takeoff,
-                                      dialect.gps_switch if self.without_gps else ''))])
-
-    def _any_origin(self) -> tuple[float, float, float] | None:
-        dialect, parameters = self._link.telemetry.dialect, self.parameters
-        if not self.without_gps or dialect is None or parameters is None:
-            return None
-        off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
-        return ANY_ORIGIN if off else None
+            return ParameterCheck((), bytewise=False)
+        needed = [rule.name for rule in rules(dialect, self.without_gps)]
+        switch = dialect.gps_switch if self.without_gps else ''
+        return ParameterCheck(
+            self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
+            needed=[*needed, *filter(None, (dialect.minimum_takeoff, switch))])
 
     def rates(self, now: float) -> dict[str, tuple[float, float]]:
         """Return how often the estimate comes and was asked for, Hz, by the message's name."""
@@ -308,16 +298,21 @@ class Housekeeping:
         self._link.request_streams(due)
 
     def _send_origin(self, now: float) -> None:
-        telemetry, origin = self._link.telemetry, self._origin or self._any_origin()
-        # Where it has one, from GPS or from before, the autopilot keeps that.
-        if origin is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
+        telemetry, origin = self._link.telemetry, self._origin
+        dialect = telemetry.dialect
+        # An autopilot that has one, from GPS or from before, keeps it.
+        if dialect is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
             return
-        if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
-            return  # told before odometry is fused, PX4's heights would jump by the origin's
+        if origin is None and self.without_gps and (
+                self.parameters.values.get(dialect.gps_switch) == 0):
+            origin = ANY_ORIGIN
+        if origin is None or (
+                # Sent before odometry is fused, PX4's heights would jump by the origin's.
+                telemetry.estimator is not None and not telemetry.estimator.has_velocity):
+            return
         latitude, longitude, height = origin
-        if telemetry.dialect is None or not telemetry.dialect.origin_has_height:
-            # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
-            height = 0.0
+        # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
+        height = height if dialect.origin_has_height else 0.0
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):

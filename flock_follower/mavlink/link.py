@@ -78,35 +78,35 @@ class Framer:
         start, incomplete = 0, -1
         self.looks = 0
         while (start := _next_marker(buffer, start)) >= 0:
-            whole = len(messages) + unused[WRONG_SIGNATURE]
-            if self.looks >= most or self.looks - whole > MOST_FALSE_STARTS:
+            false_starts = self.looks - len(messages) - unused[WRONG_SIGNATURE]
+            if self.looks >= most or false_starts > MOST_FALSE_STARTS:
                 incomplete = -1
                 break
             self.looks += 1
             end = start + frame_length(buffer, start)
             if end > len(buffer):
                 # Either the rest has not arrived yet, or this byte was no start. Look on: a whole
-                # message behind it tells that it was none.
+                # message behind it shows that it was none.
                 incomplete = start if incomplete < 0 else incomplete
                 start += 1
                 continue
+            fault = ''
             try:
                 message = self.codec.decode(buffer[start:end])
             except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
-                if 'signature' in str(error).lower():  # whole, but not from whom we trust
-                    unused[WRONG_SIGNATURE] += 1
-                    start, incomplete = end, -1
-                    continue
-                unused[UNDECODABLE] += 1
+                fault = WRONG_SIGNATURE if 'signature' in str(error).lower() else UNDECODABLE
+            else:
+                if message.get_type().startswith('UNKNOWN'):
+                    # Another dialect's, or garbage: an unknown kind has no checksum.
+                    fault = UNKNOWN_MESSAGE
+            if fault:
+                unused[fault] += 1
+            else:
+                messages.append(message)
+            if fault in (UNDECODABLE, UNKNOWN_MESSAGE):
                 start += 1
-                continue
-            if message.get_type().startswith('UNKNOWN'):
-                # Another dialect's, or garbage: the checksum of an unknown kind says nothing.
-                unused[UNKNOWN_MESSAGE] += 1
-                start += 1
-                continue
-            messages.append(message)
-            start, incomplete = end, -1
+            else:
+                start, incomplete = end, -1
         if not messages and not unused and incomplete < 0:
             unused[UNDECODABLE] += bool(buffer)
         self._waiting = buffer[incomplete:] if incomplete >= 0 else bytearray()
@@ -239,17 +239,12 @@ class Link:
     :param autopilot: its firmware, see ``dialects.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
-    :raises ValueError: for an id outside [1, 255] or an unknown firmware.
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
                  target_component: int = AUTOPILOT_COMPONENT, source_component: int = COMPONENT,
                  autopilot: str = AUTO, signing: Signing | None = None,
                  announce_as_gcs: bool = False) -> None:
-        for name, value in (('target_system', target_system), ('source_system', source_system),
-                            ('target_component', target_component),
-                            ('source_component', source_component)):
-            IDS.check(name, value)
         self.transport = transport
         self.target_system = target_system
         self.target_component = target_component
@@ -269,8 +264,6 @@ class Link:
         self.peer_changes = 0
         #: Whether the newest message of the autopilot carried a signature.
         self.autopilot_signs = False
-        self.received = 0
-        self.sent = 0
         self.bytes_received = 0
         self.bytes_sent = 0
         self._signing = signing
@@ -306,7 +299,6 @@ class Link:
                         message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
                     self.telemetry.update(message, now)
                     messages.append(message)
-        self.received += len(messages)
         return messages
 
     def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
@@ -363,7 +355,6 @@ class Link:
         data = message.pack(self._sender)
         self._sender.seq = (self._sender.seq + 1) % 256
         sent = self.transport.write(bytes(data))
-        self.sent += sent
         self.bytes_sent += len(data) * sent
         return sent
 
@@ -392,9 +383,9 @@ class Link:
         """Return, for people, what has been heard instead of the autopilot."""
         ignored = self.ignored
         if self.foreign:
-            return (f'heard {self.foreign}, which autopilot = {self.autopilot!r} does not speak')
+            return f'heard {self.foreign}, which autopilot = {self.autopilot!r} does not speak'
         if self.other_autopilots:
-            ids = ', '.join(str(system) for system in sorted(self.other_autopilots))
+            ids = ', '.join(map(str, sorted(self.other_autopilots)))
             return f'heard system id {ids}, not target_system {self.target_system}'
         for reason, text in _UNUSABLE.items():
             if ignored[reason]:

@@ -106,7 +106,7 @@ def parameter_value(message: Any, *, bytewise: bool) -> float:
 
 
 class CheckResult(NamedTuple):
-    """What a finished check has found; never changes, so that any thread may read it."""
+    """The result of a finished check."""
 
     answered: int
     differing: int
@@ -117,10 +117,10 @@ class CheckResult(NamedTuple):
 
 class ParameterCheck:
     """
-    Asks for each recommended parameter in turn; ``step`` says which to ask for now.
+    Asks for each recommended parameter in turn; ``step`` returns which to ask for now.
 
-    ``values`` holds what the autopilot answered, ``unanswered`` what it did not. All is called
-    from one thread; others read ``result`` only.
+    ``values`` holds the autopilot's answers. ``result`` may be called from any thread, everything
+    else from one.
 
     :param needed: names to read that are not compared with anything.
     """
@@ -128,20 +128,12 @@ class ParameterCheck:
     def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool,
                  needed: Sequence[str] = ()) -> None:
         self.values: dict[str, float] = {}
-        self.unanswered: list[str] = []
-        self.result: CheckResult | None = None
-        """What was found, None until every parameter was answered or given up."""
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
-        self._names = list(dict.fromkeys([*needed, *self._recommended]))
-        self._waiting = self._names.copy()
+        self._waiting = list(dict.fromkeys([*needed, *self._recommended]))
+        self._names = frozenset(self._waiting)
         self._asked: dict[str, tuple[float, int]] = {}
-        self._conclude()
-
-    @property
-    def done(self) -> bool:
-        """Return whether every parameter was answered or given up."""
-        return not self._waiting and not self._asked
+        self._unanswered: list[str] = []
 
     def step(self, now: float) -> list[str]:
         """Return the names to ask for at ``now``, s."""
@@ -151,7 +143,7 @@ class ParameterCheck:
                 continue
             if attempts >= ATTEMPTS:
                 del self._asked[name]
-                self.unanswered.append(name)
+                self._unanswered.append(name)
             else:
                 self._asked[name] = now, attempts + 1
                 ask.append(name)
@@ -159,50 +151,37 @@ class ParameterCheck:
             name = self._waiting.pop(0)
             self._asked[name] = now, 1
             ask.append(name)
-        self._conclude()
         return ask
 
     def again(self, name: str) -> None:
         """Ask once more for one that was given up."""
-        if name in self.unanswered:
-            self.unanswered.remove(name)
+        if name in self._unanswered:
+            self._unanswered.remove(name)
             self._waiting.append(name)
 
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""
         name = message.param_id
         name = (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
-        if name not in self._names:
-            return
-        self.values[name] = parameter_value(message, bytewise=self._bytewise)
-        self._asked.pop(name, None)
-        if name in self._waiting:
-            self._waiting.remove(name)
-        if name in self.unanswered:
-            self.unanswered.remove(name)
-        self._conclude()
+        if name in self._names:
+            self.values[name] = parameter_value(message, bytewise=self._bytewise)
+            self._asked.pop(name, None)
+            self._waiting = [other for other in self._waiting if other != name]
+            self._unanswered = [other for other in self._unanswered if other != name]
 
-    def _conclude(self) -> None:
-        """Put together what was found, where that is anything new."""
-        if self.done:
-            found = CheckResult(len(self.values), len(self.differences()), len(self.unanswered),
-                                tuple(self.report()))
-            if found != self.result:
-                self.result = found
-
-    def differences(self) -> list[tuple[Recommendation, float]]:
-        """Return the entries whose value is another than recommended, with that value."""
-        return [(entry, self.values[name]) for name, entry in self._recommended.items()
-                if name in self.values and entry.differs(self.values[name])]
-
-    def report(self) -> list[str]:
-        """Return for people what differs and why it matters, a line each."""
-        lines = [f'{entry.name} = {value:g}, recommended {entry.value:g}: {entry.why}'
-                 for entry, value in self.differences()]
-        if self.unanswered:
-            lines.append(f'no answer about {", ".join(self.unanswered)}: '
+    def result(self) -> CheckResult | None:
+        """Return what was found, None until every parameter was answered or given up."""
+        values, unanswered = self.values.copy(), self._unanswered.copy()
+        if self._waiting or self._asked or not self._names:
+            return None
+        lines = [f'{name} = {values[name]:g}, recommended {entry.value:g}: {entry.why}'
+                 for name, entry in self._recommended.items()
+                 if name in values and entry.differs(values[name])]
+        differing = len(lines)
+        if unanswered:
+            lines.append(f'no answer about {", ".join(unanswered)}: '
                          'compare them with the recommended values by hand')
-        return lines
+        return CheckResult(len(values), differing, len(unanswered), tuple(lines))
 
 
 #: An autopilot may fly the last setpoint for this long, s. ArduPilot's default is 3 s, in which it
@@ -258,21 +237,20 @@ def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
     return [rule for rule in RULES[dialect.name] if forwarding or not rule.forwarding]
 
 
-def obstacle(dialect: Dialect, parameters: ParameterCheck | None, forwarding: bool) -> str:
+def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
-    values = {} if parameters is None else parameters.values
+    values = parameters.values
     return next((f'{rule.name} = {values[rule.name]:g}{rule.words} (or {_ANYWAY})'
                  for rule in rules(dialect, forwarding)
                  if rule.name in values and rule.forbidden(values[rule.name])), '')
 
 
-def unread(dialect: Dialect, parameters: ParameterCheck | None, forwarding: bool) -> str:
+def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return which of them have not been read, having them asked for once more, or ''."""
     names = [rule.name for rule in rules(dialect, forwarding)
-             if parameters is None or rule.name not in parameters.values]
-    if parameters is not None:
-        for name in names:
-            parameters.again(name)
+             if rule.name not in parameters.values]
+    for name in names:
+        parameters.again(name)
     return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
             f'bridge, or not fuse what is forwarded ({_ANYWAY} flies all the same)'
             if names else '')

@@ -122,7 +122,7 @@ class EndRequested:
 
 @dataclass(frozen=True)
 class SecondCommander:
-    """Two nodes give commands at once; ``who`` in words. Told again where more is known."""
+    """Two nodes give commands at once; ``who`` in words."""
 
     who: str
 
@@ -178,9 +178,8 @@ def next_permission(now: Permission, event: Event) -> Permission:
                 return Permission(reason=why)
             return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
         case SecondCommander(who):
-            if phase is Phase.ACTIVE or now.reason.startswith(TWO_COMMAND):
-                return replace(now, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}')
-            return now
+            return replace(now, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}') if (
+                phase is Phase.ACTIVE) else now
         case Blinded(why):
             # Setpoints alone would end the failsafe of PX4, should a velocity come back.
             return Permission(reason=f'{FELL_SILENT}: {why}') if now.streams else now

@@ -13,30 +13,36 @@
 # limitations under the License.
 
 """
-Whether a take-off may be asked for, and what then to ask for.
+Requests by people and by the bridge itself: arm, offboard, take off, land; one at a time.
 
-What people ask of the autopilot: arm, offboard, take off, land; one request at a time.
-
-A request is refused here where it would be in vain or dangerous; else the autopilot is asked, and
-the permission to send setpoints follows what was asked for and what became of it.
+A request that would be in vain or dangerous is refused here. Otherwise the autopilot is asked, and
+the permission to send setpoints follows the request and its outcome.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, envelope, estimator_health
-from flock_follower.mavlink import parameter_check as failsafe
-from flock_follower.mavlink.commands import Goal, Request, Vehicle
+from flock_follower.mavlink import commands, envelope, parameter_check
+from flock_follower.mavlink.commands import (
+    Goal,
+    HOLD,
+    LAND,
+    NOT_RECEIVED,
+    OFFBOARD,
+    Request,
+    STREAM_TIMEOUT,
+    Vehicle,
+)
 from flock_follower.mavlink.dialects import Dialect, VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.estimator_health import explained
 from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import (
     EndRequested,
     OffboardFailed,
@@ -44,87 +50,9 @@ from flock_follower.mavlink.permission import (
     Phase,
 )
 from flock_follower.mavlink.status_texts import StatusTexts
-from flock_follower.mavlink.telemetry import Telemetry
 
 #: PX4 accepts a take-off this much below its minimum height, m.
 TOLERANCE: Final[float] = 0.1
-
-
-def goal(telemetry: Telemetry, height: float, now: float) -> Goal:
-    """Return the goal of climbing by ``height``, m, from where the vehicle is at ``now``, s."""
-    return commands.takeoff(height, telemetry.altitude(now) or 0.0,
-                            telemetry.sea_level_altitude(now),
-                            telemetry.height_above_home(now) or 0.0)
-
-
-def obstacle(status: VehicleStatus | None, telemetry: Telemetry,
-             parameters: ParameterCheck | None, height: float, now: float) -> str:
-    """
-    Return why the vehicle may not climb by ``height``, m, at ``now``, s, or ''.
-
-    :param status: what its HEARTBEAT says, None where none is fresh.
-    :param parameters: of the autopilot, as far as they are known.
-    """
-    if status is None or telemetry.dialect is None:
-        return 'no HEARTBEAT from the autopilot'
-    if not status.armed:
-        return 'disarmed: arm first'
-    # A second climb would begin at the height that the first has reached by now.
-    if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
-        return 'already in the air'
-    if telemetry.altitude(now) is None:
-        return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
-    return _too_low(telemetry.dialect, parameters, height)
-
-
-def out_of_bounds(limits: GateLimits, height: float, present: float | None) -> str:
-    """
-    Return why a climb by ``height``, m, would end outside the envelope, or ''.
-
-    :param present: the present height above the place of arming, m; 0 where it is not known.
-    """
-    reached = height + (present or 0.0)
-    for name, wrong in (('height_min', reached < limits.height_min),
-                        ('height_max', reached > limits.height_max)):
-        if wrong:
-            return (f'it would end {reached:.1f} m above the place of arming: beyond {name} = '
-                    f'{getattr(limits, name):g} m')
-    return ''
-
-
-def explains_mode(request: Request | None, telemetry: Telemetry, now: float) -> bool:
-    """
-    Return whether an armed vehicle is in its offboard mode, and misses no setpoint, by a take-off.
-
-    ArduPilot takes off in GUIDED, and stays in it above. Before and while it climbs out setpoints
-    would do nothing, or end it; after our own take-off nobody has asked for them yet.
-
-    :param request: the newest of ours, if any.
-    """
-    if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:
-        return False
-    ours = request is not None and request.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF and (
-        request.outcome is None or request.outcome.success)
-    return ours or telemetry.flying(now) is False
-
-
-def _too_low(dialect: Dialect, parameters: ParameterCheck | None, height: float) -> str:
-    """Return that the autopilot would climb higher than it is asked to, or ''."""
-    name = dialect.minimum_takeoff
-    if not name:
-        return ''
-    least = None if parameters is None else parameters.values.get(name)
-    if least is None:
-        if parameters is not None:
-            parameters.again(name)
-        return f'{name} is not known yet: {dialect.title} would climb that high at least'
-    if height < least - TOLERANCE:
-        return (f'{dialect.title} would climb to {name} = {least:g} m, '
-                f'above takeoff_height = {height:g} m')
-    return ''
-
-
-NOT_RECEIVED: Final[str] = 'no HEARTBEAT from the autopilot'
 
 
 class Obstacle(NamedTuple):
@@ -140,14 +68,14 @@ class Requests:
     Begins requests and steps the one whose outcome is open.
 
     :param end: of the flight; a request by a person begins it anew.
-    :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
+    :param require_failsafe: whether offboard needs the parameters of ``parameter_check.RULES``.
     """
 
     def __init__(self, link: Link, gate: Gate, housekeeping: Housekeeping,
                  texts: StatusTexts, end: FlightEnd, require_failsafe: bool) -> None:
         self.newest: Request | None = None
         self.stopping = False
-        """Whether only what ends a flight may still be asked for."""
+        """Whether only requests that end a flight are accepted."""
         self._link = link
         self._gate = gate
         self._housekeeping = housekeeping
@@ -166,26 +94,25 @@ class Requests:
         """Let the vehicle fly our setpoints, or hold its position."""
         self._end.begin()
         if not value:
-            return self.begin(commands.HOLD, now)
+            return self.begin(HOLD, now)
         obstacle = self.offboard_obstacle(now)
-        begins = obstacle is None or obstacle.waits or (
-            self._gate.permission.phase is Phase.ACTIVE)  # it flies already
-        return self.begin(commands.OFFBOARD, now,
-                          '' if begins or obstacle is None else obstacle.reason)
+        if obstacle is None or obstacle.waits or self._gate.permission.phase is Phase.ACTIVE:
+            return self.begin(OFFBOARD, now)
+        return self.begin(OFFBOARD, now, obstacle.reason)
 
     def land(self, now: float) -> Request:
         """Land here."""
         self._end.begin()
-        return self.begin(commands.LAND, now)
+        return self.begin(LAND, now)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
         self._end.begin()
-        telemetry, gate = self._link.telemetry, self._gate
-        present = gate.heights.height(now)
-        return self.begin(goal(telemetry, height, now), now, obstacle(
-            self._status(now), telemetry, self._housekeeping.parameters, height, now) or (
-                out_of_bounds(gate.limits, height, present)))
+        telemetry = self._link.telemetry
+        goal = commands.takeoff(height, telemetry.altitude(now) or 0.0,
+                                telemetry.sea_level_altitude(now),
+                                telemetry.height_above_home(now) or 0.0)
+        return self.begin(goal, now, self._takeoff_obstacle(height, now))
 
     @property
     def pending(self) -> Request | None:
@@ -196,13 +123,7 @@ class Requests:
     @property
     def landing(self) -> bool:
         """Return whether the autopilot is being asked to land."""
-        return self.pending is not None and self.pending.goal is commands.LAND
-
-    @property
-    def taking_off(self) -> bool:
-        """Return whether it has been asked for a take-off that is not over."""
-        return (self.pending is not None
-                and self.pending.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
+        return self.pending is not None and self.pending.goal is LAND
 
     def acknowledge(self, ack: Any, now: float) -> None:
         """Take a COMMAND_ACK."""
@@ -213,18 +134,21 @@ class Requests:
                 ack.command, ack.result, now):
             self._housekeeping.request_reasons()
 
-    def step(self, request: Request, streaming_for: float, now: float) -> None:
+    def step(self, streaming_for: float, now: float) -> None:
         """
-        Send what is due for a request, and let the permission follow how it ends.
+        Send what is due for the pending request, and pass its failure to the permission.
 
         :param streaming_for: how long setpoints have been going out without a gap, s.
         """
+        request = self.pending
+        if request is None:
+            return
         if not self._ended_here(request, now):
             self._ask(request, streaming_for, now)
             if request.outcome is not None and not request.outcome.success:
-                request.outcome = request.outcome._replace(message=estimator_health.explained(
+                request.outcome = request.outcome._replace(message=explained(
                     request.outcome.message, self._link.telemetry.estimator, now))
-        if request.goal is commands.OFFBOARD and request.outcome is not None and (
+        if request.goal is OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
             self._gate.permit(OffboardFailed(request.outcome.message))
 
@@ -239,45 +163,68 @@ class Requests:
 
         :param in_air: whether it has to be in the air, and in the envelope, by now.
         """
-        dialect, gate = self._link.telemetry.dialect, self._gate
-        if reason := self._gate.permission.taken_over(now):
-            return Obstacle(reason)
-        if reason := gate.misaligned(now) or gate.contradiction(now):
-            return Obstacle(reason)
-        if self._require_failsafe and dialect is not None and (
-                reason := failsafe.obstacle(dialect, self._housekeeping.parameters,
-                                             self._housekeeping.without_gps)):
-            return Obstacle(reason)
-        if self._status(now) is None or dialect is None:
-            return None
+        return next(filter(lambda obstacle: obstacle.reason,
+                           self._offboard_obstacles(now, in_air)), None)
+
+    def _offboard_obstacles(self, now: float, in_air: bool) -> Iterator[Obstacle]:
+        """Yield each check of offboard, the first one first; its reason is '' if it passes."""
+        telemetry, gate = self._link.telemetry, self._gate
+        dialect, parameters = telemetry.dialect, self._housekeeping.parameters
+        forwarding = self._housekeeping.without_gps
+        # The autopilot may not have had the time to send everything.
+        waits = now - self._housekeeping.alive_since < STREAM_TIMEOUT
+        yield Obstacle(gate.permission.taken_over(now))
+        yield Obstacle(gate.misaligned(now) or gate.contradiction(now))
+        if self._require_failsafe and dialect is not None:
+            yield Obstacle(parameter_check.obstacle(dialect, parameters, forwarding))
+        if dialect is None or self._status(now) is None:
+            return
         if gate.speed(now) is None:
-            return Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED',
-                            self._just_received(now))
-        height = gate.heights.height(now)
-        if in_air and (obstacle := self._grounded(now)):
-            return obstacle
-        if in_air and (reason := envelope.outside(gate.limits, height)):
-            return Obstacle(reason, height is None and self._just_received(now))
-        if reason := self._end.battery_low(now):
-            return Obstacle(reason)
-        if self._require_failsafe and (
-                reason := failsafe.unread(dialect, self._housekeeping.parameters,
-                                           self._housekeeping.without_gps)):
-            return Obstacle(reason, waits=True)
-        return None
+            yield Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED', waits)
+        if in_air:
+            flying, height = telemetry.flying(now), gate.heights.height(now)
+            if flying is None:
+                yield Obstacle('the autopilot does not report whether it flies '
+                               '(EXTENDED_SYS_STATE), which counts as on the ground', waits)
+            elif not flying:
+                yield Obstacle('on the ground: arm, call takeoff, and request offboard in the air')
+            yield Obstacle(envelope.outside(gate.limits, height), height is None and waits)
+        yield Obstacle(self._end.battery_low(now))
+        if self._require_failsafe:
+            yield Obstacle(parameter_check.unread(dialect, parameters, forwarding), waits=True)
 
-    def _just_received(self, now: float) -> bool:
-        """Return whether the autopilot may not have had the time to send everything."""
-        return now - self._housekeeping.alive_since < commands.STREAM_TIMEOUT
+    def _takeoff_obstacle(self, height: float, now: float) -> str:
+        """Return why the vehicle may not climb by ``height``, m, or ''."""
+        telemetry, status, limits = self._link.telemetry, self._status(now), self._gate.limits
+        if status is None or telemetry.dialect is None:
+            return NOT_RECEIVED
+        if not status.armed:
+            return 'disarmed: arm first'
+        # A second climb would begin at the height that the first has reached by now.
+        if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
+            return 'already in the air'
+        if telemetry.altitude(now) is None:
+            return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
+        if reason := self._minimum_takeoff(telemetry.dialect, height):
+            return reason
+        reached = height + (self._gate.heights.height(now) or 0.0)
+        beyond = ('height_min' if reached < limits.height_min else
+                  'height_max' if reached > limits.height_max else '')
+        return beyond and (f'it would end {reached:.1f} m above the place of arming: beyond '
+                           f'{beyond} = {getattr(limits, beyond):g} m')
 
-    def _grounded(self, now: float) -> Obstacle | None:
-        """Return that the autopilot does not report that it flies, and what to do."""
-        flying = self._link.telemetry.flying(now)
-        if flying is None:
-            return Obstacle('the autopilot does not report whether it flies (EXTENDED_SYS_STATE), '
-                            'which counts as on the ground', self._just_received(now))
-        return None if flying else Obstacle(
-            'on the ground: arm, call takeoff, and request offboard in the air')
+    def _minimum_takeoff(self, dialect: Dialect, height: float) -> str:
+        """Return that the autopilot would climb higher than it is asked to, or ''."""
+        name, parameters = dialect.minimum_takeoff, self._housekeeping.parameters
+        if not name:
+            return ''
+        least = parameters.values.get(name)
+        if least is None:
+            parameters.again(name)
+            return f'{name} is not known yet: {dialect.title} would climb that high at least'
+        return '' if height >= least - TOLERANCE else (
+            f'{dialect.title} would climb to {name} = {least:g} m, '
+            f'above takeoff_height = {height:g} m')
 
     def begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
         """
@@ -288,32 +235,28 @@ class Requests:
         """
         if self.stopping and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
-        dialect, permit = self._link.telemetry.dialect, self._gate.permit
-        pending, superseded = self.pending, None
-        if goal.ends_flight and dialect is None:
+        permit, pending, superseded = self._gate.permit, self.pending, None
+        if goal.ends_flight and self._link.telemetry.dialect is None:
             obstacle = NOT_RECEIVED  # nor is it known how to ask
-            if pending is not None:
-                pending.refuse(f'superseded by {goal.name}')
+        if goal.ends_flight:
+            # From here on only braking goes out, even if the autopilot refuses.
             permit(EndRequested(why or f'{goal.name} requested'))
-        if obstacle:
-            return Request(goal, now).refuse(obstacle)
-        if pending is not None:
-            if not goal.ends_flight:
-                return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
+        elif pending is not None:
+            obstacle = obstacle or f'still waiting for {pending.goal.name}'
+        if pending is not None and goal.ends_flight:
             pending.refuse(f'superseded by {goal.name}')
             superseded = pending.goal
+        if obstacle:
+            return Request(goal, now).refuse(obstacle)
         self.newest = request = Request(goal, now, superseded, own=bool(why))
-        if goal is commands.OFFBOARD:
+        if goal is OFFBOARD:
             permit(OffboardRequested(now))
-        elif goal.ends_flight:
-            # From here on only braking goes out, even where the autopilot refuses.
-            permit(EndRequested(why or f'{goal.name} requested'))
         return request
 
     def _ended_here(self, request: Request, now: float) -> bool:
         """End a request for offboard that has become pointless, or is in vain."""
         permission = self._gate.permission
-        if request.goal is not commands.OFFBOARD:
+        if request.goal is not OFFBOARD:
             return False
         if permission.phase not in (Phase.READY, Phase.ACTIVE):
             request.refuse(permission.reason)  # a reboot or the pilot was quicker
@@ -322,7 +265,7 @@ class Requests:
         obstacle = None if request.sent else self.offboard_obstacle(now)
         if obstacle is None:
             return False
-        if not obstacle.waits or now - request.begun >= commands.STREAM_TIMEOUT:
+        if not obstacle.waits or now - request.begun >= STREAM_TIMEOUT:
             request.refuse(obstacle.reason)
             if permission.since >= request.begun:  # else it was flying before
                 self._gate.permit(OffboardFailed(obstacle.reason, asked=False))
@@ -343,3 +286,17 @@ class Requests:
         if confirmation is not None and dialect is not None and (
                 vehicle is not None or goal.ends_flight):
             self._link.send_command(goal.command, goal.params(dialect), confirmation)
+
+    def takeoff_explains_mode(self, now: float) -> bool:
+        """
+        Return whether a take-off explains an offboard mode that misses no setpoint.
+
+        ArduPilot takes off in GUIDED, and stays in it above. Before and while it climbs setpoints
+        would do nothing, or end it; after our own take-off nobody has requested offboard yet.
+        """
+        telemetry, newest = self._link.telemetry, self.newest
+        if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:
+            return False
+        ours = newest is not None and newest.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF and (
+            newest.outcome is None or newest.outcome.success)
+        return ours or telemetry.flying(now) is False

@@ -310,8 +310,7 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
     if against.any():
         total = limit_command(safe.acceleration + against, v, limits.a_max, limits.v_max, horizon,
                               away)
-        safe = total._replace(limited=safe.limited or total.limited,
-                              reason=safe.reason or total.reason)
+        safe = total._replace(reason=safe.reason or total.reason)
     a = safe.acceleration
     least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
     inward = envelope.inward(limits, place, v, horizon)
@@ -325,7 +324,7 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
         (complex(float(away[0]), float(away[1])), float(away[:2] @ a[:2]))]
     point = limit_level(a, min(max(float(a[2]), least), most), sides + bounds, v,
                         limits.a_max, limits.v_max, horizon)
-    return LimitedCommand(point, True, ', '.join(filter(None, [safe.reason, ENVELOPE])))
+    return LimitedCommand(point, ', '.join(filter(None, [safe.reason, ENVELOPE])))
 
 
 def _grounded(safe: LimitedCommand, airborne: bool) -> Array:

@@ -29,10 +29,11 @@ import select
 import socket
 import threading
 import time
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
 
+T = TypeVar('T')
 #: A new command is sent at once, but never sooner than this after the cycle before, s: at most
 #: 50 setpoints per second, whatever the planner sends.
 SHORTEST_PERIOD: Final[float] = 0.02
@@ -47,12 +48,10 @@ class SetpointThread:
     """
     Runs a bridge until stopped, a cycle each period and at once for a new command.
 
-    The thread owns the bridge.
-
-    Other threads hand it by ``submit`` what they want done with the bridge.
-    The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
-    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. Where
-    listening fails the cycle still runs, and the other way round.
+    The thread owns the bridge; other threads ``submit`` actions on it. The thread calls
+    ``on_messages(messages, now)`` with messages of the autopilot, ``on_cycle(cycle, now)`` after
+    each cycle and ``on_error(error)`` for an exception. If listening fails the cycle still runs,
+    and the other way round.
     """
 
     def __init__(self, bridge: Bridge, period: float,
@@ -134,7 +133,12 @@ class SetpointThread:
         if not self._guarded(lambda: self._listen(wait)):
             # Listening that fails at once would else be tried without a pause, all the time.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
-        self._run_submitted()
+        # Of a flood only so many actions that the cycle is not kept waiting.
+        if count := min(len(self._submitted), MOST_AT_ONCE):
+            for _ in range(count):
+                self._guarded(self._submitted.popleft()[0])
+            # One of them may have brought odometry to send on.
+            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
         now = time.monotonic()
         if self._bridge.gate.new_command:
             next_cycle = min(next_cycle, max(now, self._last_cycle + SHORTEST_PERIOD))
@@ -145,38 +149,27 @@ class SetpointThread:
         if next_cycle < now:
             self.late += 1
             next_cycle = now + self._period
-        self._guarded(lambda: self._cycle(now))
+        cycle = self._guarded(lambda: self._bridge.cycle(now))
+        if cycle is not None and not self._quit.is_set():
+            # Read the clock again: deciding, packing and writing took time.
+            self._guarded(lambda: self._on_cycle(cycle, time.monotonic()))
         return next_cycle
 
-    def _guarded(self, action: Callable[[], object]) -> bool:
-        """Run an action, report what it raises, and return whether it went well."""
+    def _guarded(self, action: Callable[[], T]) -> T | None:
+        """Run an action; return its result, or None if it raised, which is reported."""
         try:
-            action()
+            return action()
         except Exception as error:
             self._on_error(error)
-            return False
-        return True
-
-    def _run_submitted(self) -> None:
-        """Run what was submitted; of a flood only so much that the cycle is not kept waiting."""
-        count = min(len(self._submitted), MOST_AT_ONCE)
-        for _ in range(count):
-            self._guarded(self._submitted.popleft()[0])
-        if count:  # one of them may have brought odometry to send on
-            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
+            return None
 
     def _refuse_submitted(self) -> None:
         with contextlib.suppress(IndexError):  # two threads may do so at once
             while True:
                 self._guarded(self._submitted.popleft()[1])
 
-    def _cycle(self, now: float) -> None:
-        cycle = self._bridge.cycle(now)
-        if not self._quit.is_set():
-            # Read the clock again: deciding, packing and writing took time.
-            self._on_cycle(cycle, time.monotonic())
-
-    def _listen(self, wait: float) -> None:
+    def _listen(self, wait: float) -> bool:
+        """Receive for at most ``wait``, s; return True."""
         transport = self._bridge.link.transport
         ends: list[Any] = [self._wake_receiver]
         if transport.fileno() >= 0:
@@ -189,3 +182,4 @@ class SetpointThread:
             messages = self._bridge.receive(now)
             if messages and not self._quit.is_set():
                 self._on_messages(messages, now)
+        return True

@@ -13,23 +13,19 @@
 # limitations under the License.
 
 """
-Why PX4 refuses, where it sends no STATUSTEXT: its EVENTs, which every link gets.
+Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
 
-PX4 sends its words only to links on which a ground station is heard, and where it refuses a mode
-there are none at all. Its arming checks come to every link: one EVENT for each that fails, with
-the modes it concerns, between two summaries; on a change, and when MAV_CMD_RUN_PREARM_CHECKS asks
-for them. An EVENT is a number, the hash of a name; the words for it are here. Measured on 1.16.
-
-The autopilot's own words: STATUSTEXT messages, long texts joined from their chunks.
-
-Where PX4 hears no ground station, and says nothing, its EVENTs stand in: see ``px4_events``.
+PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
+refuses a mode. It reports its arming checks by EVENTs on every link: one for each check that
+fails, with the modes that it concerns, between two summaries; on a change, and on
+MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
+here. Measured on 1.16.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 import math
 import struct
 from types import MappingProxyType
@@ -136,29 +132,22 @@ _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
     """EVENT; loading this module makes pymavlink decode it."""
 
-    id = MESSAGE_ID
     msgname = 'EVENT'
     fieldnames: ClassVar[list[str]] = [
         'number', 'event_time_boot_ms', 'sequence', 'destination_component', 'destination_system',
         'log_levels', 'arguments']
     ordered_fieldnames = fieldnames
-    array_lengths: ClassVar[list[int]] = [0, 0, 0, 0, 0, 0, 40]
     lengths: ClassVar[list[int]] = [1, 1, 1, 1, 1, 1, 40]
     orders: ClassVar[list[int]] = [0, 1, 2, 3, 4, 5, 6]
     crc_extra = 160
     unpacker = struct.Struct('<IIHBBB40B')
-    fieldtypes: ClassVar[list[str]] = []
-    instance_field = None
-    instance_offset = -1
 
-    def __init__(self, number: int, boot_ms: int, sequence: int, component: int, system: int,
-                 levels: int, arguments: Any) -> None:
+    def __init__(self, *values: Any) -> None:
         super().__init__(MESSAGE_ID, self.msgname)
         self._fieldnames = self.fieldnames
         self._instance_field, self._instance_offset = None, -1
-        self.number, self.event_time_boot_ms, self.sequence = number, boot_ms, sequence
-        self.destination_component, self.destination_system = component, system
-        self.log_levels, self.arguments = levels, bytes(arguments)
+        for name, value in zip(self.fieldnames, values):
+            setattr(self, name, value)
 
 
 mavlink.mavlink_map.setdefault(MESSAGE_ID, EventMessage)
@@ -186,7 +175,7 @@ class ArmingChecks:
     def take(self, message: Any, now: float) -> str:
         """Take an EVENT received at ``now``, s; return what it says in words by itself, or ''."""
         name = _BY_NUMBER.get(message.number % 2**24, '')
-        level, arguments = message.log_levels & 0xF, message.arguments
+        level, arguments = message.log_levels & 0xF, bytes(message.arguments)
         if name == _BEGIN:
             self._coming = []
         elif name == _END:
@@ -248,21 +237,20 @@ class AutopilotText(NamedTuple):
     text: str
 
 
-@dataclass
-class _Unfinished:
-    severity: int
+class _Unfinished(NamedTuple):
     time: float
     """When the newest of its chunks came, s."""
-    next_chunk: int = 0
-    pieces: list[str] = field(default_factory=list)
+    severity: int
+    text: str
+    next_chunk: int
 
 
 class StatusTexts:
     """
     The recent texts; ``add`` takes messages, ``since`` and ``new`` return whole texts.
 
-    Every chunk that arrives is told, with ``GAP`` where another was lost. Nothing waits for long:
-    a text of just 50 characters, or a multiple, may come without a chunk that ends it.
+    Every chunk that arrives is reported, with ``GAP`` if another one was lost. Nothing waits for
+    long: a text of just 50 characters, or a multiple, may come without a chunk that ends it.
     """
 
     def __init__(self) -> None:
@@ -272,29 +260,27 @@ class StatusTexts:
         self._new: deque[AutopilotText] = deque(maxlen=200)
         self._unfinished: dict[int, _Unfinished] = {}
 
-    def add(self, message: Any, now: float) -> str | None:
-        """Take a STATUSTEXT; return the text once it is complete."""
+    def add(self, message: Any, now: float) -> None:
+        """Take a STATUSTEXT."""
         self._said = True
-        number, chunk, piece = message.id, message.chunk_seq, str(message.text)
         self._expire(now)
+        severity, text, number = message.severity, str(message.text), message.id
         if not number:
-            return self._finish(message.severity, piece, now)
+            self._finish(severity, text, now)
+            return
         known = self._unfinished.get(number)
-        if known is not None and chunk < known.next_chunk:  # its end was lost, another text begins
-            self._give_up(number, now)
+        if known is not None and message.chunk_seq < known.next_chunk:
+            self._give_up(number, now)  # its end was lost, another text begins
             known = None
-        if known is None:
-            if len(self._unfinished) >= MOST_UNFINISHED:
-                self._give_up(next(iter(self._unfinished)), now)
-            known = self._unfinished[number] = _Unfinished(message.severity, now)
-        if chunk != known.next_chunk:
-            known.pieces.append(GAP)
-        known.pieces.append(piece)
-        known.next_chunk, known.time = chunk + 1, now
-        if len(piece) == CHUNK and known.next_chunk < MOST_CHUNKS:
-            return None
-        del self._unfinished[number]
-        return self._finish(known.severity, ''.join(known.pieces), now)
+        known = known or _Unfinished(now, severity, '', 0)
+        lost = GAP if message.chunk_seq != known.next_chunk else ''
+        known = known._replace(time=now, text=f'{known.text}{lost}{text}',
+                               next_chunk=message.chunk_seq + 1)
+        self._unfinished[number] = known
+        if len(text) < CHUNK or known.next_chunk >= MOST_CHUNKS:
+            self._finish(known.severity, self._unfinished.pop(number).text, now)
+        elif len(self._unfinished) > MOST_UNFINISHED:
+            self._give_up(next(iter(self._unfinished)), now)
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its words count where no STATUSTEXT says the same."""
@@ -332,11 +318,10 @@ class StatusTexts:
     def _give_up(self, number: int, now: float) -> None:
         """Take a text as it is; whether more was to come is not known."""
         unfinished = self._unfinished.pop(number)
-        self._finish(unfinished.severity, ''.join([*unfinished.pieces, GAP]), now)
+        self._finish(unfinished.severity, unfinished.text + GAP, now)
 
-    def _finish(self, severity: int, text: str, now: float) -> str:
-        # PX4 ends texts with a tab where it also sends them as events.
-        text = text.strip('\x00\t\n ')
-        for texts in (self._texts, self._new):
-            texts.append(AutopilotText(now, severity, text))
-        return text
+    def _finish(self, severity: int, text: str, now: float) -> None:
+        # PX4 ends texts with a tab if it also sends them as events.
+        whole = AutopilotText(now, severity, text.strip('\x00\t\n '))
+        self._texts.append(whole)
+        self._new.append(whole)

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-What the autopilot last said, in ENU and FLU, with the time it was heard.
+The newest messages of the autopilot, in ENU and FLU, with the times at which they came.
 
-The autopilot's own estimate put together from its two messages, at the time it was valid.
+``estimate`` combines its position and attitude into one odometry, at the time it was valid.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ HEIGHT_RATE: Final[float] = 20.0
 #: It has rebooted where two messages of a kind in a row are stamped by more than this earlier, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
+_UNKNOWN_TEMPERATURE = 32767  # 0.01 degC
 # What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
 _OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_', 'NAMED_VALUE_',
                  'SET_', 'STORAGE_')
@@ -144,7 +145,6 @@ class Telemetry:
         self.battery: Battery | None = None
         self.estimator: EstimatorStatus | None = None
         self.gps: GpsFix | None = None
-        self.rejected = 0
         self.arrivals = Arrivals()
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
@@ -187,9 +187,9 @@ class Telemetry:
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
             self._battery_status_seen = True
-            self.battery = _from_battery_status(message, now)
+            self.battery = _battery(message, now)
         elif kind == 'SYS_STATUS' and not self._battery_status_seen:
-            self.battery = _from_sys_status(message, now)
+            self.battery = _battery(message, now)
 
     def shown(self, message: Any) -> VehicleStatus | None:
         """
@@ -286,8 +286,6 @@ class Telemetry:
         self._streaming = True
         if np.all(np.isfinite(position)) and np.all(np.isfinite(velocity)):
             self.local_position = LocalPosition(now, position, velocity, message.time_boot_ms)
-        else:
-            self.rejected += 1
 
     def _attitude(self, message: Any, now: float) -> None:
         # MAVLink's quaternions are (w, x, y, z).
@@ -297,32 +295,25 @@ class Telemetry:
         try:
             quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
         except ValueError:
-            self.rejected += 1
             return
         self.attitude = Attitude(now, quaternion, np.nan_to_num(rates, posinf=0.0, neginf=0.0),
                                  message.time_boot_ms)
 
 
-def _from_battery_status(message: Any, now: float) -> Battery:
-    cells = [v * 1e-3 for v in message.voltages if v != _UNKNOWN_CELL]
-    cells += [v * 1e-3 for v in message.voltages_ext if v not in (0, _UNKNOWN_CELL)]
+def _battery(message: Any, now: float) -> Battery:
+    """Return the battery in a BATTERY_STATUS, or in a SYS_STATUS, which has no cells."""
+    whole = message.get_type() == 'SYS_STATUS'
+    millivolts = [message.voltage_battery] if whole else [
+        *message.voltages, *filter(None, message.voltages_ext)]
+    cells = [v * 1e-3 for v in millivolts if v != _UNKNOWN_CELL]
+    centidegrees = _UNKNOWN_TEMPERATURE if whole else message.temperature
     return Battery(
         now,
         sum(cells) if cells else math.nan,
         message.current_battery * 1e-2 if message.current_battery >= 0 else math.nan,
         message.battery_remaining * 1e-2 if message.battery_remaining >= 0 else math.nan,
-        message.temperature * 1e-2 if message.temperature != 32767 else math.nan,
+        centidegrees * 1e-2 if centidegrees != _UNKNOWN_TEMPERATURE else math.nan,
         tuple(cells) if len(cells) > 1 else ())
-
-
-def _from_sys_status(message: Any, now: float) -> Battery:
-    known = message.voltage_battery != _UNKNOWN_CELL
-    return Battery(
-        now,
-        message.voltage_battery * 1e-3 if known else math.nan,
-        message.current_battery * 1e-2 if message.current_battery >= 0 else math.nan,
-        message.battery_remaining * 1e-2 if message.battery_remaining >= 0 else math.nan,
-        math.nan, ())
 
 
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:

@@ -62,8 +62,8 @@ NOT_NOW: Final[tuple[int, ...]] = (
 IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
 
-class _Reopening:
-    """A descriptor that may be lost, and is opened again; and bytes it could not take at once."""
+class _Line:
+    """A descriptor that may be lost, and bytes that it could not take at once."""
 
     peer: Any = 'line'
     capacity = 0.0
@@ -73,31 +73,12 @@ class _Reopening:
         self.url = url
         self.fault = ''
         self._fd = -1
-        self._tried = -math.inf
+        self._tried = -math.inf  # when it was opened, or tried to, s
         self._waiting = b''
-
-    def _open(self) -> int:
-        """Return a new descriptor; OSError or termios.error where there is none."""
-        raise NotImplementedError
 
     def fileno(self) -> int:
         """Return the descriptor to select on, -1 while there is none."""
         return self._fd
-
-    def reopen(self, now: float) -> None:
-        """Try to open again what was lost, at most every RETRY_PERIOD."""
-        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
-            return
-        self._tried = now
-        self._try_to_open()
-
-    def _try_to_open(self) -> None:
-        try:
-            self._fd = self._open()
-        except (OSError, termios.error) as error:
-            self.fault = reason_of(error)
-        else:
-            self.fault = ''
 
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the bytes that have arrived."""
@@ -160,7 +141,7 @@ class _Reopening:
         self.fault = fault
 
 
-class SerialTransport(_Reopening):
+class SerialTransport(_Line):
     """
     A serial port in raw mode, opened whenever the device is there and no other process has it.
 
@@ -173,7 +154,17 @@ class SerialTransport(_Reopening):
         self._baud = baud
         self.capacity = baud / BITS_PER_BYTE
         # Not there yet is no error: at power-on the autopilot may take longer than this computer.
-        self._try_to_open()
+        self.reopen(-math.inf)
+
+    def reopen(self, now: float) -> None:
+        """Try to open again what was lost, at most every RETRY_PERIOD."""
+        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
+            return
+        self._tried = now
+        try:
+            self._fd, self.fault = self._open(), ''
+        except (OSError, termios.error) as error:
+            self.fault = reason_of(error)
 
     def _open(self) -> int:
         fd = -1
@@ -214,7 +205,7 @@ class SerialTransport(_Reopening):
         return super().congested() or self._queued() > LONGEST_BACKLOG * self.capacity
 
 
-class TcpTransport(_Reopening):
+class TcpTransport(_Line):
     """
     A TCP connection to a listening autopilot or simulator, made again when it is closed.
 
@@ -226,54 +217,44 @@ class TcpTransport(_Reopening):
     def __init__(self, url: str, address: tuple[str, int]) -> None:
         super().__init__(url)
         self._address = address
-        self._connecting = False
+        self._connection: socket.socket | None = None
+        """The connection that is being made."""
         self.fault = 'not connected yet'
-
-    def _open(self) -> int:
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
-            connection.setblocking(False)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # Drop what is not delivered by then: a late setpoint is worse than none.
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
-            code = connection.connect_ex(self._address)
-            if code not in (0, errno.EINPROGRESS):
-                raise OSError(code, os.strerror(code))
-            self._connecting = True
-            return connection.detach()
 
     def reopen(self, now: float) -> None:
         """Begin to connect, at most every RETRY_PERIOD, and see how far it has come."""
-        if self._fd >= 0 and self._connecting:
-            self._see_connection()
+        if self._fd >= 0 or (self._connection is None and now - self._tried < RETRY_PERIOD):
+            return
+        if self._connection is None:
+            self._tried, self.fault = now, 'connecting'
+            self._connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._connection.setblocking(False)
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Drop what is not delivered by then: a late setpoint is worse than none.
+            self._connection.setsockopt(
+                socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
+            self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
+            code = self._connection.connect_ex(self._address)
+        elif select.select([], [self._connection], [], 0.0)[1]:
+            code = self._connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            if not code:
+                self._fd, self.fault = self._connection.detach(), ''
+                self._connection = None
         else:
-            super().reopen(now)
-            if self._fd >= 0 and self._connecting:
-                self.fault = 'connecting'
-
-    def read(self) -> Iterator[tuple[bytes, Any]]:
-        """Yield the bytes that have arrived."""
-        if not self._connecting:
-            yield from super().read()
-
-    def write(self, data: bytes) -> bool:
-        """Send; return whether it goes out whole."""
-        return not self._connecting and super().write(data)
+            return
+        if code not in (0, errno.EINPROGRESS):
+            self._lose(os.strerror(code))
 
     def congested(self) -> bool:
         """Return whether more than TCP_BACKLOG waits: what room is left is for setpoints."""
         return super().congested() or self._queued() > TCP_BACKLOG
 
-    def _see_connection(self) -> None:
-        if not select.select([], [self._fd], [], 0.0)[1]:
-            return
-        self._connecting = False
-        with socket.socket(fileno=os.dup(self._fd)) as connection:
-            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        if code:
-            self._lose(os.strerror(code))
-        else:
-            self.fault = ''
+    def close(self) -> None:
+        """End the connection, or the attempt."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
+        super().close()
 
 
 def reason_of(error: BaseException) -> str:

@@ -90,9 +90,6 @@ class Motion(NamedTuple):
         return self.yaw if usable else None
 
 
-UNKNOWN: Final[Motion] = Motion()
-
-
 @dataclass(frozen=True, kw_only=True)
 class KnownMotion:
     """What both sources say of the vehicle's motion, and since when not to believe them."""
@@ -167,6 +164,15 @@ def fresh(age: float, timeout: float) -> bool:
     return -FUTURE_TOLERANCE <= age <= timeout
 
 
+def refusal(age: float, timeout: float) -> str:
+    """Return why an input of an age, s, is refused, or ''."""
+    if not math.isfinite(age):
+        return 'not finite'
+    if age > timeout:
+        return 'too old'
+    return 'from the future' if age < -FUTURE_TOLERANCE else ''
+
+
 def finite_vector(value: ArrayLike) -> Array | None:
     """Return a copy as an array (3,), None where it is not three finite numbers."""
     try:
@@ -228,7 +234,7 @@ class VelocityComparison:
         return now - self._since
 
 
-#: s.
+#: Displacements are compared over this time, s.
 WINDOW: Final[float] = 5.0
 #: Displacements may differ by this, m, or by 3 standard deviations if those are more.
 TOLERANCE: Final[float] = 0.5
@@ -236,6 +242,8 @@ TOLERANCE: Final[float] = 0.5
 BAROMETER_STD: Final[float] = 0.3
 #: The vehicle is handed over after displacements have differed for this long, s.
 HANDOVER_TIME: Final[float] = 1.0
+#: Yaws of the autopilot are kept for this long, s: odometry is compared with them as it comes.
+YAW_MEMORY: Final[float] = 1.0
 #: After a longer gap than this, s, a path begins again.
 LONGEST_GAP: Final[float] = 0.5
 #: s between two positions that are kept.
@@ -306,3 +314,58 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array | None:
     moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
     result: Array = moved - other.between(start, end)
     return result
+
+
+class Source:
+    """The newest of what one source reports, and the times at which it was so, s."""
+
+    def __init__(self) -> None:
+        self.velocity: Array = np.zeros(3)
+        self.velocity_time = -math.inf
+        self.yaws: deque[tuple[float, float]] = deque()
+        self.path = Path()
+        self.std = 0.0
+        """Standard deviation of the position, m."""
+
+    def take_yaw(self, yaw: float, time: float) -> None:
+        """Take a yaw, rad, at a time, s."""
+        if math.isfinite(yaw) and (not self.yaws or time >= self.yaws[-1][0]):
+            self.yaws.append((time, wrap_angle(yaw)))
+            while time - self.yaws[0][0] > YAW_MEMORY:
+                self.yaws.popleft()
+
+    def yaw(self, time: float) -> tuple[float, float]:
+        """Return the yaw nearest to a time, rad, and the time at which it was so."""
+        if not self.yaws:
+            return 0.0, -math.inf
+        # A copy: diagnostics read it from another thread.
+        near = min(tuple(self.yaws), key=lambda known: abs(known[0] - time))
+        return near[1], near[0]
+
+    @property
+    def newest_yaw(self) -> tuple[float, float]:
+        """Return the newest yaw, rad, and the time at which it was so."""
+        return self.yaw(math.inf) if not self.yaws else self.yaws[-1][::-1]
+
+
+def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
+              now: float) -> str:
+    """
+    Return that odometry reports another displacement than another source, or ''.
+
+    :param autopilot: None if its estimate proves nothing about odometry.
+    :param turn: yaw of odom minus that of the autopilot, rad.
+    :param height: heights by the barometer.
+    """
+    if autopilot is not None:
+        off = difference(odom.path, autopilot.path, -turn, now)
+        most = max(TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
+        if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
+            return (f'displacements of odom and of the autopilot differ by {distance:.1f} m in '
+                    f'{WINDOW:g} s')
+    off = difference(odom.path, height, 0.0, now)
+    most = max(TOLERANCE, 3.0 * math.hypot(BAROMETER_STD, odom.std))
+    if off is not None and abs(climb := float(off[2])) > most:
+        return (f'displacements of odom and of the barometer differ by {climb:.1f} m in '
+                f'{WINDOW:g} s')
+    return ''

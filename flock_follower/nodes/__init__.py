@@ -23,7 +23,7 @@ import sys
 import threading
 from types import TracebackType
 
-#: A signalled process is gone after this, s; the bridge has said its last words before.
+#: A signalled process has ended after this, s; the bridge has braked and ended its stream before.
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None
@@ -31,17 +31,17 @@ _unhurried = False
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
-    """Say how to shut down, now that there is something to."""
+    """Set the function that a signal calls; before, a signal ends the process at once."""
     global _shut_down
     _shut_down = shut_down
 
 
 def set_deadline() -> None:
     """
-    End the process by SIGALRM should it be there in SHUTDOWN_TIMEOUT still.
+    End the process by SIGALRM if it still runs after SHUTDOWN_TIMEOUT.
 
-    Fast DDS spins for ever, once in some thousand times, while it destroys a node. It holds the
-    GIL all the while: no thread and no handler of Python's can end that.
+    Once in some thousand times Fast DDS spins for ever while it destroys a node, and holds the
+    GIL: no thread and no handler of Python can end that.
     """
     if _AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
@@ -49,7 +49,7 @@ def set_deadline() -> None:
 
 @contextlib.contextmanager
 def unhurried() -> Iterator[None]:
-    """Set no deadline inside the block: what it has to finish takes as long as it takes."""
+    """Set no deadline inside the block, which may take long to finish its files."""
     global _unhurried
     _unhurried = True
     try:
@@ -59,7 +59,7 @@ def unhurried() -> Iterator[None]:
 
 
 def ignore_signals() -> None:
-    """Say that all is done: a signal while the interpreter ends is no failure."""
+    """Ignore further signals: one that comes while the interpreter ends is no failure."""
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -86,8 +86,8 @@ def _runs_as_a_program() -> bool:
             or Path(__file__).with_name(f'{path.name}.py').exists())
 
 
-def _say_what_is_missing(kind: type[BaseException], error: BaseException,
-                         trace: TracebackType | None) -> None:
+def _report_missing_package(kind: type[BaseException], error: BaseException,
+                            trace: TracebackType | None) -> None:
     if isinstance(error, ModuleNotFoundError):
         print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
               'package that package.xml names?', file=sys.stderr)
@@ -99,4 +99,4 @@ _AS_A_PROGRAM = _runs_as_a_program()
 if _AS_A_PROGRAM:
     signal.signal(signal.SIGINT, _handle)
     signal.signal(signal.SIGTERM, _handle)
-    sys.excepthook = _say_what_is_missing
+    sys.excepthook = _report_missing_package

@@ -13,13 +13,12 @@
 # limitations under the License.
 
 """
-The black box: records what ``evaluate`` needs of a flight, on a disk of limited room.
+The black box: records the topics that ``evaluate`` needs, on a disk of limited room.
 
-It publishes nothing but its diagnostics, serves nobody, and nobody waits for it: it takes what
-any publisher sends without an answer to that (best effort; latched topics reliably), twenty times
-per second, undecoded but for images that it compresses, and yields the processor to all others.
-A thread of its own has all of it on the disk within a second, see ``bags.recording``. Topics
-are recorded by our names, whatever they are remapped to and without the namespace, so that
+It publishes only its diagnostics, and no node waits for it: it receives best effort (latched
+topics reliably), twenty times per second, without decoding any but the images that it compresses,
+and yields the processor to all others. A thread of its own writes to the disk within a second, see
+``bags.recording``. Topics are recorded by our names, without namespace and remaps, so that
 ``evaluate``, ``check`` and ``replay`` take a recording as it is.
 """
 
@@ -58,8 +57,8 @@ from flock_follower.nodes.support.runtime import (
     never_block_output,
     run,
     spin,
+    Waiting,
 )
-from flock_follower.nodes.support.waiting import Waiting
 from flock_follower.parameters.black_box_table import build, folder, SPECS
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.perception.images import decode, encode_jpeg
@@ -119,13 +118,21 @@ class BlackBox(FlockNode):
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
         self._guard = threading.Lock()
-        self._heard = [self._hear(name, msgtype) for name, msgtype in RECORDED.items()]
+        self._inputs: list[_Subscribed] = []
+        for name, msgtype in RECORDED.items():
+            self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)
         for camera in cameras(values):
-            self._heard.append(self._hear(camera.camera_info, INFO))
-            if values['record_images'] == 'compressed':
-                self._heard.append(self._subscribe_images(camera.images(values['image_transport'])))
+            self._subscribe(camera.camera_info, INFO, QOS)
+            images = camera.images(values['image_transport'])
+            if values['record_images'] == 'none':
+                continue
+            if values['image_transport'] == 'compressed':
+                self._subscribe(images, COMPRESSED, IMAGE_QOS)
+            else:
+                self._subscribe(images, IMAGE, IMAGE_QOS, change=self._compressed,
+                                recorded=f'{images}/{COMPRESSED_IMAGES.rpartition("/")[2]}')
         # rosbags takes tenths of a second for each type the first time: now, not in flight.
-        for msgtype in {heard.topic.msgtype for heard in self._heard}:
+        for msgtype in {each.topic.msgtype for each in self._inputs}:
             definition(msgtype)
             type_hash(msgtype)
         for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
@@ -154,26 +161,16 @@ class BlackBox(FlockNode):
                     thread.join()
         return 0
 
-    def _hear(self, name: str, msgtype: str) -> _Subscribed:
-        latched = name in LATCHED
-        return self._subscribe(name, RecordedTopic(
-            f'/{name.strip("/")}', msgtype, latched), LATCHED_QOS if latched else QOS)
-
-    def _subscribe_images(self, name: str) -> _Subscribed:
-        if self._values['image_transport'] == 'compressed':
-            return self._subscribe(name, RecordedTopic(f'/{name.strip("/")}', COMPRESSED),
-                                   IMAGE_QOS)
-        ours = f'/{name.strip("/")}/{COMPRESSED_IMAGES.rpartition("/")[2]}'
-        return self._subscribe(name, RecordedTopic(ours, COMPRESSED), IMAGE_QOS, IMAGE,
-                               self._compressed)
-
-    def _subscribe(self, name: str, topic: RecordedTopic, qos: QoSProfile, msgtype: str = '',
-                   change: Callable[[bytes], bytes] | None = None) -> _Subscribed:
-        kind = message_class(msgtype or topic.msgtype)
+    def _subscribe(self, name: str, msgtype: str, qos: QoSProfile, recorded: str = '',
+                   change: Callable[[bytes], bytes] | None = None) -> None:
+        """Subscribe; record under another name, and compressed, if they are given."""
+        kind = message_class(msgtype)
         handle = self.create_subscription(
             kind, name, lambda _: None, qos, callback_group=Waiting(), raw=True).handle
-        topic = topic._replace(source=self.resolve_topic_name(name))
-        return _Subscribed(topic, handle, kind, change)
+        topic = RecordedTopic(
+            f'/{(recorded or name).strip("/")}', COMPRESSED if change else msgtype,
+            qos is LATCHED_QOS, self.resolve_topic_name(name))
+        self._inputs.append(_Subscribed(topic, handle, kind, change))
 
     def _compressed(self, data: bytes) -> bytes:
         """Return a serialised image as a serialised compressed one."""
@@ -188,10 +185,10 @@ class BlackBox(FlockNode):
 
     def _take_on(self) -> None:
         """
-        Take what arrives until the end.
+        Take messages until the end.
 
-        Not in the executor: where another process was killed, Fast DDS can hold up who publishes,
-        as this node its diagnostics, for a second.
+        Not in the executor: if another process was killed, Fast DDS can hold up a publisher, as
+        that of this node's diagnostics, for a second.
         """
         while not self._ending.wait(TAKE_PERIOD):
             try:
@@ -200,23 +197,22 @@ class BlackBox(FlockNode):
                 self.diagnostics.internal_error('on taking', error)
 
     def _take(self) -> None:
-        """Take what has arrived."""
+        """Take the messages that have arrived."""
         if self._simulated and not self.get_clock().now().nanoseconds:
-            return  # nobody knows the time yet: they wait
+            return  # without the time they wait
         taken: list[TakenMessage] = []
-        for heard in self._heard:
-            while (received := heard.handle.take_message(heard.message_class, True)) is not None:
+        for topic, handle, kind, change in self._inputs:
+            while (received := handle.take_message(kind, True)) is not None:
                 data, info = received
                 try:
-                    if heard.change is not None:
-                        data = heard.change(data)
+                    data = change(data) if change is not None else data
                 except ValueError as error:
-                    self.diagnostics.reject(f'invalid {heard.topic.source}', str(error))
+                    self.diagnostics.reject(f'invalid {topic.source}', str(error))
                     continue
-                if heard.topic.name == PARAMETER_EVENTS:
-                    self._flown.changed(deserialize(data, heard.topic.msgtype).node)
-                stamp = self._arrival(heard.topic, info['received_timestamp'])
-                taken.append(TakenMessage(heard.topic, stamp, data))
+                if topic.name == PARAMETER_EVENTS:
+                    self._flown.changed(deserialize(data, topic.msgtype).node)
+                stamp = self._arrival(topic, info['received_timestamp'])
+                taken.append(TakenMessage(topic, stamp, data))
         with self._guard:
             for message in taken:
                 if self._waiting + len(message.data) > WAITING_MAX:
@@ -226,7 +222,7 @@ class BlackBox(FlockNode):
                 self._taken.append(message)
 
     def _arrival(self, topic: RecordedTopic, received: int) -> int:
-        """Return when a message arrived, ns of this node's clock, by its time of day."""
+        """Return the time at which a message arrived, ns of this node's clock."""
         stamp = received
         if self._simulated or not received:
             waited = time.time_ns() - received if received else 0
@@ -256,7 +252,7 @@ class BlackBox(FlockNode):
                       file=sys.stderr)
 
     def _write(self) -> None:
-        """Have on the disk what was taken."""
+        """Write the messages taken to the disk."""
         with self._guard:
             taken, self._taken, self._waiting = self._taken, [], 0
             notes, self._notes = self._notes, {}

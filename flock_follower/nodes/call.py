@@ -18,7 +18,7 @@ Call a service for machines without the ``ros2`` command.
 ``call planner/engage true`` calls a SetBool, ``call mavlink_bridge/takeoff`` a Trigger.
 
 Waits for the service to exist, at most ``--timeout``, calls it once, and shows its answer; exit
-code 0 where it succeeded. A refused request is never repeated: between two of them a pilot may
+code 0 if it succeeded. A refused request is never repeated: between two of them a pilot may
 have taken over.
 """
 
@@ -90,7 +90,7 @@ class Caller(Node):
         return 1
 
     def _wait_for_service(self) -> str:
-        """Wait until the service exists; return what is wrong, or ''."""
+        """Wait until the service exists; return the problem, or ''."""
         deadline = time.monotonic() + self._timeout
         while rclpy.ok():
             types = self._types()
@@ -104,10 +104,10 @@ class Caller(Node):
         return 'interrupted'
 
     def _types(self) -> list[str]:
-        """Return the types the service is served with; a client counts all of them as its own."""
+        """Return the types of the service by its servers: the graph counts a client's, too."""
         types: list[str] = []
         for name, namespace in self.get_node_names_and_namespaces():
-            with suppress(NodeNameNonExistentError):  # gone meanwhile
+            with suppress(NodeNameNonExistentError):  # it ended meanwhile
                 served = self.get_service_names_and_types_by_node(name, namespace)
                 types += dict(served).get(self._name, [])
         return types
@@ -119,7 +119,7 @@ class Caller(Node):
                 f'ros2 service call {self._name} {kind}')
 
     def _call(self) -> str:
-        """Call once; print the answer where it is yes, else return what is wrong."""
+        """Call once; print the answer if it is yes, else return the problem."""
         future = self._client.call_async(self._request)
         longest = patience(self._name)
         began = time.monotonic()
@@ -127,7 +127,7 @@ class Caller(Node):
         while rclpy.ok() and not future.done() and time.monotonic() < began + longest:
             rclpy.spin_until_future_complete(self, future, timeout_sec=POLL_PERIOD)
             if not future.done() and not self._client.service_is_ready():
-                return 'the service went away without an answer: what came of it is not known'
+                return 'the service went away without an answer: the result is unknown'
             if not noticed and not future.done() and time.monotonic() > began + NOTICE:
                 noticed = True
                 print(f'{self._service}: waiting for the answer, at most {longest:.0f} s',
@@ -135,7 +135,7 @@ class Caller(Node):
         if not rclpy.ok():
             return 'interrupted'
         if not future.done():
-            return f'no answer within {longest:.0f} s: what came of it is not known'
+            return f'no answer within {longest:.0f} s: the result is unknown'
         if not future.result().success:
             return str(future.result().message)
         print(f'{self._service}: {future.result().message}')

@@ -17,7 +17,8 @@ The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
 
 A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
 
-Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
+Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's ground station
+``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
 ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
@@ -46,8 +47,10 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from sensor_msgs.msg import Range
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -55,8 +58,9 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.flight_end import EndParams
+from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD, GroundStationReport
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import Phase, SecondCommander
@@ -70,8 +74,7 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
-from flock_follower.nodes.support.commanders import Commanders
-from flock_follower.nodes.support.diagnostics import internal_error
+from flock_follower.nodes.support.diagnostics import internal_error, listed, publishers
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.publisher_thread import PublisherThread
@@ -85,9 +88,14 @@ from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 # newest: in what it replaces, a second node that commands would not show.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
+UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
+              '/diagnostics, but does not brake')
+TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
 
 
@@ -112,16 +120,17 @@ class MavlinkBridge(FlockNode):
             recommendations=recommendations(
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
-            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
-        self._applied: GateLimits | None = None
+            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
+            ground_station=GroundStationReport() if values['report_to_gcs'] else None)
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
-        self._new_odom: list[tuple[float, Callable[[], Sequence[str]]]] = []
+        self._new_odom: list[tuple[OdometryState, float, float]] = []
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
-            self._bridge, 1.0 / values['stream_rate'], self._on_messages, self._on_cycle,
+            self._bridge, 1.0 / values['stream_rate'],
+            lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
@@ -130,10 +139,22 @@ class MavlinkBridge(FlockNode):
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 
+        self._connect(values)
+        self._publisher.start()
+        self._stream.start()
+        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
+                               f'{values["connection"]}')
+        if shares_memory():
+            self.get_logger().warning(
+                'Fast DDS shares memory with other processes here: to begin to talk to one can '
+                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+
+    def _connect(self, values: Mapping[str, Any]) -> None:
+        """Create the subscriptions, timers and services."""
         self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
         self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
-        self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
-                                      self._second)
+        self._sources = CommandSources()
+        self._numbered = True
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command, COMMANDS,
                        required=False, informed=True)
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS, required=(
@@ -146,15 +167,15 @@ class MavlinkBridge(FlockNode):
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        self._apply()
-        self._publisher.start()
-        self._stream.start()
-        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
-                               f'{values["connection"]}')
-        if shares_memory():
-            self.get_logger().warning(
-                'Fast DDS shares memory with other processes here: to begin to talk to one can '
-                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+        if (ground_station := self._bridge.ground_station) is not None:
+            def take(action: Callable[..., None], *value: Any) -> None:
+                self._stream.submit(partial(action, *value, time.monotonic()))
+            self.subscribe(String, 'planner/state', lambda message: take(
+                ground_station.take_state, message.data), STATE_QOS, required=False)
+            self.create_timer(DISTANCE_PERIOD, self.poll(
+                Range, 'planner/distance', lambda message, _: take(
+                    ground_station.take_distance, message.header.frame_id, message.range),
+                NEWEST_QOS, required=False))
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
@@ -167,22 +188,35 @@ class MavlinkBridge(FlockNode):
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
 
-    def _second(self, who: str) -> None:
-        """Have the bridge brake: a second node commands."""
-        self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
-
     def _on_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
         now = time.monotonic()
-        self._commanders.heard(info, now)
+        self._watch_commanders(info, now)
         command = from_trajectory(message, self._odom_frame)
         if not self._fresh('command/trajectory', command.stamp):
             return
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        self._hand_over('command', [(age, lambda: [
-            self._bridge.gate.take_command(command, age, now, source_age)])])
+
+        def take() -> None:
+            if refused := self._bridge.gate.take_command(command, age, now, source_age):
+                self._report.refused(f'command {refused}', f'stamp {age:.3f} s old')
+        if not self._stream.submit(take):
+            self.diagnostics.reject('command not taken', TOO_MANY)
+
+    def _watch_commanders(self, info: Mapping[str, Any], now: float) -> None:
+        """Have the bridge brake if the numbers of commands show that two nodes publish them."""
+        number, received = info['publication_sequence_number'], info['received_timestamp']
+        if number is None and self._numbered:
+            self._numbered = False
+            self.get_logger().warning(UNNUMBERED)
+        # The time of arrival: two commands may have waited that came far apart.
+        waited = max(time.time_ns() - received, 0) * 1e-9 if received else 0.0
+        if self._sources.another(number, now - waited) and self._flying():
+            topic = self.resolve_topic_name('command/trajectory')
+            who = f'{listed(publishers(self, topic))} on {topic}'
+            self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
@@ -215,24 +249,14 @@ class MavlinkBridge(FlockNode):
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
         self._outputs.place = state, now
-        self._new_odom.append((age, lambda: self._use_odom(state, age, now)))
+        self._new_odom.append((state, age, now))
 
     def _hand_over_odom(self) -> None:
         """Take the odometry that waits, and hand it over."""
         self._poll_odom()
-        if self._new_odom:
-            taken, self._new_odom = self._new_odom, []
-            self._hand_over('odom', taken)
-
-    def _hand_over(self, what: str,
-                   new: Sequence[tuple[float, Callable[[], Sequence[str]]]]) -> None:
-        """Have the setpoint thread take inputs, each with its age, s; count those it refuses."""
-        def taken() -> None:
-            for age, take in new:
-                for refused in filter(None, take()):
-                    self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
-        if not self._stream.submit(taken):
-            self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
+        taken, self._new_odom = self._new_odom, []
+        if taken and not self._stream.submit(lambda: self._use_odom(taken)):
+            self.diagnostics.reject('odom not taken', TOO_MANY)
 
     async def _serve(self, name: str, request: Any, response: Any) -> Any:
         """Answer the service of a name once the autopilot shows the result."""
@@ -258,17 +282,19 @@ class MavlinkBridge(FlockNode):
 
     # The setpoint thread: it publishes and logs by the publisher thread; no lock of rclpy.
 
-    def _use_odom(self, state: OdometryState, age: float, now: float) -> Sequence[str]:
-        """Judge and send on odometry that was ``age`` s old when it came; return what refused."""
-        refused = self._bridge.on_odometry(
-            state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
-            math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))
-        if not self._settings.values['forward_odometry']:
-            return [refused]
-        sample = ForwardedOdometry(
-            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
-            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
-        return [refused, self._bridge.forward(sample, now)]
+    def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
+        """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
+        for state, age, now in taken:
+            refusals = [self._bridge.on_odometry(
+                state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
+                math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
+            if self._settings.values['forward_odometry']:
+                refusals.append(self._bridge.forward(ForwardedOdometry(
+                    now - age, state.position, state.quaternion, state.velocity,
+                    state.angular_velocity, state.pose_covariance, state.velocity_covariance,
+                    state.twist_covariance[3:, 3:]), now))
+            for refused in filter(None, refusals):
+                self._report.refused(f'odom {refused}', f'stamp {age:.3f} s old')
 
     def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
         """Make a request; ``answer`` is given once it has an outcome."""
@@ -280,12 +306,9 @@ class MavlinkBridge(FlockNode):
         finally:
             self._give_answers()
 
-    def _on_messages(self, messages: list[Any], now: float) -> None:
-        self._outputs.on_messages(now)
-
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
-        self._apply()
+        self._bridge.gate.limits = self._settings.current
         self._give_answers()
         self._outputs.on_cycle(now)
 
@@ -298,12 +321,6 @@ class MavlinkBridge(FlockNode):
         if self._answered:
             answered = tuple(self._answered)
             self._publisher.submit(lambda: self._answer(answered))
-
-    def _apply(self) -> None:
-        limits = self._settings.current
-        if limits is not self._applied:
-            self._bridge.gate.limits = limits
-            self._applied = limits
 
     # The publisher thread, or any other once the setpoint thread has ended.
 

@@ -15,12 +15,11 @@
 """
 Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-It publishes nothing and sets nothing; our nodes are asked for their parameters.
+It publishes nothing and sets nothing; it requests the parameters of our nodes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 import os
 from pathlib import Path
@@ -32,14 +31,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.machine import dead_segments, idle_share
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
+from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -59,8 +56,10 @@ from flock_follower.nodes.support.files_in_use import (
     misses,
 )
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
-from flock_follower.nodes.support.runtime import run
-from flock_follower.nodes.support.static_child import StaticChild
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.runtime import READERS, run
+from flock_follower.nodes.support.transforms import StaticChild
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, shared
 from flock_follower.parameters.spec import NAMES
@@ -69,6 +68,7 @@ from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s in which the others are found
 POLL_PERIOD = 0.25  # s between looks for topics that are new
+PROCESSORS = Path('/proc/stat')
 ANSWER = 2.0  # s that nodes have to tell their parameters after all else
 # Best effort and volatile takes what any publisher sends.
 HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -99,7 +99,8 @@ class Observer(Node):
         self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
-        self._asked: dict[str, AsyncParameterClient] = {}
+        self._remote: dict[str, RemoteParameters] = {}
+        self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
 
     def observe(self) -> Observations:
@@ -108,15 +109,15 @@ class Observer(Node):
         executor.add_node(self)
         try:
             self._until(executor, DISCOVERY)
-            before, self._listening = _processor_times(), True
+            before, self._listening = PROCESSORS.read_text(), True
             began = time.monotonic()
             self._until(executor, self._seconds)
             self.seen.duration = time.monotonic() - began
             self._listening = False
-            idle = idle_share(before, _processor_times())
+            idle = idle_share(before, PROCESSORS.read_text())
             self._look_at_graph()
             answers = time.monotonic() + ANSWER
-            while self._asked.keys() - self.seen.parameters.keys() and (
+            while self._asked - self.seen.parameters.keys() and (
                     time.monotonic() < answers):
                 executor.spin_once(timeout_sec=0.05)
         finally:
@@ -128,7 +129,7 @@ class Observer(Node):
         self.seen.machine = _machine(idle)
         self._compare_with_files()
         if self.seen.frames:
-            self.seen.static_child = self._static.pose(self.seen.frames[-1][1])
+            self.seen.static_child = self._static.transform(self.seen.frames[-1][1])
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
@@ -149,10 +150,11 @@ class Observer(Node):
             full = full_name(node, self.seen.namespace)
             if node in self._asked or full not in self._nodes():
                 continue
-            client = AsyncParameterClient(self, full)
-            if client.services_are_ready():
-                self._asked[node] = client
-                client.list_parameters(callback=partial(self._take_names, node, client))
+            if node not in self._remote:
+                self._remote[node] = RemoteParameters(
+                    self, full, partial(self._take_values, node))
+            if self._remote[node].ask():
+                self._asked.add(node)
             if node == 'relative_pose':
                 self._names_of(full)
 
@@ -163,19 +165,13 @@ class Observer(Node):
             if ours is not None and ours not in self._remaps:
                 self.seen.names[ours] = topic
 
-    def _take_names(self, node: str, client: AsyncParameterClient, future: Any) -> None:
-        names = list(future.result().result.names)
-        client.get_parameters(names, partial(self._take_values, node, names))
-
-    def _take_values(self, node: str, names: list[str], future: Any) -> None:
-        values = {name: _plain(parameter_value_to_python(value))
-                  for name, value in zip(names, future.result().values)}
+    def _take_values(self, node: str, values: dict[str, Any]) -> None:
         if NAMES in values:
             values = self._of_camera(values)
         self.seen.parameters[node] = values
 
     def _of_camera(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Look at the topics of the camera that is wanted, and return its values as the only."""
+        """Use the topics of the camera to observe; return its values as those of a single one."""
         try:
             camera, values = alone(values, self._camera)
         except ValueError as error:
@@ -193,16 +189,15 @@ class Observer(Node):
                       if name != self.get_name())
 
     def _subscribe(self) -> None:
-        """Subscribe to what is published of our topics, and is not heard yet."""
+        """Subscribe to those of our topics that are published and not yet subscribed to."""
         published = dict(self.get_topic_names_and_types())
         for name in (*READ, *COUNTED):
             topic = self.seen.names[name]
-            if topic in self._subscribed or TYPES[name] not in published.get(topic, ()):
-                continue
-            self._subscribed.add(topic)
-            self.create_subscription(
-                message_class(TYPES[name]), topic, self._taker(name, topic), HEARD_QOS,
-                raw=name in COUNTED)
+            if topic not in self._subscribed and TYPES[name] in published.get(topic, ()):
+                self._subscribed.add(topic)
+                kind = message_class(TYPES[name])
+                self.create_subscription(kind, topic, partial(self._take, name, topic), HEARD_QOS,
+                                         raw=kind in READERS or name in COUNTED)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
             self.create_subscription(Clock, '/clock', self._take_clock, HEARD_QOS)
@@ -210,19 +205,17 @@ class Observer(Node):
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
 
-    def _taker(self, name: str, topic: str) -> Callable[[Any, Any], None]:
-        def take(message: Any, info: Any) -> None:
-            if not self._listening:
-                return
-            # When it was received, not when its turn came: decoding an image takes a while.
-            arrival = (self._simulated if self._simulated is not None
-                       else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
-            header = getattr(message, 'header', None)
-            self._collector.heard(topic, arrival, 0.0 if header is None else (
-                stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
-            if self.seen.names[name] == topic:  # else that of another camera
-                self._collector.take(name, message, arrival)
-        return take
+    def _take(self, name: str, topic: str, message: Any, info: Any) -> None:
+        if not self._listening:
+            return
+        # The time of reception, not that of the callback: decoding an image takes a while.
+        arrival = (self._simulated if self._simulated is not None
+                   else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
+        if name in COUNTED or self.seen.names[name] != topic:  # of another camera
+            message = None
+        elif isinstance(message, bytes):
+            message = read_odometry(message)
+        self._collector.take(name, topic, message, arrival)
 
     def _look_at_graph(self) -> None:
         seen = self.seen
@@ -261,17 +254,6 @@ class Observer(Node):
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)
-
-
-def _plain(value: Any) -> Any:
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
-
-
-def _processor_times() -> str:
-    try:
-        return Path('/proc/stat').read_text(encoding='ascii')
-    except OSError:
-        return ''
 
 
 def _machine(idle: float | None) -> Machine:

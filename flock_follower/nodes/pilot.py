@@ -15,10 +15,10 @@
 """
 The node of the command ``follow``: keys and reports in, service calls and a live line out.
 
-What is due is decided in ``flock_follower.flight_steps``. Subscribes ``/diagnostics``,
-``mavlink_bridge/state``, ``planner/distance`` and ``mavlink/battery``; calls the services of
-``planner`` and ``mavlink_bridge``. SIGINT, SIGTERM, SIGHUP and a terminal that is closed brake
-and hand over: so the node handles them itself, and ROS goes on until that is answered.
+``flock_follower.flight_steps`` decides which call is due. The node subscribes ``/diagnostics``,
+``mavlink_bridge/state``, ``planner/distance`` and ``mavlink/battery``, and calls the services of
+``planner`` and ``mavlink_bridge``. SIGINT, SIGTERM, SIGHUP and a closed terminal brake and hand
+over: the node handles the signals itself, so that ROS runs until the services have answered.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, Range
 from std_msgs.msg import String
@@ -51,6 +49,7 @@ from flock_follower.live_line import LiveLine
 from flock_follower.nodes.call import patience
 from flock_follower.nodes.observer import Observer
 from flock_follower.nodes.support.diagnostics import internal_error
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
@@ -63,9 +62,8 @@ class Pilot(Node):
     Flies by keys.
 
     :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
-    :param verdict: returns whether nothing of what ``check`` sees keeps it from flying, and the
-        findings in words.
-    :param seconds: for which ``check`` listens.
+    :param verdict: returns whether ``check`` permits the flight, and its findings as text.
+    :param seconds: time for which ``check`` listens.
     """
 
     def __init__(self, namespace: str, confirm: bool,
@@ -76,12 +74,12 @@ class Pilot(Node):
         self._flight = Flight(time.monotonic(), confirm)
         self._runner = SingleThreadedExecutor()
         self._runner.add_node(self)
-        self._signals = 0
+        self._signals: list[int] = []
         self._checking = False
         self._keyboard = True
         self._line = LiveLine()
         self._calls: dict[str, tuple[Any, float]] = {}
-        self._ways = {step: self.create_client(Trigger if value is None else SetBool, service)
+        self._callers = {step: self.create_client(Trigger if value is None else SetBool, service)
                          for step, (service, value) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
         self.create_subscription(String, 'mavlink_bridge/state', lambda message: setattr(
@@ -115,7 +113,7 @@ class Pilot(Node):
             while self._flight.code is None:
                 try:
                     self._turn()
-                except Exception as error:  # a second one ends it
+                except Exception as error:  # a second one ends the command
                     self._flight.lines.append(internal_error(error))
                     self._request(self._flight.end(1, self._reports))
         return self._flight.code
@@ -128,33 +126,32 @@ class Pilot(Node):
         self._request(self._flight.step(self._reports, now))
         self._show(now)
 
-    def _on_signal(self, *_: object) -> None:
-        # No more than that: the code that is interrupted may hold a lock that a call needs.
-        self._signals += 1
+    def _on_signal(self, number: int, _: object) -> None:
+        # No more than that: the interrupted code may hold a lock that a call needs.
+        self._signals.append(number)
         if self._checking:
             raise KeyboardInterrupt
 
     def _real_vehicle(self) -> str:
-        """Return why the autopilot may be a real one, as far as the bridge tells, or ''."""
-        client = AsyncParameterClient(self, 'mavlink_bridge')
-        future: Any = None
+        """Return why the autopilot may be a real one by the bridge's ``connection``, or ''."""
+        bridge, asked = RemoteParameters(self, 'mavlink_bridge'), False
         end = time.monotonic() + DISCOVERY
-        while time.monotonic() < end and (future is None or not future.done()):
+        while bridge.values is None:
+            if time.monotonic() > end:
+                return 'missing: mavlink_bridge, whose connection --yes must know'
             self._runner.spin_once(timeout_sec=POLL_PERIOD)
-            if future is None and client.services_are_ready():
-                future = client.get_parameters(['connection'])
-        if future is None or not future.done():
-            return 'missing: mavlink_bridge, which --yes asks for its connection'
-        connection = str(parameter_value_to_python(future.result().values[0]))
+            asked = asked or bridge.ask(['connection'])
+        connection = str(bridge.values['connection'])
         return '' if loopback(connection) else (
             f'--yes: connection = {connection!r} of mavlink_bridge: must be a loopback address, '
             'such as udpin:127.0.0.1:14540 of a simulator')
 
     def _take_keys(self) -> None:
-        """Take signals and keys; a keyboard that is gone brakes and hands over."""
-        pressed, self._signals = self._signals, 0
-        for _ in range(pressed):
-            self._request(self._flight.end(INTERRUPTED, self._reports))
+        """Take signals and keys; a closed terminal brakes and hands over."""
+        received, self._signals = self._signals, []
+        for number in received:  # a logout sends several: only Ctrl-C, pressed again, insists
+            self._request(self._flight.end(
+                INTERRUPTED, self._reports, insist=number == signal.SIGINT))
         try:
             if not self._keyboard or not select.select([0], [], [], 0.0)[0]:
                 return
@@ -164,9 +161,9 @@ class Pilot(Node):
         for key in keys.decode('ascii', 'replace'):
             self._request(self._flight.press(key, self._reports))
         self._keyboard = bool(keys)
-        if not keys and self._confirm:  # else there need be none
+        if not keys and self._confirm:  # --yes needs no keyboard
             self._flight.lines.append('the terminal is closed')
-            self._request(self._flight.end(INTERRUPTED, self._reports))
+            self._request(self._flight.end(INTERRUPTED, self._reports, insist=False))
 
     def _request(self, steps: list[str]) -> None:
         for step in steps:
@@ -174,41 +171,41 @@ class Pilot(Node):
                 self._check()
                 continue
             service, value = SERVICES[step]
-            client = self._ways[step]
+            client = self._callers[step]
             request = Trigger.Request() if value is None else SetBool.Request(data=value)
             self._calls[step] = client.call_async(request), time.monotonic() + patience(service)
 
     def _check(self) -> None:
-        """Run the command ``check`` here; it takes some seconds, in which no key is read."""
+        """Run the command ``check`` here; no key is read for its duration of some seconds."""
         observer = Observer(self._seconds, self.get_namespace(), {}, None, '')
         self._checking = True
         try:
-            ready, told = self._verdict(observer.observe())
+            ready, text = self._verdict(observer.observe())
         except ValueError as error:
-            ready, told = False, str(error)
+            ready, text = False, str(error)
         except KeyboardInterrupt:
             return
         finally:
             self._checking = False
             observer.destroy_node()
         self._request(self._flight.answer(
-            'check', ready, told, self._reports, time.monotonic()))
+            'check', ready, text, self._reports, time.monotonic()))
 
     def _take_answers(self, now: float) -> None:
         for step, (future, end) in list(self._calls.items()):
             if future.done():
                 success, message = future.result().success, future.result().message
-            elif not self._ways[step].service_is_ready():
+            elif not self._callers[step].service_is_ready():
                 success, message = False, f'{step}: no service {SERVICES[step][0]}'
             elif now > end:
-                success, message = False, f'{step}: no answer: what came of it is not known'
+                success, message = False, f'{step}: no answer: the result is unknown'
             else:
                 continue
             del self._calls[step]
             self._request(self._flight.answer(step, success, message, self._reports, now))
 
     def _show(self, now: float) -> None:
-        """Print; a terminal that is gone or stopped must not keep it from handing over."""
+        """Print; an error of the terminal must not prevent the handing over."""
         with contextlib.suppress(OSError):
             for line in self._flight.lines:
                 self._line.say(line)
@@ -219,7 +216,7 @@ class Pilot(Node):
 
 @contextlib.contextmanager
 def _single_keys() -> Iterator[None]:
-    """Have the terminal hand over each key at once, without Enter."""
+    """Have the terminal give each key at once, without Enter."""
     if not os.isatty(0):
         yield
         return
@@ -228,12 +225,12 @@ def _single_keys() -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(termios.error):  # it is gone
+        with contextlib.suppress(termios.error):  # it is closed
             termios.tcsetattr(0, termios.TCSANOW, before)
 
 
 def fly(namespace: str, confirm: bool, verdict: Callable[[Observations], tuple[bool, str]],
         seconds: float) -> int:
     """Run the node and return the exit code; the arguments are those of :class:`Pilot`."""
-    never_block_output()  # a terminal that was stopped must not keep it from handing over
+    never_block_output()  # a stopped terminal must not prevent the handing over
     return run(lambda: Pilot(namespace, confirm, verdict, seconds), ['follow'], Pilot.spin)

@@ -56,7 +56,7 @@ from flock_follower.messages import (
     trajectory,
     with_acceleration,
 )
-from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -73,7 +73,6 @@ from flock_follower.planner.modes import (
 )
 from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldsOfView, Outlook
 from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
@@ -104,12 +103,10 @@ class Planner(FlockNode):
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
         told = cameras(self._settings.values)
-        self._outlook = Outlook({camera.name: camera.rpy for camera in told})
+        self._rpy = {camera.name: camera.rpy for camera in told}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
-        self._state: State | None = None
-        self._reason = ''
+        self._decision: Decision | None = None
         self._given_up = False
-        self._warnings: tuple[str, ...] = ()
         self._guarded = 0
         self._limited = 0
         self._ticked = time.monotonic()
@@ -130,6 +127,8 @@ class Planner(FlockNode):
                         required=False) for camera in told)]
         self._poll_frames = self.poll(
             Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+        inputs = self.diagnostics.inputs
+        inputs['neighbors'].heartbeat = inputs['neighbors/frames']  # images without a leader
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
@@ -228,9 +227,9 @@ class Planner(FlockNode):
         if calibration == self._calibrations.get(camera):
             return
         self._calibrations[camera] = calibration
-        self._loop.view = view = self._outlook.of(message, camera)
-        left, right, up, down = (f'{math.degrees(angle):.0f}'
-                                 for angle in (view.left, view.right, view.up, view.down))
+        self._loop.take_camera_info(message, self._rpy[camera], camera)
+        left, right, up, down = (f'{math.degrees(max(angles)):.0f}'
+                                 for angles in list(zip(*self._loop.view))[:4])
         self.get_logger().info('keeps the leader in sight of the camera: degrees to the left '
                                f'{left}, right {right}, up {up}, down {down}')
 
@@ -293,26 +292,27 @@ class Planner(FlockNode):
                 make, command._replace(stamp=command.stamp + self._watch.shift)))
             self.diagnostics.rate('command').tick(self._ticked)
         if (known := self._loop.distance()) is not None:
+            stamp = nanoseconds_to_stamp(nanoseconds + self._watch.shift)
             self._distances.publish(Range(
-                header=Header(frame_id=known[0], stamp=self.get_clock().now().to_msg()),
-                range=known[1]))
+                header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
         self._tell(decision, self._loop.seconds(nanoseconds))
 
     def _tell(self, decision: Decision, now: float) -> None:
         """Publish the state where it changed, and keep what /diagnostics shows of the tick."""
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
-        self._reason = decision.reason
-        if decision.state is not self._state or self._loop.memory.given_up > self._given_up:
-            self._state = decision.state
+        before, self._decision = self._decision, decision
+        if before is None or decision.state is not before.state or (
+                self._loop.memory.given_up > self._given_up):
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
         self._given_up = self._loop.memory.given_up
-        self._warnings = decision.warnings
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
         values = self.diagnostics.values
+        for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
+            del values[key]
         values.update({'state': decision.state.value, 'reason': decision.reason,
                        'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
@@ -321,10 +321,6 @@ class Planner(FlockNode):
                        'edges': ', '.join(decision.edges), 'known': len(decision.known)})
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
-        else:
-            values.pop('acceleration_m_s2', None)
-        for key in [key for key in values if key.endswith(('_age_s', '_is'))]:
-            del values[key]
         if self._bridge is not None:
             values['bridge_age_s'] = f'{self._bridge_age():.3f}'
         memory = self._loop.memory
@@ -333,8 +329,9 @@ class Planner(FlockNode):
         for name, n in memory.neighbors.items():
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
         for each in decision.known:
-            values[f'{each.name}_is'] = ', '.join(filter(None, [
-                each.role, 'seen' if each.seen else 'heard', 'edge' if each.edge else '']))
+            values[f'{each.name}_is'] = ', '.join([
+                each.who.role, 'heard' if each.heard else 'seen',
+                *(['edge'] if each.name in decision.edges else [])])
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked
@@ -345,20 +342,19 @@ class Planner(FlockNode):
         return ERROR, f'no tick for {silent:.0f} s: {clock}'
 
     def _state_problem(self, now: float) -> Problem | None:
-        state = self._state
-        if state in (State.SEARCH, State.COAST, State.HOLD) or (
-                state is State.IDLE and self._reason != 'not engaged'):
-            return WARN, f'{state.value}: {self._reason}'
-        if self._warnings:
-            return WARN, '; '.join(self._warnings)
-        return None
+        decision = self._decision
+        if decision is None or decision.reason == 'not engaged':
+            return None
+        if decision.state is not State.TRACK:
+            return WARN, f'{decision.state.value}: {decision.reason}'
+        return (WARN, '; '.join(decision.warnings)) if decision.warnings else None
 
     def _sight_problem(self, now: float) -> Problem | None:
         view = self._loop.view
-        if isinstance(view, FieldsOfView) and not view.ahead and (
+        if view and all(field.outside(0.0) for field in view) and (
                 self._settings.current.yaw_mode == 'leader'):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view is not None or self._state in (None, State.IDLE):
+        if view or self._decision is None or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
                       'the camera sees')

@@ -42,6 +42,7 @@ from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
 from flock_follower.bags.schedule import NANOSECONDS, progress, published_names, section, Timeline
+from flock_follower.live_line import LiveLine
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
@@ -52,13 +53,12 @@ CLOCK_PERIOD = 0.001         # s of wall time between ticks at the least, for ra
 SERVICE_PERIOD = 0.02        # s between looks at services, parameters and the diagnostics timer
 LEAD_IN = 0.1                # s from a jump of the clock to the first message that follows it
 MAX_LATENESS = 0.5           # s of backlog kept; what a stall adds beyond it delays the rest
-BAR_PERIOD, LINE_PERIOD = 0.1, 5.0  # s between progress on a terminal, and in a log
 LARGE_TYPES = frozenset(
     f'sensor_msgs/msg/{name}' for name in ('Image', 'CompressedImage', 'PointCloud2'))
-#: What the recorded system said about itself; played only if asked for by name.
+#: Topics of the recorded system itself; played only if named.
 INFRASTRUCTURE = frozenset({'/clock', '/diagnostics', '/parameter_events', '/rosout'})
-#: Commands of a recorded flight, in whatever namespace; played only if asked for by name: a bridge
-#: could not tell them from those of a planner.
+#: Commands of a recorded flight, in any namespace; played only if named: a bridge could not
+#: distinguish them from those of a planner.
 COMMANDS = '/command/trajectory'
 
 SPECS = [
@@ -71,7 +71,7 @@ SPECS = [
     Spec('clock', True, 'publish /clock'),
     Spec('topics', [''], 'topics of the bag to play; none named: all'),
     Spec('remap', [''], 'from:=to for topics of the bag, besides remaps of ROS'),
-    # Discovery takes DDS up to 2.5 s; whoever is matched later misses the first messages.
+    # Discovery takes DDS up to 2.5 s; a later subscriber misses the first messages.
     Spec('wait_for_subscribers', 3.0,
          'how long to wait, at most, for a subscriber of each topic', Range(0.0, 3600.0, 's')),
     Spec('wait_for', [''], 'topics of the bag that wait_for_subscribers means; none named: all'),
@@ -107,12 +107,12 @@ class Replay(FlockNode):
             self._section.start_ns, values['rate'], time.monotonic(), values['paused'])
         self._clock_ns = -1
         self._clock_wall = 0.0
-        self._next_service = self._next_progress = 0.0
+        self._next_service = 0.0
         self._sent: Counter[str] = Counter()
         self._loops = 0
         self._slipped = 0.0
         self._lateness = self.diagnostics.latency('lateness')
-        self._on_terminal = sys.stdout.isatty()
+        self._line = LiveLine()
         self.create_service(SetBool, 'replay/pause', self._on_pause)
 
     def play(self) -> int:
@@ -196,7 +196,7 @@ class Replay(FlockNode):
             executor.spin_once(timeout_sec=SERVICE_PERIOD)
 
     def _begin(self) -> None:
-        """Go to the start of the section; the clock says so before any message follows."""
+        """Go to the start of the section; publish the clock before any message."""
         start_ns = self._section.start_ns
         self._timeline.jump(start_ns, time.monotonic() + LEAD_IN)
         self._clock_ns = -1  # the one place where the clock may go back
@@ -212,7 +212,7 @@ class Replay(FlockNode):
         return self.bag.messages(self._topics, *self._section)
 
     def _wait_until_due(self, stamp_ns: int, executor: SingleThreadedExecutor) -> None:
-        """Wait for the moment of a stamp; keep the clock and the services going meanwhile."""
+        """Wait until a stamp is due; serve the clock and the services meanwhile."""
         while True:
             now = time.monotonic()
             if now >= self._next_service:
@@ -230,7 +230,7 @@ class Replay(FlockNode):
         self._slipped += self._timeline.limit_lateness(stamp_ns, now, MAX_LATENESS)
 
     def _serve(self, executor: SingleThreadedExecutor) -> None:
-        """Answer services, take over parameter changes, tell how far it is."""
+        """Answer services, apply parameter changes, report the position."""
         executor.spin_once(timeout_sec=0.0)
         now = time.monotonic()
         if self._timeline.rate != self._settings.values['rate']:
@@ -241,8 +241,7 @@ class Replay(FlockNode):
             'rate': self._timeline.rate, 'paused': self._timeline.paused, 'loops': self._loops,
             'dropped_backlog_s': f'{self._slipped:.2f}',
             **{f'published {topic}': count for topic, count in self._sent.items()}})
-        if now >= self._next_progress:
-            self._next_progress = now + (BAR_PERIOD if self._on_terminal else LINE_PERIOD)
+        if self._line.due(now):
             self._show_progress(self._position(now))
 
     def _next_tick(self) -> float:
@@ -258,7 +257,7 @@ class Replay(FlockNode):
             self._clock_output.publish(Clock(clock=nanoseconds_to_stamp(stamp_ns)))
 
     def _send(self, message: BagMessage) -> None:
-        self._publish_clock(message.stamp_ns)  # first: whoever gets the message finds its time
+        self._publish_clock(message.stamp_ns)  # first: a subscriber finds the message's time
         self._outputs[message.topic].publish(message.data)
         self._sent[message.topic] += 1
         self.diagnostics.rate(message.topic).tick(time.monotonic())
@@ -275,7 +274,7 @@ class Replay(FlockNode):
         return response
 
     def _position(self, now: float) -> int:
-        """Return the bag time reached, ns; late, the timeline runs on beyond what is played."""
+        """Return the bag time reached, ns; the timeline itself runs on beyond the section."""
         return min(self._timeline.position(now), self._section.stop_ns - 1)
 
     def _seconds(self, stamp_ns: int) -> float:
@@ -283,17 +282,14 @@ class Replay(FlockNode):
 
     def _show_progress(self, position_ns: int) -> None:
         start_ns, end_ns = self._section.start_ns, self._section.stop_ns - 1
-        width = shutil.get_terminal_size().columns - 1 if self._on_terminal else 0
-        line = progress(
+        width = shutil.get_terminal_size().columns - 1 if self._line.on_terminal else 0
+        self._line.show(progress(
             self._seconds(position_ns), self._seconds(end_ns),
             (position_ns - start_ns) / max(end_ns - start_ns, 1), self._timeline.rate,
-            self._sent.total(), self._timeline.paused, width)
-        # Carriage return and "erase to end of line": the bar stays on one line.
-        print(f'\r{line}\x1b[K' if self._on_terminal else line,
-              end='' if self._on_terminal else '\n', flush=True)
+            self._sent.total(), self._timeline.paused, width))
 
     def _finish(self, elapsed: float) -> None:
-        """Let reliable subscribers have the last messages, and sum up."""
+        """Wait for reliable subscribers to receive the last messages, and print a summary."""
         deadline = time.monotonic() + 1.0
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
@@ -304,14 +300,15 @@ class Replay(FlockNode):
                   f'in {elapsed:.1f} s, p99 {lateness} ms late{slipped}')
 
     def _say(self, text: str, stream: TextIO | None = None) -> None:
-        print(('\n' if self._on_terminal else '') + text, file=stream or sys.stdout, flush=True)
+        self._line.end()
+        print(text, file=stream or sys.stdout, flush=True)
 
 
 def bag_argument(args: list[str]) -> str:
     """
-    Return the bag given as a plain argument, '' where there is none.
+    Return the bag given as a plain argument, '' if there is none.
 
-    :raises ValueError: more than one plain argument.
+    :raises ValueError: if there is more than one plain argument.
     """
     plain = remove_ros_args(args)
     if len(plain) > 1:

@@ -15,17 +15,16 @@
 """
 ROS 2 parameter files, read without ROS.
 
-A file maps names of nodes to their parameters, under ``ros__parameters``. Those of ``/**`` hold
-for every node; if a section of a node's own name has one of them too, the last in the file
-counts, as in rcl. Unlike in a node, a name under ``/**`` that some of the nodes know is no error
-for the others: a file made for one node can be read for all. ROS knows no section for some nodes;
-the nodes themselves read the section ``follower``: each takes the parameters that it has, unless
-they are set for it by its own section, ``/**`` or the command line.
+A file maps names of nodes to their parameters, under ``ros__parameters``. The section ``/**`` is
+for every node; if it and the section of a node set one parameter, the last one in the file wins,
+as in rcl. A name under ``/**`` must be a parameter of one of the nodes, not of all. ROS has no
+section for some nodes; the nodes themselves read the section ``follower``: each takes the
+parameters that it has, unless its own section, ``/**`` or the command line sets them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import difflib
 from pathlib import Path
 import re
@@ -39,7 +38,7 @@ from flock_follower.parameters.spec import (
     check_values,
     expanded,
     NAMES,
-    OF_EVERY_NODE,
+    refuse_unknown,
     Spec,
     specs_of,
     unknown_parameter,
@@ -59,8 +58,10 @@ SHARED: Final = 'follower'
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'
 
-#: How alike two names are from which on one is taken for the other, misspelt; 1 is equal.
+#: From this similarity on, a name is taken as a misspelt one; 1 is equal.
 _MISSPELT = 0.85
+#: The name of sections for every node.
+_ALL = '**'
 
 
 def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
@@ -68,7 +69,7 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
     Return the checked values of every parameter of the nodes of ``table``, defaults included.
 
     :raises ValueError: naming the file, and the parameter, its value and the valid range.
-    :raises OSError: where the file cannot be read.
+    :raises OSError: if the file cannot be read.
     """
     try:
         document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
@@ -81,9 +82,9 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
 
 def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | None:
     """
-    Return the values that stand beside a recording of the black box; None where none do.
+    Return the values in the file beside a recording of the black box; None without a file.
 
-    Names of files among them are those beside it, too.
+    A neighbours' file that they name is looked for beside the recording, too.
 
     :raises ValueError: see :func:`read_parameters`. :raises OSError: likewise.
     """
@@ -105,50 +106,43 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     """
     if not isinstance(document, Mapping):
         raise ValueError('must map names of nodes to ros__parameters')
-    for_all: set[str] = set()
-    own: dict[str, set[str]] = {node: set() for node in table}
+    named: dict[str, dict[str, Any]] = {name: {} for name in (*table, SHARED, _ALL)}
     found: dict[str, dict[str, Any]] = {node: {} for node in table}
-    of_follower: dict[str, Any] = {}
-    meant = False
-    for section, content in document.items():
-        node = str(section).rsplit('/', 1)[-1]
-        if node in ('*', '**'):
+    sections = {section: _ALL if _last(section) == '*' else _last(section)
+                for section in map(str, document)}
+    for (section, name), content in zip(sections.items(), document.values()):
+        if name in named:
             parameters = _parameters(section, content)
-            for_all.update(parameters)
-            for each in found.values():
-                each.update(parameters)
-            meant = True
-        elif node in own:
-            parameters = _parameters(section, content)
-            own[node].update(parameters)
-            found[node].update(parameters)
-            meant = True
-        elif node == SHARED:
-            of_follower.update(_parameters(section, content))
-            meant = True
-        elif near := difflib.get_close_matches(node, [*own, SHARED], n=1):
+            named[name].update(parameters)
+            for node in table if name == _ALL else table.keys() & {name}:
+                found[node].update(parameters)
+        elif near := difflib.get_close_matches(name, [*table, SHARED], n=1):
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
-    if not meant:
-        raise ValueError(f'holds parameters neither of /** nor of {", ".join(own)}')
-    found = {node: {**of_follower, **values} for node, values in found.items()}
-    known = {spec.name for node, specs in table.items() for spec in expanded(specs, found[node])}
-    for name in for_all:
-        if name not in known and not _of_every_node(name):
-            raise ValueError(unknown_parameter(name, known, '/**'))
-    _check_shared(of_follower)
-    values = {node: _checked(node, specs, found[node], own[node])
-              for node, specs in table.items()}
+    if not named.keys() & set(sections.values()):
+        raise ValueError(f'holds parameters neither of /** nor of {", ".join(table)}')
+    found = {node: {**named[SHARED], **values} for node, values in found.items()}
+    known = {node: {spec.name for spec in expanded(specs, found[node])}
+             for node, specs in table.items()}
+    refuse_unknown(named[_ALL], {name for names in known.values() for name in names}, '/**')
+    _check_shared(named[SHARED])
+    values = {}
+    for node, specs in table.items():
+        refuse_unknown(named[node], known[node], node)
+        try:
+            values[node] = check_values(specs, found[node])
+        except ValueError as error:
+            raise ValueError(f'{node}: {error}') from None
     of_cameras = sorted({name for own in values.values() for name in own if '.' in name})
     for name in (*COMMON, *of_cameras):
-        told = {node: own[name] for node, own in values.items() if name in own}
-        if len({str(value) for value in told.values()}) > 1:
-            given = ' and '.join(f'{value!r} for {node}' for node, value in told.items())
-            raise ValueError(f'{name} = {given}: must be the same')
+        settings = {node: own[name] for node, own in values.items() if name in own}
+        if len({str(value) for value in settings.values()}) > 1:
+            listed = ' and '.join(f'{value!r} for {node}' for node, value in settings.items())
+            raise ValueError(f'{name} = {listed}: must be the same')
     return values
 
 
 def _check_shared(values: Mapping[str, Any]) -> None:
-    """Refuse a parameter for all nodes of a follower that none of them has."""
+    """Refuse a parameter of the section ``follower`` that no node has."""
     known = {spec.name for specs in TABLE.values() for spec in expanded(specs, values)}
     for name in values:
         if name not in known:
@@ -157,7 +151,7 @@ def _check_shared(values: Mapping[str, Any]) -> None:
 
 def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
     """
-    Return what the sections ``follower`` beside a node set, the last file counting.
+    Return the values of the sections ``follower`` beside a node; the last file wins.
 
     :param node: the node's full name, as '/drone1/planner'.
     :raises ValueError: naming the file, and what is wrong with it.
@@ -188,18 +182,18 @@ def files_in(arguments: Sequence[str]) -> list[str]:
 
 def unheeded(path: str | Path, node: str) -> str:
     """
-    Return what to warn of where ROS takes nothing, or not all that was meant, from a file; or ''.
+    Return a warning if ROS takes nothing, or not all that was meant, from a file; or ''.
 
     :param node: the node's full name, as '/drone1/planner'.
-    :raises ValueError: where nothing in the file is for the node, but a section for one of its
-        name in another namespace, or of nearly its name, which it seems to be meant by.
-    :raises OSError: where the file cannot be read.
+    :raises ValueError: if no section is for the node, but one has its name in another namespace,
+        or nearly its name.
+    :raises OSError: if the file cannot be read.
     """
     try:
         document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except (yaml.YAMLError, UnicodeDecodeError):
-        return ''  # rcl, which has read it, knows better
-    sections = list(_sections('', document))
+        return ''  # rcl has read it, and reports the fault
+    sections = [section for section, _ in _contents('', document)]
     matching = [section for section in sections if _means(section, node)]
     name = node.rsplit('/', 1)[-1]
     if any(_last(section) == name for section in matching):
@@ -217,12 +211,12 @@ def unheeded(path: str | Path, node: str) -> str:
 
 def given(path: str | Path, node: str, exact: bool = False) -> dict[str, Any]:
     """
-    Return what a file sets for a node, the last of two counting, as in ROS; nothing is checked.
+    Return the values that a file sets for a node, unchecked; the last one wins, as in ROS.
 
     :param node: the node's full name, as '/drone1/planner'.
     :param exact: whether only sections that end in the node's own name count.
-    :raises ValueError: where it is not valid YAML.
-    :raises OSError: where the file cannot be read.
+    :raises ValueError: if it is not valid YAML.
+    :raises OSError: if the file cannot be read.
     """
     try:
         document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
@@ -246,17 +240,6 @@ def _contents(prefix: str, document: Any) -> Iterator[tuple[str, Mapping[str, An
             yield from _contents(f'{prefix}/{str(key).strip("/")}', content)
 
 
-def _sections(prefix: str, document: Any) -> Iterator[str]:
-    """Yield the full names of the nodes, or their patterns, of a file; namespaces may nest."""
-    if not isinstance(document, Mapping):
-        return
-    for key, content in document.items():
-        if key == 'ros__parameters':
-            yield prefix or '/'
-        else:
-            yield from _sections(f'{prefix}/{str(key).strip("/")}', content)
-
-
 def _means(section: str, node: str) -> bool:
     """Return whether ROS gives a node what is under a section: * is one name, ** any number."""
     wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
@@ -271,18 +254,6 @@ def _last(section: str) -> str:
 
 def _misspelt(name: str, meant: str) -> bool:
     return name != meant and difflib.SequenceMatcher(None, name, meant).ratio() >= _MISSPELT
-
-
-def _checked(node: str, specs: Sequence[Spec], found: Mapping[str, Any],
-             own: Collection[str]) -> dict[str, Any]:
-    known = {spec.name for spec in expanded(specs, found)}
-    for name in own:
-        if name not in known and not _of_every_node(name):
-            raise ValueError(unknown_parameter(name, known, node))
-    try:
-        return check_values(specs, found)
-    except ValueError as error:
-        raise ValueError(f'{node}: {error}') from None
 
 
 def _parameters(section: Any, content: Any) -> dict[str, Any]:
@@ -303,7 +274,3 @@ def _flat(prefix: str, values: Mapping[Any, Any]) -> dict[str, Any]:
         else:
             flat[f'{prefix}{name}'] = value
     return flat
-
-
-def _of_every_node(name: str) -> bool:
-    return name in OF_EVERY_NODE or name.startswith('qos_overrides.')

@@ -43,6 +43,9 @@ SPECS = [
          'link, too. While the bridge runs PX4 then takes the ground station for connected: the '
          'failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) does not act, and '
          'acts when the bridge ends. ArduPilot goes by the system id, and talks anyway'),
+    Spec('report_to_gcs', True,
+         "send the planner's state as STATUSTEXT, at most one per 2 s, and the distance as "
+         'NAMED_VALUE_FLOAT flock_dist, 1 Hz; PX4 forwards them with MAV_n_FORWARD 1'),
     Spec('signing_key_file', '',
          'file with the 32-byte MAVLink 2 signing key; none: unsigned'),
     Spec('stream_rate', 20.0,

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-A parameter as a table row: name, default, meaning and valid values, the same for all who read it.
+A parameter as a table row: name, default, meaning and valid values.
 
 The nodes declare these tables to ROS; ``evaluate`` reads the same values from a file. Every value
 passes the same checks, and every refusal names the parameter, its value and the valid range.
@@ -21,7 +21,7 @@ passes the same checks, and every refusal names the parameter, its value and the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 import difflib
 from functools import cached_property
@@ -33,6 +33,8 @@ from flock_follower.ranges import Checked, Range
 #: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
 #: stands in the name of one; in its default that is the camera's name, too.
 NAMES, EACH = 'cameras', 'NAME'
+#: Parameters that every ROS node has.
+OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
 #: Parameters of earlier versions: those that took their place, and what to set them to.
 REPLACED = {'altitude_hold': 'altitude_mode: hold for true, or follow'}
 #: Parameters of earlier versions that nothing replaces, and why.
@@ -203,26 +205,26 @@ def expanded(specs: Sequence[Spec], values: Mapping[str, Any]) -> list[Spec]:
     """
     Return the parameters with those of every camera listed in place of ``camera.NAME...``.
 
-    :raises ValueError: where the list of names, among the values, is wrong.
+    :raises ValueError: if the list of names, among the values, is wrong.
     """
     listed = next((spec for spec in specs if spec.name == NAMES), None)
     if listed is None:
         return list(specs)
-    told = listed.check(values.get(NAMES, listed.default))
-    assert isinstance(told, list)
-    names = [name for name in told if isinstance(name, str) and name]
-    for k, name in enumerate(names):
+    value = listed.check(values.get(NAMES, listed.default))
+    assert isinstance(value, list)
+    names = [name for name in value if isinstance(name, str) and name]
+    for name in names:
         if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name):
-            raise ValueError(f'{NAMES} = {told}: {name!r} must be a letter, then letters, digits '
+            raise ValueError(f'{NAMES} = {value}: {name!r} must be a letter, then letters, digits '
                              'and _')
-        if name in names[:k]:
-            raise ValueError(f'{NAMES} = {told}: {name!r} is there twice: must all be different')
+        if names.count(name) > 1:
+            raise ValueError(f'{NAMES} = {value}: {name!r} is there twice: must all be different')
     return [spec if name is None else spec.named(name) for spec in specs
             for name in (names if EACH in spec.name else [None])]
 
 
 def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
-    """Return what to say of a name that is no parameter of a node."""
+    """Return the error for a name that is no parameter of a node."""
     if name in REPLACED and REPLACED[name].split(':')[0] in known:
         return f'unknown parameter {name} for node {node}: it is now {REPLACED[name]}'
     if name in REMOVED:
@@ -237,5 +239,13 @@ def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
     return f'unknown parameter {name} for node {node}: {hint}'
 
 
-#: Parameters that every ROS node has.
-OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
+def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> None:
+    """
+    Refuse names that are no parameters of a node: ROS ignores them, and their values with them.
+
+    :raises ValueError: naming the parameter, and the one that is nearest to it.
+    """
+    for name in sorted(names):
+        if name not in known and name not in OF_EVERY_NODE and (
+                not name.startswith('qos_overrides.')):
+            raise ValueError(unknown_parameter(name, known, node))

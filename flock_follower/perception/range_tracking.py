@@ -130,7 +130,7 @@ class Ranged(NamedTuple):
     estimate: Estimate
 
 
-class _Placed(NamedTuple):
+class PlacedRange(NamedTuple):
     """A range, by the filters' clock, s, and where the own antenna was (3,), m, in their frame."""
 
     stamp: float
@@ -152,7 +152,7 @@ class Ranging:
         self.params = params or RangingParams()
         self._odometry = odometry
         self._tag = np.array(self.params.tag_position)
-        self._series = {n.name: _Series(filters[n.name], np.array(n.tag_position))
+        self._series = {n.name: RangeSeries(filters[n.name], np.array(n.tag_position))
                         for n in neighbors}
         self._waiting: list[tuple[float, RangeState]] = []
 
@@ -220,14 +220,14 @@ class Ranging:
                 continue
             body = own.smooth_pose
             variance = measured.variance or self.params.range_noise ** 2
-            placed = _Placed(clock(measured.name, stamp), measured.distance, variance,
+            placed = PlacedRange(clock(measured.name, stamp), measured.distance, variance,
                              body.apply(self._tag))
             estimate = self._series[measured.name].take(placed, own)
             if estimate is not None:
                 yield Ranged(measured.name, measured.stamp, estimate)
 
 
-class _Series:
+class RangeSeries:
     """The ranges to an antenna, at ``tag`` (3,) on the body of whom a filter follows by sight."""
 
     def __init__(self, seen: NeighborFilter, tag: Array) -> None:
@@ -238,11 +238,11 @@ class _Series:
         self.bias = RangeBias()
         self.newest: float | None = None
         self.began = False
-        self._unused: deque[_Placed] = deque(maxlen=MOST_WAITING)
+        self._unused: deque[PlacedRange] = deque(maxlen=MOST_WAITING)
         self._apart: NeighborFilter | None = None
         self._since: float | None = None
 
-    def take(self, measured: _Placed, own: OdometrySample) -> Estimate | None:
+    def take(self, measured: PlacedRange, own: OdometrySample) -> Estimate | None:
         """Take a range; return the state by the odometry's clock, where it is not in sight."""
         self.began = True
         seen = self._seen.newest
@@ -266,7 +266,7 @@ class _Series:
             return None
         return self._told(now, own)
 
-    def _learn(self, measured: _Placed, seen: Estimate) -> None:
+    def _learn(self, measured: PlacedRange, seen: Estimate) -> None:
         then = self._seen.near(measured.stamp)
         if then is None or seen.stamp - measured.stamp > LEARNT:
             return
@@ -277,7 +277,7 @@ class _Series:
         self.bias.learn(measured.stamp, np.array([measured.distance - distance]),
                         np.array([measured.variance + spread]))
 
-    def _go_on(self, apart: NeighborFilter, measured: _Placed) -> UpdateOutcome:
+    def _go_on(self, apart: NeighborFilter, measured: PlacedRange) -> UpdateOutcome:
         return apart.update_range(
             measured.stamp, measured.distance - float(self.bias.value[0]), measured.antenna,
             measured.variance + float(self.bias.variance(measured.stamp)[0]), self._tag)

@@ -60,21 +60,17 @@ from flock_follower.planner.inputs import (
     expected,
     Neighbor,
     OwnState,
-    TOUCHING,
-    variance_along,
 )
 from flock_follower.planner.limits import (
+    Bound,
     COHESION,
     FENCE,
-    HalfSpace,
     scalar_product,
     SEPARATION,
     SIGHT,
-    vector3,
 )
-from flock_follower.planner.neighborhood import radii_sum
-from flock_follower.planner.params import GuardParams, PlannerParams, replace
-from flock_follower.planner.sight import FieldOfView, GRAVITY, MARGIN
+from flock_follower.planner.params import GuardParams, PlannerParams
+from flock_follower.planner.sight import all_round, GRAVITY, MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
@@ -111,46 +107,24 @@ class Edges(NamedTuple):
         return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
 
 
-class RadialBounds(NamedTuple):
-    """What the guard asks of the acceleration a, for one neighbour: lowest <= n . a <= highest."""
-
-    distance: float
-    """r, m."""
-    direction: Array
-    """n (3,), from the neighbor to the own vehicle."""
-    lowest: float
-    """m/s^2; below it one would come too near."""
-    highest: float
-    """m/s^2; above it one would fall too far behind."""
-    seen: bool = True
-    """Whether it is in sight: bounds of those seen go before bounds of those only predicted."""
-
-    @property
-    def separation(self) -> HalfSpace:
-        """Return the bound that keeps away."""
-        return HalfSpace(self.direction, self.lowest, SEPARATION)
-
-    @property
-    def cohesion(self) -> HalfSpace:
-        """Return the bound that keeps near."""
-        return HalfSpace(-self.direction, -self.highest, COHESION)
-
-
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
-                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
+                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
     """
-    Return the guard's bounds for one neighbor; None without a direction, or if not finite.
+    Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
+
+    Without a direction, or if something is not finite, there are none.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
     :param its_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
     """
-    p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity).tolist()
-    a = vector3('its_acceleration', its_acceleration).tolist()
+    p = np.asarray(offset, dtype=float)
+    w = np.asarray(relative_velocity, dtype=float).tolist()
+    a = np.asarray(its_acceleration, dtype=float).tolist()
     distance = math.hypot(*p.tolist())
     if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
-        return None  # as for NaN, which fails every comparison
+        return []  # as for NaN, which fails every comparison
     n = p / distance
     unit = n.tolist()
     rate = scalar_product(unit, w)
@@ -158,18 +132,18 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     # Whoever may be anywhere in a sphere that grows comes nearer by that.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
-    lowest = common - (closing + params.closing_speed(gap)) / params.T_g - (
-        params.closing_slope(gap) * closing)
-    highest = math.inf
+    speed, slope = params.closing(gap)
+    lowest = common - (closing + speed) / params.T_g - slope * closing
+    bounds = [Bound(n, lowest, SEPARATION, distance)]
     if math.isfinite(edges.far):
-        gap = edges.far - edges.margin - distance
-        highest = common - (rate - params.closing_speed(gap)) / params.T_g - (
-            params.closing_slope(gap) * rate)
-    return RadialBounds(distance, n, lowest, highest)
+        speed, slope = params.closing(edges.far - edges.margin - distance)
+        highest = common - (rate - speed) / params.T_g - slope * rate
+        bounds.append(Bound(-n, -highest, COHESION, distance))
+    return bounds
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             params: PlannerParams, radii: float = 0.0) -> list[RadialBounds]:
+             params: PlannerParams, radii: float = 0.0) -> list[Bound]:
     """
     Return the bounds for one neighbor.
 
@@ -186,27 +160,25 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         near = (DOWNWASH if seen else 1.0) * inner.near + radii
         ways.append((LEVEL, band._replace(near=near, far=math.inf)))
-    bounds = [radial_bounds(axes * (position - it.position), axes * (velocity - it.velocity),
-                            edges, params.guarding, axes * it.acceleration)
-              for axes, edges in ways]
-    return [each._replace(seen=seen) for each in bounds if each is not None]
+    return [each._replace(seen=seen) for axes, edges in ways for each in radial_bounds(
+        axes * (position - it.position), axes * (velocity - it.velocity), edges, params.guarding,
+        axes * it.acceleration)]
 
 
-def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
     """Return the bound that stops it along a unit vector within so much, m."""
     guarding, rate = params.guarding, float(along @ velocity)
-    guarding = replace(guarding, b=max(guarding.b, STOP_SHARE * params.strongest))
     # Until the command acts it goes on as it does.
-    left -= max(rate, 0.0) * params.response_time
-    speed = max(guarding.closing_speed(left), 0.0)
-    return HalfSpace(-along, (rate - speed) / guarding.T_g
-                     + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
+    speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,
+                                    max(guarding.b, STOP_SHARE * params.strongest))
+    return Bound(
+        -along, (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
 
 
 def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
-                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
+                    velocity: Array, params: PlannerParams) -> list[Bound]:
     """
-    Return the bound that keeps at the distance that is known.
+    Return the bound, if any, that keeps at the distance that is known.
 
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
@@ -215,29 +187,30 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     it = expected(n, its, me.stamp - n.stamp, params)
     sight = it.position - me.position
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
-    if not level > TOUCHING:
-        return None
+    if not level > 1e-6:
+        return []
     along = sight / distance
     towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
     if known is not None:
         x, y, _ = (known.position - me.position).tolist()
         away = math.hypot(x, y)
-        if away > TOUCHING:
+        if away > 1e-6:
             towards = np.array([x, y, 0.0]) / away
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
+    variance = float(along @ n.position_covariance @ along)
     # As measured; until the command acts only the own motion on the line backwards changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)
     band = inner._replace(
-        near=inner.near + radii_sum(n, params), far=math.inf, spreading=it.spreading,
-        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance_along(n, along), 0.0)))
-    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
-                          float(along @ it.acceleration) * towards)
-    return None if found is None else found._replace(seen=sure)
+        near=inner.near + params.radius + n.who.radius, far=math.inf, spreading=it.spreading,
+        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
+    return [each._replace(seen=sure) for each in radial_bounds(
+        -distance * towards, -rate * towards, band, params.guarding,
+        float(along @ it.acceleration) * towards)]
 
 
-def sight_bounds(offset: Array, velocity: Array, it: Expected, view: FieldOfView,
-                 params: PlannerParams) -> list[HalfSpace]:
+def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view: View,
+                 params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 
@@ -248,30 +221,31 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, view: FieldOfView
         |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                         f, t: towards it, across
 
     :param offset: its position minus the own one, m; :param velocity: the own one, m/s.
+    :param yaw: the own one, rad.
     """
     x, y, z = offset.tolist()
     distance = math.hypot(x, y)
     if distance < OVERHEAD:
         return []
-    up, down = view.vertical(math.atan2(y, x))
+    up, down = vertical(view, math.atan2(y, x) - yaw)
     forward = np.array([x, y, 0.0]) / distance
     slope = z / distance
     # Its height alone never forces a horizontal motion: altitude control follows its height.
     faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
     slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
-    bounds = [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT)]
-    if view.all_round:
+    bounds = [Bound(-forward, -faster, SIGHT), Bound(forward, -slower, SIGHT)]
+    if all_round(view):
         return bounds  # the yaw need not follow it
     left = np.array([-y, x, 0.0]) / distance
     passing = float(left @ (it.velocity - velocity))
     turning = TURNING_SHARE * params.yaw_rate_max * distance
     across = float(left @ it.acceleration)
-    return [*bounds, HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
-            HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+    return [*bounds, Bound(left, (passing - turning) / TURNING_TIME + across, SIGHT),
+            Bound(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
 
 
 def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
-                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
+                  faces: Sequence[float], params: PlannerParams) -> list[Bound]:
     """
     Return what keeps a neighbour's marker from being seen too obliquely.
 
@@ -292,4 +266,4 @@ def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
     fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
     rate = float(outward @ (velocity - it.velocity))
     across = float(outward @ it.acceleration)
-    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
+    return [Bound(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]

@@ -39,7 +39,6 @@ from flock_follower.planner.bounds import (
     LEVEL,
     marker_bounds,
     radial_bounds,
-    RadialBounds,
     sight_bounds,
     stop,
 )
@@ -51,16 +50,17 @@ from flock_follower.planner.inputs import (
     SEEN,
 )
 from flock_follower.planner.limits import (
+    Bound,
+    COHESION,
     constrained,
     FENCE,
-    HalfSpace,
     LimitedCommand,
     SEPARATION,
 )
 from flock_follower.planner.memory import Loss, Memory
-from flock_follower.planner.neighborhood import Neighborhood, radii_sum, role
-from flock_follower.planner.params import AVOID, member, PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.neighborhood import Neighborhood
+from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
@@ -75,19 +75,20 @@ CLIMB_MAX = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
 
 
-def ordered(neighbors: Sequence[RadialBounds], fences: Sequence[HalfSpace] = (),
-            sight: Sequence[HalfSpace] = ()) -> list[HalfSpace]:
+def ordered(bounds: Iterable[Bound], fences: Sequence[Bound] = (),
+            sight: Sequence[Bound] = ()) -> list[Bound]:
     """
     Return all bounds in the order of their importance.
 
-    Not coming too near to anyone in sight comes first, the nearest neighbour before the others;
-    then fences, those out of sight, and seeing the neighbour; last not falling behind, the
-    farthest first. So falling behind never costs separation or sight.
+    Separation from those in sight comes first, the nearest neighbor before the others; then
+    fences, separation from those out of sight, and sight; last cohesion, the farthest first. So
+    cohesion never costs separation or sight.
     """
-    near = sorted(neighbors, key=lambda each: each.distance)
-    return [*(each.separation for each in near if each.seen), *fences,
-            *(each.separation for each in near if not each.seen), *sight,
-            *(each.cohesion for each in reversed(near) if math.isfinite(each.highest))]
+    near = sorted(bounds, key=lambda each: each.distance)
+    apart = [each for each in near if each.reason == SEPARATION]
+    return [*(each for each in apart if each.seen), *fences,
+            *(each for each in apart if not each.seen), *sight,
+            *(each for each in reversed(near) if each.reason == COHESION)]
 
 
 def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
@@ -102,20 +103,20 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     rest = math.inf
     for n in neighbors:
-        hull = radii_sum(n, params)
+        hull = params.radius + n.who.radius
         near = edges.near + hull
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
         if level < DOWNWASH * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
-            speed = min(params.guarding.closing_speed(gap), 0.0)
+            speed = min(params.guarding.closing(gap)[0], 0.0)
             if z > 0.0:
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
         approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
                           for v in (n.velocity, me.velocity))
-        needed = approach - params.guarding.closing_speed(level - near - edges.margin)
+        needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
         if math.hypot(level, z) < CLOSE + hull and away > APPROACH_NOISE:
@@ -125,14 +126,13 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
 
 
 def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
-           params: PlannerParams) -> list[HalfSpace]:
+           params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep it near home and, out of sight, from moving on unseeing."""
-    bounds = []
+    bounds = list[Bound]()
     if home is not None:
-        fence = radial_bounds(LEVEL * (position - home), LEVEL * velocity,
-                              Edges(-math.inf, params.range_max), params.guarding)
-        if fence is not None:
-            bounds.append(fence.cohesion._replace(reason=FENCE))
+        inside = radial_bounds(LEVEL * (position - home), LEVEL * velocity,
+                               Edges(-math.inf, params.range_max), params.guarding)
+        bounds += [each._replace(reason=FENCE) for each in inside if each.reason == COHESION]
     if lost is not None:
         away = LEVEL * (position - lost.origin)
         distance = math.hypot(*away.tolist())
@@ -144,15 +144,15 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
     return bounds
 
 
-def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
-               params: PlannerParams, sideways: bool = True) -> RadialBounds:
+def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
+               params: PlannerParams, sideways: bool = True) -> Bound:
     """
     Return the bound of one out of sight, limited to the retreat.
 
     :param sideways: whether it is the lost neighbor itself, whose path is left.
     """
     far, offset = retreat(lost, params), LEVEL * (position - lost.origin)
-    direction = bound.direction
+    direction = bound.normal
     # Not towards one that has come to that side.
     sideways = sideways and float(direction @ lost.side) > -BESIDE
     if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
@@ -162,7 +162,7 @@ def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array
     along = float(direction @ offset)
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
     most = -stop(direction, left, velocity, params).least
-    return bound._replace(direction=direction, lowest=min(bound.lowest, most))
+    return bound._replace(normal=direction, least=min(bound.least, most))
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
@@ -204,7 +204,7 @@ def beside(velocity: Array, offset: Array) -> Array:
 
 
 def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-              neighbors: Neighborhood, view: FieldOfView | None, blinded: bool,
+              neighbors: Neighborhood, view: View, blinded: bool,
               params: PlannerParams) -> LimitedCommand:
     """
     Return the nearest command within all bounds.
@@ -215,11 +215,10 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
     :param neighbors: the neighbors at hand in TRACK, else nobody.
     :param blinded: whether no images are processed.
     """
-    near = list[RadialBounds]()
+    near = list[Bound]()
     for name, n in memory.ranged.items():
-        if name not in memory.neighbors and (
-                sphere := clear_of_sphere(n, memory.flock.get(name), me, velocity, params)):
-            near.append(sphere)
+        if name not in memory.neighbors:
+            near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (blinded and not n.heard)):
@@ -233,25 +232,24 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
         clear = constrained(allowed.acceleration, velocity, [
             each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
             params.fastest, params.period)
-        allowed = clear if clear.limited else allowed
-    if not allowed.limited:
+        allowed = clear if clear.reason else allowed
+    if not allowed.reason:
         return command
     reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
-    return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
+    return LimitedCommand(allowed.acceleration, reasons, allowed.away)
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
                      neighbors: Neighborhood, here: bool,
-                     params: PlannerParams) -> list[RadialBounds]:
+                     params: PlannerParams) -> list[Bound]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
-    age, hull = me.stamp - n.stamp, radii_sum(n, params)
-    seen = here and (memory.lost is None or bool(neighbors.flock) or role(n, params) == AVOID)
-    tie = neighbors.ties.get(n.name)
-    joined = here and tie is not None and tie.edge
+    age, hull = me.stamp - n.stamp, params.radius + n.who.radius
+    seen = here and (memory.lost is None or bool(neighbors.flock) or n.who.role == AVOID)
+    joined = here and n.name in neighbors.edges
     places = [_expected(n, memory, me, params)]
     if age > SEEN and not n.heard:  # its acceleration is a guess: keep farther away, never chase
         places.append(expected(n, np.zeros(3), age, params))
-    found = []
+    found = list[Bound]()
     for place in places:
         found += in_sight(place, me.position, velocity, seen,
                           joined and place is places[-1], params, hull)
@@ -263,17 +261,16 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
 
 
 def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood,
-                  view: FieldOfView | None, params: PlannerParams) -> list[HalfSpace]:
+                  view: View, params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
     n = None if neighbors.faced is None else memory.flock[neighbors.faced.name]
-    if n is None or view is None or n.heard:
+    if n is None or not view or n.heard:
         return []
     it = _expected(n, memory, me, params)
     offset = it.position - me.position
-    bounds = sight_bounds(offset, velocity, it, view, params)
+    bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
-        faces = member(params.vehicles, n.name, False).faces
-        bounds += marker_bounds(offset, velocity, it, n.yaw, faces, params)
+        bounds += marker_bounds(offset, velocity, it, n.yaw, n.who.faces, params)
     return bounds
 
 

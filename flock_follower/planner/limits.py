@@ -33,7 +33,6 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
-from flock_follower.ranges import Range
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
 # norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
@@ -45,9 +44,6 @@ SENT_INSIDE = 1.0 - 2e-7
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
-_A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
-_V_MAX = Range(0.0, FASTEST_OWN, 'm/s')
-_TIME = Range(0.0, 10.0, 's', above=True)
 
 
 class LimitedCommand(NamedTuple):
@@ -55,21 +51,24 @@ class LimitedCommand(NamedTuple):
 
     acceleration: Array
     """Acceleration (3,), m/s^2, in the frame of the inputs."""
-    limited: bool
-    """Whether it differs from what was asked for."""
     reason: str
-    """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
+    """Why it differs from what was asked for, '' if it does not; 'a_max', 'v_max', 'a_max, v_max',
+    reasons of bounds, or which input is not finite."""
     away: Array | None = None
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
 
-class HalfSpace(NamedTuple):
-    """What is asked of the acceleration a (3,), m/s^2: normal . a >= least."""
+class Bound(NamedTuple):
+    """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
 
     normal: Array
     """(3,); it need not be of unit length."""
     least: float
     reason: str
+    distance: float = 0.0
+    """From the neighbor that causes it, m."""
+    seen: bool = True
+    """Whether that neighbor is in sight."""
 
 
 def limit_norm(vector: ArrayLike, limit: float) -> Array:
@@ -109,21 +108,17 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     :param period: time T the acceleration will be held for, s, in (0, 10].
     :param away: unit vector (3,) along which the acceleration is cut last, because it keeps clear
         of a neighbour: within the limits, as much of it is left as there can be.
-    :raises ValueError: where a limit is out of its range or a vector is not of shape (3,).
     """
-    _A_MAX.check('a_max', a_max)
-    _V_MAX.check('v_max', v_max)
-    _TIME.check('period', period)
-    wanted, v = vector3('acceleration', acceleration), vector3('velocity', velocity)
+    wanted, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
     asked, flown, strongest = wanted.tolist(), v.tolist(), a_max * SENT_INSIDE
     reached = [x + u * period for x, u in zip(flown, asked)]
     if (math.hypot(*asked) < strongest * INSIDE
             and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
-        return LimitedCommand(wanted.copy(), False, '')
+        return LimitedCommand(wanted.copy(), '')
     if not all(map(math.isfinite, flown)):
-        return LimitedCommand(np.zeros(3), True, 'velocity not finite')
+        return LimitedCommand(np.zeros(3), 'velocity not finite')
     if not all(map(math.isfinite, asked)):
-        return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
+        return LimitedCommand(brake(v, a_max, period), 'acceleration not finite')
 
     a = limit_norm(wanted, strongest)
     reasons = [] if a.tolist() == asked else ['a_max']
@@ -139,7 +134,7 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
         if away @ wanted > 0.0:
             clear = _away_first(wanted, v, away, a_max, v_max, period)
             a = clear if away @ clear > away @ a else a
-    return LimitedCommand(a, bool(reasons), ', '.join(reasons))
+    return LimitedCommand(a, ', '.join(reasons))
 
 
 def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
@@ -154,7 +149,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     :param vertical: acceleration, m/s^2, at most ``a_max``.
     :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
     """
-    v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
+    v, wanted = np.asarray(velocity, dtype=float), np.asarray(wanted, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
@@ -170,7 +165,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
     said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(said) if 'finite' not in command.reason else command.reason
-    return LimitedCommand(command.acceleration, bool(reason), reason)
+    return LimitedCommand(command.acceleration, reason)
 
 
 def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
@@ -220,7 +215,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration
 
 
-def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
+def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound], a_max: float,
           v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
@@ -238,7 +233,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSp
     :param velocity: own velocity (3,), m/s.
     :param wanted: the bounds, the most important first (see ``ordered``).
     """
-    a, v = vector3('command', command), vector3('velocity', velocity)
+    a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     speed = math.hypot(*v.tolist())
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST_OWN
@@ -247,7 +242,10 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSp
     if not flyable or not all(map(math.isfinite, asked)) or all(
             scalar_product(each.normal.tolist(), asked) >= each.least for each in wanted):
         return limit_command(a, v, a_max, fastest, period)
-    bounds, reasons = _within_reach(wanted, asked[2])
+    # Those on the horizontal part that it can do anything for.
+    sides = [(complex(x, y), each.least - z * asked[2], each.reason)
+             for each in wanted for x, y, z in [each.normal.tolist()] if math.hypot(x, y) > STEEP]
+    bounds = [side[:2] for side in sides]
     missed = [product(normal, complex(*asked[:2])) < least for normal, least in bounds]
     if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
@@ -263,21 +261,9 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSp
     acting = [k for k, (normal, least) in enumerate(bounds)
               if missed[k] or product(normal, point) <= least + TOLERANCE]
     away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
-        bounds[k][0] for k in acting if reasons[k] == SEPARATION)), None)
-    said = sorted({reasons[k] for k in acting}, key=REASONS.index)
-    return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
-
-
-def _within_reach(wanted: Sequence[HalfSpace],
-                  vertical: float) -> tuple[list[Side], list[str]]:
-    """Return the bounds on the horizontal part of a command that this can do anything for."""
-    bounds, reasons = list[Side](), list[str]()
-    for each in wanted:
-        x, y, z = each.normal.tolist()
-        if math.hypot(x, y) > STEEP:
-            bounds.append((complex(x, y), each.least - z * vertical))
-            reasons.append(each.reason)
-    return bounds, reasons
+        bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
+    said = sorted({sides[k][2] for k in acting}, key=REASONS.index)
+    return LimitedCommand(limited.acceleration, ', '.join(said), away)
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:
@@ -290,22 +276,11 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     :param velocity: present velocity (3,), m/s.
     :param a_max: largest acceleration, m/s^2, in (0, 100].
     :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
-    :raises ValueError: where a parameter is out of its range or the shape is not (3,).
     """
-    _A_MAX.check('a_max', a_max)
-    _TIME.check('time_constant', time_constant)
     # Shortened before the division, which could overflow, and after it, which rounds.
     strongest = a_max * SENT_INSIDE
-    step = limit_norm(0.0 - vector3('velocity', velocity), strongest * time_constant)
+    step = limit_norm(0.0 - np.asarray(velocity, dtype=float), strongest * time_constant)
     return limit_norm(step / time_constant, strongest)
-
-
-def vector3(name: str, value: ArrayLike) -> Array:
-    """Return a vector (3,); ValueError names one of another shape."""
-    v = np.asarray(value, dtype=float)
-    if v.shape != (3,):
-        raise ValueError(f'{name} has shape {v.shape}: must be (3,)')
-    return v
 
 
 def scalar_product(one: list[float], other: list[float]) -> float:

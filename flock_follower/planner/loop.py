@@ -18,10 +18,13 @@ from __future__ import annotations
 
 from collections import deque
 import math
+from typing import Any
+
+from numpy.typing import ArrayLike
 
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import Command, OdometryState
-from flock_follower.planner.inputs import at, Neighbor, OwnState, Rhythm
+from flock_follower.planner.inputs import at, Neighbor, OwnState, Span
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
@@ -31,14 +34,16 @@ from flock_follower.planner.modes import (
     parse,
     TAKEN_OVER,
 )
-from flock_follower.planner.params import PlannerParams, replace
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.sight import FieldOfView, View
 from flock_follower.planner.step import Decision, step
 
 #: Largest standard deviation of a neighbour's yaw that is used, rad.
 MAX_YAW_STD = 0.5
 #: Processed images of which the stamps are kept.
 FRAMES = 20
+#: Messages of odometry: 2 s at 10 Hz, but a hiccup at 60 Hz is forgotten in 0.3 s.
+REMEMBERED = 20
 
 
 class PlannerLoop:
@@ -54,8 +59,9 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
-        self.view: FieldOfView | None = None
-        """Field of view of the cameras; None if unknown."""
+        self.view: View = ()
+        """Fields of view of the cameras; () if unknown."""
+        self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
@@ -64,9 +70,10 @@ class PlannerLoop:
         self._disengaged_by = ''
         self._bridge: BridgeState | None = None
         self._interrupted = False
-        self._rhythm = Rhythm()
         self._frame = ''
         self._own: OdometryState | None = None
+        self._newest = 0, 0
+        self._spans: deque[Span] = deque(maxlen=REMEMBERED)
         self._neighbors: list[tuple[OdometryState, bool]] = []
         self._looked: int | None = None
         self._frames: deque[int] = deque(maxlen=FRAMES)
@@ -80,7 +87,7 @@ class PlannerLoop:
         """
         self.engaged, self._disengaged_by = wanted, ''
         self._interrupted |= not wanted or self.memory.given_up
-        self.memory = replace(self.memory, given_up=False)
+        self.memory = self.memory._replace(given_up=False)
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
         """
@@ -113,7 +120,13 @@ class PlannerLoop:
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
         """Take the own state at a time, ns; only the newest since the last tick counts."""
-        self._rhythm.take(state.stamp, nanoseconds)
+        stamp, arrived = self._newest
+        if state.stamp < stamp:
+            self._spans.clear()  # the clock jumped back, or another source took over
+        elif state.stamp > stamp > 0:
+            self._spans.append(((arrived - stamp) * 1e-9, (nanoseconds - stamp) * 1e-9))
+        if state.stamp != stamp:
+            self._newest = state.stamp, nanoseconds
         self._own = state
         self._frame = state.frame
 
@@ -130,6 +143,16 @@ class PlannerLoop:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append((neighbor, heard))
+
+    def take_camera_info(self, info: Any, rpy: ArrayLike, camera: str = '') -> None:
+        """
+        Take a CameraInfo of a camera, by its name if there are several.
+
+        :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
+        :raises ValueError: if that camera cannot keep a neighbor in sight.
+        """
+        self._fields[camera] = FieldOfView.of_camera(info, rpy, bool(camera))
+        self.view = tuple(self._fields.values())
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
@@ -151,14 +174,13 @@ class PlannerLoop:
 
     def distance(self) -> tuple[str, float] | None:
         """Return name and distance, m, of the neighbour faced, else of the nearest, if any."""
-        now, me, known = self.memory.now, self.memory.own, self.memory.neighbors
-        if now is None or me is None or not known:
+        now, me, faced = self.memory.now, self.memory.own, self.memory.faced
+        if now is None or me is None or not self.memory.neighbors:
             return None
         here = at(me, now).position
-        distances = {name: math.dist(at(n, now).position, here) for name, n in known.items()}
-        faced = self.memory.faced
-        name = faced if faced in known else min(distances, key=lambda each: distances[each])
-        return name, distances[name]
+        return min(((n.name, math.dist(at(n, now).position, here))
+                    for n in self.memory.neighbors.values()),
+                   key=lambda known: (known[0] != faced, known[1]))
 
     def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
         """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""
@@ -178,7 +200,7 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion), tuple(self._rhythm.spans))
+            yaw_from_quaternion(self._own.quaternion), tuple(self._spans))
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance, None if heard else n.acceleration, _yaw(n), heard)
@@ -187,13 +209,11 @@ class PlannerLoop:
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
-        last = own or self.memory.own
-        view = self.view if self.view is None or last is None else self.view.at(last.yaw)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
         waiting = self.waiting(bridge_age) if self.engaged else self._disengaged_by
         self.memory, decision = step(self.memory, now, self.engaged, own, neighbors, params,
-                                     looked, waiting, view, self.ground,
+                                     looked, waiting, self.view, self.ground,
                                      [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None

@@ -13,18 +13,16 @@
 # limitations under the License.
 
 """
-State of the planner between two steps, and how new inputs are taken into it.
+State of the planner between two steps, and the acceptance of new inputs.
 
-An input that cannot be used is rejected with a reason. Estimates and odometry are carried to the
-time of the command with constant velocity. Nothing here reads a clock.
+An input that cannot be used is rejected with a reason. Nothing here reads a clock.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,11 +36,10 @@ from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     Rejection,
-    TOO_UNCERTAIN,
     uncertain,
     untimely,
 )
-from flock_follower.planner.params import PlannerParams, replace
+from flock_follower.planner.params import member, PlannerParams
 from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
@@ -51,7 +48,7 @@ LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
 class SmoothedMotion(NamedTuple):
-    """A neighbour's velocity (3,), m/s, at a stamp, s: smoothed, and how fast it changes."""
+    """A neighbor's velocity (3,), m/s, at a stamp, s: smoothed, and how fast it changes."""
 
     stamp: float
     velocity: Array
@@ -62,7 +59,7 @@ class SmoothedMotion(NamedTuple):
 def observed(motions: Mapping[str, SmoothedMotion],
              neighbors: Iterable[Neighbor]) -> dict[str, SmoothedMotion]:
     """
-    Return the motions of the neighbours, brought up to their newest estimates.
+    Return the motions of the neighbors, brought up to their newest estimates.
 
     The smoothed velocity u follows the estimated one with du/dt = (v - u) / SMOOTHING; under a
     constant acceleration it changes as fast as v does. An acceleration that the estimate has
@@ -71,43 +68,22 @@ def observed(motions: Mapping[str, SmoothedMotion],
     updated = {}
     for n in neighbors:
         last = motions.get(n.name)
-        if last is not None and last.stamp == n.stamp:
-            updated[n.name] = last
-        elif last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            updated[n.name] = SmoothedMotion(
-                n.stamp, n.velocity, np.zeros(3) if n.acceleration is None else n.acceleration)
-        else:
-            behind = n.velocity - last.velocity
+        if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
+            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
+        elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
-            change = -math.expm1(-elapsed / SMOOTHING) * behind
-            updated[n.name] = SmoothedMotion(
-                n.stamp, last.velocity + change,
-                change / elapsed if n.acceleration is None else n.acceleration)
+            change = -math.expm1(-elapsed / SMOOTHING) * (n.velocity - last.velocity)
+            last = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
+        updated[n.name] = last if n.acceleration is None else last._replace(
+            acceleration=n.acceleration)
     return updated
 
 
-ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
+ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
 NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
 
 
-class Tie(NamedTuple):
-    """How a neighbour is attended to."""
-
-    edge: bool
-    share: float
-    """From 0 for none to 1 for an edge: it changes over the time of a handover."""
-
-
-
-class Fading(NamedTuple):
-    """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
-
-    command: Array
-    since: float
-
-
-@dataclass(frozen=True)
-class Loss:
+class Loss(NamedTuple):
     """The neighbor followed is out of sight."""
 
     towards: Array
@@ -116,45 +92,48 @@ class Loss:
     """Where the follower was then, or has moved on to along that since (3,), m: it retreats from
     there."""
     free: float = math.inf
-    """How far along ``towards`` nothing was in the way when it was seen last, m, counted from the
-    frame's origin."""
+    """Distance along ``towards`` in which nothing was in the way when it was seen last, m, counted
+    from the frame's origin."""
     approach: float = 0.0
-    """Speed at which it came nearer then, m/s, horizontally."""
+    """Horizontal speed at which it came nearer then, m/s."""
     height: float = math.inf
     """Its height then, m."""
-    side: Array = field(default_factory=lambda: np.zeros(3))
+    side: Array = np.zeros(3)
     """Horizontal unit vector (3,) across its path, to the follower's side of it."""
     name: str = ''
     """Its name; '' if unknown."""
 
     def retreated(self, position: Array) -> float:
-        """Return how far from the origin a position (3,), m, is, horizontally."""
+        """Return the horizontal distance of a position (3,) from the origin, m."""
         return math.dist(position[:2], self.origin[:2])
 
 
-@dataclass(frozen=True, eq=False)
-class Memory:
-    """What one step hands to the next; ``Memory()`` is the start."""
+NONE: Mapping[str, Any] = {}  # never changed
+
+
+class Memory(NamedTuple):
+    """The state that one step hands to the next; ``Memory()`` is the start."""
 
     now: float | None = None
     own: OwnState | None = None
-    neighbors: Mapping[str, Neighbor] = field(default_factory=dict)
-    flock: Mapping[str, Neighbor] = field(default_factory=dict)
-    """The neighbours at hand and those lost since: to keep clear of."""
-    ranged: Mapping[str, Neighbor] = field(default_factory=dict)
+    neighbors: Mapping[str, Neighbor] = NONE
+    flock: Mapping[str, Neighbor] = NONE
+    """The neighbors at hand and those lost since: to keep clear of."""
+    ranged: Mapping[str, Neighbor] = NONE
     """Those of which no more than the distance is known at present."""
-    motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
-    """How the flock has been moving."""
-    ties: Mapping[str, Tie] = field(default_factory=dict)
-    """How those at hand were attended to in the last step that followed somebody."""
+    motions: Mapping[str, SmoothedMotion] = NONE
+    """Motions of the flock."""
+    shares: Mapping[str, float] = NONE
+    """See ``Neighborhood``, in the last step that followed somebody; likewise ``edges``."""
+    edges: frozenset[str] = frozenset()
     faced: str = ''
-    """Whom it faced then."""
+    """The neighbor that it faced then."""
     leader: Neighbor | None = None
     """Last estimate of a leader that it has seen and faced."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
-    met: Mapping[str, Neighbor] = field(default_factory=dict)
-    """What was known last of everyone that could be followed since leaving IDLE."""
+    met: Mapping[str, Neighbor] = NONE
+    """Last estimate of each neighbor that could be followed since leaving IDLE."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
@@ -162,21 +141,21 @@ class Memory:
     given_up: bool = False
     """Whether it followed nobody for too long to command anything until it is engaged anew."""
     begun: float | None = None
-    """When it left IDLE, s."""
+    """Time at which it left IDLE, s."""
     home: Array | None = None
-    """Where it left IDLE (3,), m."""
+    """Place at which it left IDLE (3,), m."""
     altitude: Altitude | None = None
     """Altitude held since leaving IDLE."""
     yaw: float | None = None
     """Yaw last commanded since leaving IDLE, rad."""
     command: Array | None = None
-    """Acceleration last commanded, m/s^2; None where the last step commanded nothing."""
-    pending: Array = field(default_factory=lambda: np.zeros(3))
+    """Acceleration last commanded, m/s^2; None if the last step commanded nothing."""
+    pending: Array = np.zeros(3)
     """Velocity that has been commanded and not yet been flown (3,), m/s."""
     params: PlannerParams | None = None
     """Parameters with which the law was followed in the last step; None if it was not."""
-    fading: Fading | None = None
-    """Where the law's command is being faded in from."""
+    fading: tuple[Array, float] | None = None
+    """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
     occlusion: Occlusion | None = None
     """Whether the faced neighbor is occluded."""
     slow: bool = False
@@ -185,55 +164,48 @@ class Memory:
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
     def begun_afresh(self) -> Memory:
-        """Return what is known of the present, and nothing of a flight that is over."""
+        """Return it without anything of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
                       slow=self.slow, jumped=self.jumped, given_up=self.given_up)
 
-    def without_command(self) -> Memory:
-        """Return it after a step that commanded nothing."""
-        return replace(self, command=None, params=None, fading=None, pending=np.zeros(3))
 
-
-def ingest(memory: Memory, now: float, own: OwnState | None,
-           neighbors: Iterable[Neighbor],
+def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
-    """Return the memory with the new inputs that pass and without what grew old, and the rest."""
+    """Return the memory with the valid new inputs and without those too old, and the rest."""
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
         memory = Memory(given_up=memory.given_up)
     me, jumped = memory.own, memory.jumped
     if own is not None:
-        problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)
-        if problem:
+        if problem := implausible(own) or untimely(own.stamp, now, params.odom_timeout):
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif me is None or own.stamp >= me.stamp:
-            jump = 0.0 if me is None else math.dist(
-                own.position, at(me, own.stamp).position)
+            jump = 0.0 if me is None else math.dist(own.position, at(me, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
-                memory = replace(memory, neighbors={}, flock={}, ranged={}, met={}, altitude=None,
-                                 home=None, lost=None)
+                memory = memory._replace(neighbors={}, flock={}, ranged={}, met={}, altitude=None,
+                                         home=None, lost=None)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        problem = (implausible(n) or untimely(n.stamp, now, longest(n, params))
-                   or uncertain(n, params.max_position_std, params.max_velocity_std)
-                   or far(n, me))
         what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
-        if problem and problem.reason == TOO_UNCERTAIN and not far(n, me) and not n.heard and (
-                distance_known(n, me, params.max_position_std)) and (
-                jumped is None or n.stamp >= jumped):
+        vague = uncertain(n, params)
+        unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
+        outside, old = far(n, me), jumped is not None and n.stamp < jumped
+        n = n._replace(who=member(params.vehicles, n.name, n.heard))
+        if vague and not (unusable or outside or old or n.heard) and (
+                distance_known(n, me, params.max_position_std)):
             ranged[n.name] = n
-        elif problem:
+        elif problem := unusable or vague or outside:
             rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
-        elif jumped is not None and n.stamp < jumped:
+        elif old:
             rejected.append(Rejection(f'{what} older than the jump of odometry', n.name))
-        elif before is None or (before.heard and not n.heard):  # the eyes beat any word
+        elif before is None or (before.heard and not n.heard):  # sightings beat received states
             kept[n.name] = n
         elif before.heard == n.heard and n.stamp >= before.stamp:
             if (by := off(n, before)) > NEIGHBOR_JUMP:
@@ -242,8 +214,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                 kept[n.name] = n
     ranged = {name: n for name, n in ranged.items()
               if name not in kept or n.stamp > kept[name].stamp}
-    return replace(memory, now=now, own=me, neighbors=kept, ranged=ranged,
-                   jumped=jumped), tuple(rejected)
+    return memory._replace(now=now, own=me, neighbors=kept, ranged=ranged,
+                           jumped=jumped), tuple(rejected)
 
 
 def longest(n: Neighbor, params: PlannerParams) -> float:

@@ -22,8 +22,7 @@ follower's way, so the follower brakes. Nothing here reads a clock.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -38,41 +37,37 @@ MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitu
 WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
 
 
-@dataclass(frozen=True)
-class FieldOfView:
-    """What a camera sees, as angles from the body's forward axis, rad: it must look ahead."""
+class FieldOfView(NamedTuple):
+    """Field of view of a camera, as angles from the body's forward axis, rad."""
 
     left: float
     right: float
     up: float
     down: float
     heading: float = 0.0
-    """Of one of several: where its axis looks, from there anticlockwise, rad; angles from that."""
+    """Anticlockwise angle of its axis, if it is one of several, rad; the others count from it."""
 
     @classmethod
-    def of_camera(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike,
-                  several: bool = False, fisheye: bool = False) -> FieldOfView:
+    def of_camera(cls, info: Any, rpy: ArrayLike, several: bool = False) -> FieldOfView:
         """
         Return the field of view of a camera.
 
-        :param width: of the image, pixels; :param height: likewise.
-        :param k: the matrix K of its CameraInfo, (9,) or (3, 3).
+        :param info: its CameraInfo.
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
         :param several: it is one of several, which may look to any side.
-        :param fisheye: its lens is a fisheye (``equidistant``).
         :raises ValueError: if it does not look ahead, or to a side, or K is invalid.
         """
-        angles = np.asarray(rpy, dtype=float).tolist()
+        angles, width, height = np.asarray(rpy, dtype=float).tolist(), info.width, info.height
         mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
         heading = math.atan2(mounting[1, 0], mounting[0, 0]) if several else 0.0
-        fx, _, cx, _, fy, cy, *_ = np.asarray(k, dtype=float).ravel().tolist()
+        fx, _, cx, _, fy, cy, *_ = np.asarray(info.k, dtype=float).ravel().tolist()
         if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
             raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
                              'must all be above 0')
         # The middles of the four sides of the image: forward, left, up of the camera.
         sides = np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
                           [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
-        if fisheye:
+        if several and info.distortion_model == 'equidistant':
             sides[:, 1:] = np.tan(np.clip(sides[:, 1:], -WIDEST, WIDEST))
         ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
         sides = sides @ ahead.T
@@ -91,103 +86,45 @@ class FieldOfView:
         off = wrap_angle(bearing - self.heading)
         return max(off - self.left + edge, edge - self.right - off, 0.0)
 
-    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
-        """
-        Return whether a neighbour is in the image, by at least a margin, m, at its place.
 
-        :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
-        :param forward: own acceleration towards it, m/s^2, which tilts the camera.
-        """
-        x, y, z = offset.tolist()
-        distance = math.hypot(x, y)
-        if distance <= margin:
-            return False
-        edge = math.atan(margin / math.hypot(distance, z))
-        elevation = math.atan2(z, distance) + math.atan(forward / GRAVITY)
-        return self.outside(math.atan2(y, x) - yaw, edge) <= 0.0 and (
-            edge - self.down <= elevation <= self.up - edge)
+View = tuple[FieldOfView, ...]
+"""Of all cameras; () if unknown."""
 
-    @property
-    def all_round(self) -> bool:
-        """Return whether a neighbor that passes stays in view without a turn of the vehicle."""
+
+def visible(view: View, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+    """
+    Return whether a neighbor is in an image, by at least a margin, m, at its place.
+
+    :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
+    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    """
+    x, y, z = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance <= margin:
         return False
-
-    def vertical(self, bearing: float) -> tuple[float, float]:
-        """Return the angles up and down, rad, of the image that shows a bearing, rad, ENU."""
-        return self.up, self.down
-
-    def at(self, yaw: float) -> FieldOfView:
-        """Return what one whose yaw is that sees: of one camera, turned to it, no matter which."""
-        return self
-
-@dataclass(frozen=True)
-class FieldsOfView(FieldOfView):
-    """What several cameras see; its angles are the largest of any. ``yaw`` is one's own, rad."""
-
-    fields: tuple[FieldOfView, ...] = ()
-    yaw: float = 0.0
-
-    @classmethod
-    def together(cls, fields: tuple[FieldOfView, ...]) -> FieldsOfView:
-        """Return what cameras, at least one, see together."""
-        return cls(max(f.left for f in fields), max(f.right for f in fields),
-                   max(f.up for f in fields), max(f.down for f in fields), fields=fields)
-
-    def at(self, yaw: float) -> FieldsOfView:
-        """Return the same, seen by one whose yaw is ``yaw``, rad."""
-        return replace(self, yaw=yaw)
-
-    @property
-    def all_round(self) -> bool:
-        """Return whether a neighbour that goes round is always in one of the images."""
-        arcs = [(f.heading - f.right + MARGIN, f.heading + f.left - MARGIN) for f in self.fields]
-        # Where an image ends on the left there is another one.
-        return all(any((end - right) % math.tau < left - right for right, left in arcs)
-                   for _, end in arcs)
-
-    @property
-    def ahead(self) -> bool:
-        """Return whether what is straight ahead is in an image: there the neighbour is kept."""
-        return any(not f.outside(0.0) for f in self.fields)
-
-    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
-        """Return whether a neighbour is in the image of one of them; see FieldOfView."""
-        # Where two images meet a neighbour changes from one to the other.
-        return any(f.inside(offset, yaw, forward * math.cos(f.heading), margin)
-                   for f in self.fields)
-
-    def vertical(self, bearing: float) -> tuple[float, float]:
-        """Return the largest angles up and down, rad, of the images nearest to a bearing, rad."""
-        off = [(f.outside(bearing - self.yaw), f) for f in self.fields]
-        least = min(outside for outside, _ in off)
-        seeing = [f for outside, f in off if outside <= least]
-        return max(f.up for f in seeing), max(f.down for f in seeing)
+    edge = math.atan(margin / math.hypot(distance, z))
+    elevation, bearing = math.atan2(z, distance), math.atan2(y, x) - yaw
+    return any(f.outside(bearing, edge) <= 0.0 and edge - f.down <= elevation + math.atan(
+        forward * math.cos(f.heading) / GRAVITY) <= f.up - edge for f in view)
 
 
-class Outlook:
+def all_round(view: View) -> bool:
+    """Return whether a neighbor that goes round is always in an image, without a turn."""
+    arcs = [(f.heading - f.right + MARGIN, f.heading + f.left - MARGIN) for f in view]
+    # At the left end of each image there is another one.
+    return all(any((end - right) % math.tau < left - right for right, left in arcs)
+               for _, end in arcs)
+
+
+def vertical(view: View, bearing: float) -> tuple[float, float]:
     """
-    What a follower's cameras see, as their calibrations come.
+    Return the largest angles up and down, rad, of the images nearest to a bearing.
 
-    :param rpy: how the camera is mounted, rad; of several, each by its name.
+    :param bearing: from the forward axis, rad.
     """
-
-    def __init__(self, rpy: ArrayLike | Mapping[str, ArrayLike]) -> None:
-        self._rpy: Mapping[str, ArrayLike] = rpy if isinstance(rpy, Mapping) else {'': rpy}
-        self._fields: dict[str, FieldOfView] = {}
-
-    def of(self, message: Any, camera: str = '') -> FieldOfView:
-        """
-        Return what is seen, given a CameraInfo, by all whose calibrations came.
-
-        :raises ValueError: where nothing is kept in the sight of that camera.
-        """
-        field = FieldOfView.of_camera(
-            message.width, message.height, message.k, self._rpy[camera], bool(camera),
-            bool(camera) and message.distortion_model == 'equidistant')
-        if not camera:
-            return field
-        self._fields[camera] = field
-        return FieldsOfView.together(tuple(self._fields.values()))
+    off = [f.outside(bearing) for f in view]
+    seeing = [f for f, outside in zip(view, off) if outside <= min(off)]
+    return max(f.up for f in seeing), max(f.down for f in seeing)
 
 
 #: Consecutive processed images without the marker that make it occluded, and with it that end it.
@@ -207,8 +144,7 @@ class Occlusion(NamedTuple):
 
 
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
-              frames: Sequence[float], view: FieldOfView | None,
-              forward: float) -> Occlusion | None:
+              frames: Sequence[float], view: View, forward: float) -> Occlusion | None:
     """
     Return whether a neighbor is occluded, or None.
 
@@ -218,12 +154,12 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     :param frames: stamps of the newest processed images, s, in their order.
     :param forward: own acceleration ahead, m/s^2, which tilts the camera.
     """
-    if n is None or n.heard or view is None:
+    if n is None or n.heard or not view:
         return None if n is None else before
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:
         offset = at(n, me.stamp).position - me.position
-        lost = missed >= IMAGES and view.inside(offset, me.yaw, forward, INSIDE)
+        lost = missed >= IMAGES and visible(view, offset, me.yaw, forward, INSIDE)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:
         return Occlusion(n.stamp)

@@ -27,13 +27,12 @@ and ``v_max``. Altitude has priority over all horizontal motion.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
@@ -41,10 +40,8 @@ from flock_follower.planner.inputs import (
     Neighbor,
     OwnState,
     Rejection,
-    since_measured,
     too_slow,
     TRUSTED_TIME,
-    unflown,
 )
 from flock_follower.planner.limits import (
     brake,
@@ -55,45 +52,30 @@ from flock_follower.planner.limits import (
     REASONS,
     SEPARATION,
 )
-from flock_follower.planner.memory import (
-    Fading,
-    ingest,
-    Loss,
-    Memory,
-    NEIGHBOR_JUMP,
-    observed,
-    off,
-)
+from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, observed, off
 from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.neighborhood import (
-    followed,
     gathered,
-    Known,
     last_known,
-    LostLeader,
     Neighborhood,
+    NOBODY,
     nominal,
     reports,
-    role,
     sought,
     unknown,
 )
-from flock_follower.planner.params import AVOID, PHANTOM, PlannerParams, replace
-from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion
+from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.sight import Occlusion, occlusion, View
 from flock_follower.planner.vertical_yaw import (
     Altitude,
     facing,
     OVERHEAD,
-    scanning,
     searching,
     turning,
 )
 
-NOBODY = Neighborhood((), {}, None, None)
 
-
-@dataclass(frozen=True, eq=False)
-class Decision:
+class Decision(NamedTuple):
     """The outcome of one step."""
 
     state: State
@@ -102,24 +84,24 @@ class Decision:
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
-    """Commanded yaw, rad, ENU; None exactly where the acceleration is None."""
+    """Commanded yaw, rad, ENU; None exactly if the acceleration is None."""
     yaw_rate: float = 0.0
     """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
     away: Array | None = None
-    """Unit vector (3,) away from the neighbour that the command keeps clear of; None: of none."""
+    """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
     stamp: float | None = None
     """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
     limits: str = ''
     """The limits that bound: those of 'a_max', 'v_max', and of the guard's reasons, that did."""
     rejected: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
-    """What the neighbours do that is beyond the follower's means."""
+    """Motions of the neighbors that are beyond the follower's means."""
     lift: float = 0.0
     """The part of the vertical acceleration that only makes up for a wrong hover thrust, m/s^2."""
     edges: tuple[str, ...] = ()
-    """The neighbours attended to; others are only kept clear of."""
-    known: tuple[Known, ...] = ()
-    """Everyone at hand, in TRACK."""
+    """The neighbors at the ends of its edges; others are only kept clear of."""
+    known: tuple[Neighbor, ...] = ()
+    """All neighbors at hand, in TRACK, by name."""
 
     @property
     def guarded(self) -> bool:
@@ -141,9 +123,9 @@ class _Mode(NamedTuple):
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
-         estimates: Iterable[Neighbor], params: PlannerParams,
-         looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
-         ground: float | None = None, frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
+         estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
+         waiting: str = '', view: View = (), ground: float | None = None,
+         frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
     Return the memory for the next step, and the decision for the time ``now``, s.
 
@@ -153,7 +135,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param estimates: of neighbors since the last step; the newest of each name counts.
     :param looked: when the last image was processed, s; None if none was, which is no fault.
     :param waiting: why it may not command although engaged, or what disengaged it, or ''.
-    :param view: field of view of the cameras; None if unknown.
+    :param view: fields of view of the cameras; () if unknown.
     :param ground: height at arming, m, in the frame of the odometry.
     :param frames: stamps of the newest processed images, s, in their order.
     """
@@ -164,20 +146,20 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     if mode.state is State.IDLE:
         return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
     if memory.own is None or mode.silent:
-        return memory.without_command(), Decision(mode.state, mode.reason, rejected=rejected)
+        memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
+        return memory, Decision(mode.state, mode.reason, rejected=rejected)
 
     me, tracking = at(memory.own, now), mode.state is State.TRACK
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
-    coming = memory.pending * since_measured(now - memory.own.stamp, params)
-    neighbors = gathered(
-        memory.ties, memory.faced, me, [at(n, now) for n in memory.neighbors.values()], params,
-        elapsed) if tracking else NOBODY
-    lost_leader = sought(memory, neighbors, me, params) if tracking else None
-    flock = _flock(memory, now, tracking, lost_leader, params)
-    memory = replace(
-        memory, flock=flock,
-        motions=observed(memory.motions, flock.values()) if flock else memory.motions,
-        lost=_loss(memory, flock, me, tracking, lost_leader, params),
+    # They are flown with the time constant response_time: part of them since the measurement.
+    coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
+    neighbors = gathered(memory, me, [at(n, now) for n in memory.neighbors.values()], params,
+                         elapsed) if tracking else NOBODY
+    leader = sought(memory, neighbors, me, params) if tracking else None
+    flock = _flock(memory, now, tracking, leader, params)
+    memory = memory._replace(
+        flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
+        lost=_loss(memory, flock, me, tracking, leader, params),
         home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
         memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
@@ -186,32 +168,35 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - lift * params.period, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, lost_leader, params, elapsed)
+    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
     stamp = mode.newest if tracking else (
         memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
-    memory = replace(
-        memory, followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
-        ties=neighbors.ties, faced=neighbors.faced.name if neighbors.faced else memory.faced,
-        leader=last_known(memory, neighbors, params), looking=lost_leader is not None,
+    left = math.exp(-elapsed / params.response_time)
+    memory = memory._replace(
+        followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
+        shares=neighbors.shares, edges=neighbors.edges,
+        faced=neighbors.faced.name if neighbors.faced else memory.faced,
+        leader=last_known(memory, neighbors), looking=leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
-        pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
+        pending=left * memory.pending + (1.0 - left) * params.response_time * (
+            command.acceleration - lift))
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.away, stamp, command.reason, rejected,
-        _warnings(memory, mode, me, neighbors, lost_leader, params), float(lift[2]),
-        neighbors.edges, neighbors.known(params))
+        _warnings(memory, mode, me, neighbors, leader, params), float(lift[2]),
+        tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
-          looked: float | None, waiting: str, view: FieldOfView | None,
+          looked: float | None, waiting: str, view: View,
           frames: Sequence[float]) -> tuple[Memory, _Mode]:
     """Return the mode of this step, and the memory with what the mode rests on."""
     fault = odometry_fault(memory.own, now, params)
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
     occluded = None if fault else _occluded(memory, now, frames, view)
-    follow = [n for n in followed(memory.neighbors.values(), params)
-              if occluded is None or n.heard or n.name != memory.faced]
+    follow = [n for n in memory.neighbors.values() if n.who.role != AVOID and (
+        occluded is None or n.heard or n.name != memory.faced)]
     seen, heard = (max((n.stamp for n in follow if n.heard is received), default=None)
                    for received in (False, True))
     unfollowed = None if memory.followed is None else now - memory.followed
@@ -223,120 +208,16 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
         engaged, fault or late(memory.own, slow, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
         None if heard is None else now - heard, occluded is not None)
-    memory = replace(memory, slow=slow is not None)
+    memory = memory._replace(slow=slow is not None)
     if state is not State.IDLE:
-        memory = replace(memory, given_up=given_up, begun=begun, occlusion=occluded)
+        memory = memory._replace(given_up=given_up, begun=begun, occlusion=occluded)
     if state is State.TRACK:
-        memory = replace(memory, met={**memory.met, **{n.name: n for n in follow}})
+        memory = memory._replace(met={**memory.met, **{n.name: n for n in follow}})
     newest = heard if seen is None else seen
     return memory, _Mode(state, reason, bool(fault) or given_up, bool(blinded), newest)
 
 
-def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bool,
-              ground: float | None, coming: float, params: PlannerParams,
-              elapsed: float) -> tuple[Altitude, float]:
-    """Return the altitude to hold, and the vertical acceleration, m/s^2."""
-    jumped = memory.own is not None and memory.own.stamp == memory.jumped
-    # After a jump of the odometry its height at arming is of another frame.
-    altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
-    altitude = (altitude.meeting(neighbors.peers, params, elapsed) if neighbors.peers else
-                altitude.following(neighbors.level, params, elapsed))
-    if not params.guard:
-        return altitude.controlled(me, params, elapsed, coming=coming)
-    near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
-                          if me.stamp - n.stamp <= params.coast_timeout]
-    least, most = climb_range(near, me, params)
-    raised = altitude
-    if memory.lost is not None and not blinded:
-        raised = altitude.above(overflight(memory.lost, me.position, altitude.held, params))
-    controlled, vertical = raised.controlled(me, params, elapsed, least, most, coming)
-    # The climb lasts as long as the loss: the next one begins at the altitude held before.
-    return replace(controlled, held=altitude.held), vertical
-
-
-def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
-             view: FieldOfView | None, vertical: float, climb: float, velocity: Array,
-             params: PlannerParams) -> tuple[LimitedCommand, Fading | None]:
-    """
-    Return the nominal acceleration within all limits and bounds, and its fading.
-
-    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param velocity: own velocity when the command acts (3,), m/s.
-    """
-    fading = None
-    if mode.state is State.TRACK:
-        wanted, fading = nominal(memory, me, neighbors, params)
-    elif mode.state is State.COAST:
-        wanted = np.zeros(3)
-    else:
-        wanted = brake(velocity, params.strongest, params.brake_time_constant)
-    # Limits lowered in flight do not bind braking and keeping clear.
-    limits = (params.strongest, params.fastest) if mode.state in (State.SEARCH, State.HOLD) else (
-        params.a_max, params.v_max)
-    rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
-    if params.guard and (mode.state is not State.SEARCH or memory.flock):
-        command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # What is still to be flown is a guess: the measured velocity is limited, too.
-    if SEPARATION in command.reason or FENCE in command.reason:
-        limits = params.strongest, params.fastest
-    final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
-    if final.limited and final.reason not in command.reason:
-        command = command._replace(reason=', '.join(filter(None, [final.reason, command.reason])))
-    return command._replace(acceleration=final.acceleration), fading
-
-
-def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader | None,
-           params: PlannerParams) -> Mapping[str, Neighbor]:
-    """Return those at hand, and those lost that may still be near: to keep clear of."""
-    if tracking:
-        here = memory.neighbors
-    else:  # the vehicle always keeps clear of vehicles to avoid
-        here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
-    flock = {name: n for name, n in memory.flock.items()
-             if now - n.stamp <= params.coast_timeout
-             or not (tracking or role(n, params) == AVOID)
-             or (lost_leader and lost_leader.last.name == n.name)}
-    for n in here.values():
-        before = flock.get(n.name)
-        if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
-            # The old track may be a second drone: avoid it until coast_timeout.
-            name = f'{n.name}{PHANTOM}'
-            flock[name] = replace(before, name=name)
-    flock.update(here)
-    return flock
-
-
-def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
-          lost_leader: LostLeader | None, params: PlannerParams) -> Loss | None:
-    """Return the loss of the neighbor that it followed or looks for."""
-    if lost_leader and lost_leader.age <= params.coast_timeout:
-        lost_leader = None  # until then it is kept clear of on all sides, as any other
-    if (tracking and lost_leader is None) or memory.followed is None:
-        return None
-    if memory.lost is not None:
-        along = memory.lost.towards
-        ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
-        return replace(memory.lost, origin=memory.lost.origin + ahead * along)
-    towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [lost_leader.last] if lost_leader else followed(flock.values(), params)
-    if not near:
-        return Loss(towards, me.position)
-    n = min(near, key=lambda n: math.dist(n.position, me.position))
-    there = lost_leader.expected(params) if lost_leader else at(n, me.stamp)
-    x, y, _ = there.position - me.position
-    if math.hypot(x, y) > OVERHEAD:
-        towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    motion = memory.motions.get(n.name)
-    its = np.zeros(3) if n.heard or motion is None else motion.acceleration
-    soon = expected(n, its, TRUSTED_TIME, params)
-    approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
-    return Loss(towards, me.position, float(towards @ n.position), approach,
-                float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
-
-
-def _occluded(memory: Memory, now: float, frames: Sequence[float],
-              view: FieldOfView | None) -> Occlusion | None:
+def _occluded(memory: Memory, now: float, frames: Sequence[float], view: View) -> Occlusion | None:
     """Return whether the faced neighbor is occluded."""
     if memory.own is None or memory.followed is None:
         return None
@@ -347,12 +228,150 @@ def _occluded(memory: Memory, now: float, frames: Sequence[float],
     return occlusion(memory.occlusion, n, me, frames, view, float(forward))
 
 
+def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
+           params: PlannerParams) -> Mapping[str, Neighbor]:
+    """
+    Return those at hand, and those lost that may still be near: to keep clear of.
+
+    :param leader: the leader to look for.
+    """
+    # The vehicle always keeps clear of vehicles to avoid.
+    here = [n for n in memory.neighbors.values() if tracking or n.who.role == AVOID]
+    flock = {name: n for name, n in memory.flock.items()
+             if now - n.stamp <= params.coast_timeout
+             or not (tracking or n.who.role == AVOID) or (leader and leader.name == n.name)}
+    for n in here:
+        before = flock.get(n.name)
+        if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
+            # The old track may be a second drone: avoid it until coast_timeout.
+            name = f'{n.name} before'
+            flock[name] = before._replace(name=name)
+    flock.update({n.name: n for n in here})
+    return flock
+
+
+def _awaited(leader: Neighbor, now: float, params: PlannerParams) -> Neighbor:
+    """Return the leader to look for, predicted by at most ``coast_timeout``."""
+    return at(leader, leader.stamp + min(now - leader.stamp, params.coast_timeout))
+
+
+def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
+          leader: Neighbor | None, params: PlannerParams) -> Loss | None:
+    """Return the loss of the neighbor that it followed or looks for."""
+    if leader and me.stamp - leader.stamp <= params.coast_timeout:
+        leader = None  # until then it is kept clear of on all sides, as any other
+    if (tracking and leader is None) or memory.followed is None:
+        return None
+    if memory.lost is not None:
+        along = memory.lost.towards
+        ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
+        return memory.lost._replace(origin=memory.lost.origin + ahead * along)
+    towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
+    near = [leader] if leader else [n for n in flock.values() if n.who.role != AVOID]
+    if not near:
+        return Loss(towards, me.position)
+    n = min(near, key=lambda n: math.dist(n.position, me.position))
+    there = _awaited(leader, me.stamp, params) if leader else at(n, me.stamp)
+    x, y, _ = there.position - me.position
+    if math.hypot(x, y) > OVERHEAD:
+        towards = np.array([x, y, 0.0]) / math.hypot(x, y)
+    motion = memory.motions.get(n.name)
+    a = np.zeros(3) if n.heard or motion is None else motion.acceleration
+    soon = expected(n, a, TRUSTED_TIME, params)
+    approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
+    return Loss(towards, me.position, float(towards @ n.position), approach,
+                float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
+
+
+def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bool,
+              ground: float | None, coming: float, params: PlannerParams,
+              elapsed: float) -> tuple[Altitude, float]:
+    """Return the altitude to hold, and the vertical acceleration, m/s^2."""
+    jumped = memory.own is not None and memory.own.stamp == memory.jumped
+    # After a jump of the odometry its height at arming is of another frame.
+    altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
+    follows = params.altitude_mode == 'follow'
+    altitude = altitude.meeting(neighbors.peers, params, elapsed) if (
+        follows and neighbors.peers) else altitude.following(
+        neighbors.level if follows else None, params, elapsed)
+    if not params.guard:
+        return altitude.controlled(me, params, elapsed, coming=coming)
+    near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
+                               if me.stamp - n.stamp <= params.coast_timeout]
+    raised = altitude
+    if memory.lost is not None and not blinded:
+        above = overflight(memory.lost, me.position, altitude.held, params)
+        raised = altitude._replace(held=max(altitude.held, min(above, altitude.highest)))
+    controlled, vertical = raised.controlled(
+        me, params, elapsed, *climb_range(near, me, params), coming)
+    # The climb lasts as long as the loss: the next one begins at the altitude held before.
+    return controlled._replace(held=altitude.held), vertical
+
+
+def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood, view: View,
+             vertical: float, climb: float, velocity: Array, params: PlannerParams
+             ) -> tuple[LimitedCommand, tuple[Array, float] | None]:
+    """
+    Return the nominal acceleration within all limits and bounds, and its fading.
+
+    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
+    :param velocity: own velocity when the command acts (3,), m/s.
+    """
+    wanted: Array = np.zeros(3)
+    fading = None
+    # Limits lowered in flight do not bind braking and keeping clear.
+    strongest = params.strongest, params.fastest
+    limits = params.a_max, params.v_max
+    if mode.state is State.TRACK:
+        wanted, fading = nominal(memory, me, neighbors, params)
+    elif mode.state is not State.COAST:
+        limits = strongest
+        wanted = brake(velocity, params.strongest, params.brake_time_constant)
+    rising = max(abs(float(me.velocity[2])), abs(climb))
+    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
+    if params.guard and (mode.state is not State.SEARCH or memory.flock):
+        command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
+    # What is still to be flown is a guess: the measured velocity is limited, too.
+    if SEPARATION in command.reason or FENCE in command.reason:
+        limits = strongest
+    final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
+    reason = command.reason if final.reason in command.reason else ', '.join(
+        filter(None, [final.reason, command.reason]))
+    return command._replace(acceleration=final.acceleration, reason=reason), fading
+
+
+def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
+         leader: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
+    """Return the yaw to command."""
+    if params.yaw_mode != 'leader':
+        return last
+    since = -math.inf
+    towards: Array = np.zeros(3)
+    if leader is not None:
+        faced, since = _awaited(leader, me.stamp, params), me.stamp - leader.stamp
+        towards = faced.position - me.position
+    elif faced is None and state is State.SEARCH:
+        # It looks round, anticlockwise.
+        return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
+    elif faced is None:
+        if memory.lost is None:
+            return last
+        since, towards = me.stamp - (memory.followed or 0.0), memory.lost.towards
+        newest = max((n for n in memory.flock.values() if n.who.role != AVOID),
+                     key=lambda n: n.stamp, default=None)
+        faced = None if newest is None else at(newest, me.stamp)
+    since -= params.coast_timeout
+    if since <= 0.0 and faced is not None:
+        return facing(last, me, faced, params, elapsed)
+    return searching(last, math.atan2(towards[1], towards[0]), max(since, 0.0), params, elapsed)
+
+
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
-              lost_leader: LostLeader | None, params: PlannerParams) -> tuple[str, ...]:
+              leader: Neighbor | None, params: PlannerParams) -> tuple[str, ...]:
     """Return what is beyond the follower's means, and what it does about neighbors not seen."""
     if mode.state is State.TRACK:
-        search = '' if lost_leader is None else (
-            f'looks for {lost_leader.last.name}, not known of for {lost_leader.age:.1f} s')
+        search = '' if leader is None else (
+            f'looks for {leader.name}, not known of for {me.stamp - leader.stamp:.1f} s')
         return (*filter(None, [mode.reason, search]),
                 *reports(neighbors, memory.motions, me, params),
                 *unknown(memory, neighbors, me, params))
@@ -365,27 +384,3 @@ def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood
     return () if retreated < retreat(memory.lost, params) - 0.05 else (
         f'moved {retreated:.1f} m out of the way of a neighbor out of sight: no further without '
         'seeing',)
-
-
-def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
-         lost_leader: LostLeader | None, params: PlannerParams, elapsed: float) -> float:
-    """Return the yaw to command."""
-    if params.yaw_mode != 'leader':
-        return last
-    since = -math.inf
-    towards: Array = np.zeros(3)
-    if lost_leader is not None:
-        faced, since = lost_leader.expected(params), lost_leader.age - params.coast_timeout
-        towards = faced.position - me.position
-    elif faced is None and state is State.SEARCH:
-        return scanning(last, params, elapsed)
-    elif faced is None:
-        if memory.lost is None:
-            return last
-        since, towards = me.stamp - (memory.followed or 0.0) - params.coast_timeout, (
-            memory.lost.towards)
-        newest = max(followed(memory.flock.values(), params), key=lambda n: n.stamp, default=None)
-        faced = None if newest is None else at(newest, me.stamp)
-    if since <= 0.0 and faced is not None:
-        return facing(last, me, faced, params, elapsed)
-    return searching(last, math.atan2(towards[1], towards[0]), max(since, 0.0), params, elapsed)

@@ -36,12 +36,12 @@ The yaw turns the camera to the neighbor, after it, or round in search of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from flock_follower.geometry import wrap_angle
 from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
-from flock_follower.planner.params import PlannerParams, replace
+from flock_follower.planner.params import PlannerParams
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
 MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
@@ -60,8 +60,7 @@ RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
 CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
 
 
-@dataclass(frozen=True)
-class Altitude:
+class Altitude(NamedTuple):
     """The altitude to hold, m, and what holds it, between one step and the next."""
 
     held: float
@@ -74,7 +73,7 @@ class Altitude:
     """How fast ``held`` changes, m/s."""
     lift: float = 0.0
     """The integral, m/s^2."""
-    its_climb: float | None = None
+    neighbor_climb: float | None = None
     """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
 
     @classmethod
@@ -93,34 +92,29 @@ class Altitude:
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
         """Return it after following a neighbour, at the own time, for some time, s."""
-        if leader is None or params.altitude_mode != 'follow':
-            return replace(self, climb=0.0, its_climb=None)
+        if leader is None:
+            return self._replace(climb=0.0, neighbor_climb=None)
         wanted = float(leader.position[2]) + params.altitude_offset
         within = min(max(wanted, self.lowest), self.highest)
-        most, change = params.climb_rate, CLIMB_ACCELERATION * elapsed
-        its = self._its_climb(leader, elapsed)
-        significant = min(max(_significant(its), -most), most) if within == wanted else 0.0
+        most, faster = params.climb_rate, CLIMB_ACCELERATION * elapsed
+        its = float(leader.velocity[2])
+        if self.neighbor_climb is not None and leader.acceleration is not None:
+            # Smoothed, without lag if it accelerates.
+            change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
+                         TRUSTED_ACCELERATION) * elapsed
+            due = self.neighbor_climb + change
+            its = due + BELIEVED_CLIMB * (its - due)
+        significant = 0.0
+        if within == wanted:
+            share = (its / CLIMB_NOISE) ** 4  # of it that is more than its noise
+            significant = min(max(its * share / (1.0 + share), -most), most)
         ahead = self.held + significant * elapsed
         ahead = min(max(ahead + BELIEVED_HEIGHT * (within - ahead), self.lowest), self.highest)
         held = min(max(ahead, self.held - most * elapsed), self.held + most * elapsed)
         climb = min(max(significant + (ahead - held) / CATCH_UP_TIME, -most), most)
-        climb = min(max(climb, min(self.climb, significant) - change),
-                    max(self.climb, significant) + change)
-        return replace(self, held=held, climb=climb, its_climb=its)
-
-    def above(self, height: float) -> Altitude:
-        """Return it with an altitude to hold of at least a height, m, inside the bounds."""
-        return replace(self, held=max(self.held, min(height, self.highest)))
-
-    def _its_climb(self, leader: Neighbor, elapsed: float) -> float:
-        """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
-        velocity = float(leader.velocity[2])
-        if self.its_climb is None or leader.acceleration is None:
-            return velocity
-        change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
-                     TRUSTED_ACCELERATION) * elapsed
-        expected = self.its_climb + change
-        return expected + BELIEVED_CLIMB * (velocity - expected)
+        climb = min(max(climb, min(self.climb, significant) - faster),
+                    max(self.climb, significant) + faster)
+        return self._replace(held=held, climb=climb, neighbor_climb=its)
 
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
@@ -131,16 +125,14 @@ class Altitude:
         motion, and all would leave together. So slowly, and with half of their climb, the way
         round has a gain below 1 at every frequency, whoever is joined to whom.
         """
-        if params.altitude_mode != 'follow':
-            return replace(self, climb=0.0, its_climb=None)
         height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
             [n.position for n in others], [n.velocity for n in others]))
         most = params.climb_rate
         climb = min(max(MOVING_ALONG * along + MEETING * (height - self.held), -most), most)
         held = self.held + climb * elapsed
         within = min(max(held, self.lowest), self.highest)
-        return replace(self, held=within, climb=climb if within == held else 0.0,
-                       its_climb=None)
+        return self._replace(held=within, climb=climb if within == held else 0.0,
+                       neighbor_climb=None)
 
     def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
                    least: float = -math.inf, most: float = math.inf,
@@ -183,7 +175,7 @@ class Altitude:
             lift = self.lift
         lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
         total = min(max(vertical + self.lift, -params.a_max), params.a_max)
-        return replace(self, lift=lift if math.isfinite(lift) else 0.0), total
+        return self._replace(lift=lift if math.isfinite(lift) else 0.0), total
 
 
 def _stopped_within(gap: float, gain: float) -> float:
@@ -197,12 +189,6 @@ def _stopped_within(gap: float, gain: float) -> float:
     if gap > near:
         return math.sqrt(2.0 * BRAKING * (gap - 0.5 * near))
     return max(gain * gap, -RETURN_SPEED)
-
-
-def _significant(climb: float) -> float:
-    """Return a vertical velocity, m/s, without what its noise alone would show."""
-    share = (climb / CLIMB_NOISE) ** 4
-    return climb * share / (1.0 + share)
 
 
 YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75
@@ -223,11 +209,6 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
     passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
     ahead = YAW_LEAD * min(max(passing, -params.yaw_rate_max), params.yaw_rate_max)
     return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
-
-
-def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
-    """Return the yaw that turns on from the last one to look round, anticlockwise."""
-    return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
 
 
 def searching(last: float, lost: float, since: float, params: PlannerParams,

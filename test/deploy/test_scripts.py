@@ -44,10 +44,11 @@ def workspace(tmp_path: Path) -> Path:
 
 
 def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: Path) -> None:
-    ended = start(workspace, LAUNCH_FILE='t265.launch.py', LAUNCH_ARGUMENTS=(
-        "odom:=/vio/odom camera_rpy:='[0.0, 0.2, 0.0]'  bridge_prefix:='taskset -c 3'"))
+    ended = start(workspace, LAUNCH_FILE='camera.launch.py', LAUNCH_ARGUMENTS=(
+        "recipe:=t265 odom:=/vio/odom camera_rpy:='[0.0, 0.2, 0.0]'  "
+        "bridge_prefix:='taskset -c 3'"))
     assert ended.stdout.splitlines() == [
-        'launch', 'flock_follower', 't265.launch.py', 'odom:=/vio/odom',
+        'launch', 'flock_follower', 'camera.launch.py', 'recipe:=t265', 'odom:=/vio/odom',
         'camera_rpy:=[0.0, 0.2, 0.0]', 'bridge_prefix:=taskset -c 3'], ended.stderr
 
 

@@ -24,7 +24,7 @@ from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
 from flock_desk.scenarios.scenario_file import load
 
 pytestmark = pytest.mark.slow
-RUNS = range(20)
+RUNS = range(5)
 LEAST = 1.0  # m above the ground
 
 

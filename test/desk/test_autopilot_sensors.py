@@ -61,13 +61,6 @@ def test_the_barometer_is_streamed_once_it_is_asked_for(personality):
     assert np.diff([m.time_boot_ms for m in told]).tolist() == [50] * 399
 
 
-def test_unasked_px4_sends_the_barometer_at_one_hertz_and_arducopter_not():
-    flights = [Flight(personality) for personality in ('px4', 'arducopter')]
-    for flight in flights:
-        flight.fly(5.0)
-    assert [len(all_of(flight, 'SCALED_PRESSURE')) for flight in flights] == [5, 0]
-
-
 def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
     ask(flight, PRESSURE)
@@ -75,28 +68,6 @@ def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
     told = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
     assert told == pytest.approx(flight.vehicle.position[2], abs=0.01)
     assert told < 2.0 - 0.5  # it holds the height of the odometry, and sinks
-
-
-@PERSONALITIES
-def test_a_fault_shifts_the_barometer_for_a_time(personality):
-    flight = Flight(personality, barometer=EXACT, faults=[
-        Fault('barometer', 1.0, duration=1.0, offset=-1.5)])
-    ask(flight, PRESSURE)
-    shown = []
-    for _ in range(3):
-        flight.fly(0.9)
-        shown.append(height(flight.last('SCALED_PRESSURE')) - flight.vehicle.position[2])
-        flight.fly(0.1)
-    assert shown == pytest.approx([GROUND_AMSL, GROUND_AMSL - 1.5, GROUND_AMSL], abs=0.01)
-
-
-def test_the_barometer_is_repeatable_and_seeded():
-    def heights(seed):
-        flight = Flight(seed=seed)
-        ask(flight, PRESSURE)
-        flight.fly(1.0)
-        return [m.press_abs for m in all_of(flight, 'SCALED_PRESSURE')]
-    assert heights(1) == heights(1) != heights(2)
 
 
 def test_the_drift_is_slow_and_bounded():
@@ -149,9 +120,3 @@ def test_the_battery_can_be_drained_and_become_unknown(personality):
         shown.append((status.battery_remaining, status.voltage_battery))
     assert [remaining for remaining, _ in shown] == [100, 15, -1]
     assert shown[0][1] > 16500 and 14000 < shown[1][1] < 15000 and shown[2][1] == 65535
-
-
-def test_a_drained_battery_goes_on_draining():
-    flight = Flight(faults=[Fault('battery', 0.5, remaining=0.15)])
-    flight.fly(25.0)
-    assert flight.last('SYS_STATUS').battery_remaining in (12, 13)

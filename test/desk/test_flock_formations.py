@@ -31,7 +31,6 @@ from flock_desk.scenarios.flock import (
 from flock_desk.scenarios.scenario_file import (
     load,
     load_for_real_time,
-    names,
     parse,
     ScenarioError,
     with_flock,
@@ -50,7 +49,7 @@ flock:
 
 
 @pytest.mark.parametrize('formation', FORMATIONS)
-@pytest.mark.parametrize('count', [1, 2, 3, 4, 7, 12, 19])
+@pytest.mark.parametrize('count', [1, 4, 19])
 def test_in_a_formation_nobody_is_near_another_and_each_faces_whom_it_has_ahead(
         formation: str, count: int) -> None:
     found = places(Flock(count, formation, spacing=1.8))
@@ -62,14 +61,6 @@ def test_in_a_formation_nobody_is_near_another_and_each_faces_whom_it_has_ahead(
         assert 0 <= place.ahead < number
         ahead = apart[number, place.ahead] * np.array([np.cos(yaw), np.sin(yaw), 0.0])
         assert place.offset + ahead == pytest.approx(points[place.ahead], abs=1e-9)
-
-
-@pytest.mark.parametrize('formation', FORMATIONS)
-def test_four_followers_begin_in_the_band_of_whom_they_have_ahead(formation: str) -> None:
-    found = places(Flock(4, formation))
-    points = [np.zeros(3), *(place.offset for place in found)]
-    for place in found:
-        assert 1.0 < np.linalg.norm(place.offset - points[place.ahead]) < np.sqrt(8.0)
 
 
 def test_a_vehicle_between_hides_the_one_behind_it() -> None:
@@ -157,12 +148,6 @@ def test_a_flock_of_ones_own_is_read() -> None:
     assert flock == Flock(4, 'wedge', fails=FollowerFailure(2, 20.0))
     assert flock is not None
     assert flock.names == ['leader', *(f'follower_{k}' for k in range(1, 5))]
-
-
-def test_only_scenarios_of_flocks_have_one() -> None:
-    flocks = {name for name in names() if load(name).flock is not None}
-    assert {'flock_line', 'flock_wedge', 'flock_ring'} <= flocks
-    assert {name for name in flocks if not name.startswith('flock_')} == {'overhead'}
 
 
 def test_the_nodes_fly_no_flock_and_say_who_does() -> None:

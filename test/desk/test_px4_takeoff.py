@@ -42,7 +42,7 @@ def braking(deviation, seed=1):
     return lambda: setpoint(*(noise.gauss(0.0, deviation) / BRAKE_TIME for _ in range(3)))
 
 
-@pytest.mark.parametrize('deviation', [0.005, 0.02])
+@pytest.mark.parametrize('deviation', [0.005])
 def test_braking_by_noisy_odometry_on_the_ground_takes_px4_off(deviation):
     flight = armed_on_the_ground()
     flight.fly(1.0, braking(deviation))
@@ -60,7 +60,7 @@ def test_without_an_upward_setpoint_px4_idles_on_the_ground():
     assert flight.controller.landed_state == ON_GROUND and flight.controller.armed
 
 
-@pytest.mark.parametrize('up', [0.001, 0.02])
+@pytest.mark.parametrize('up', [0.001])
 def test_one_upward_setpoint_takes_px4_off(up):
     flight = armed_on_the_ground(thrust_error=0.35)  # 0.3 is lost on the ground
     flight.fly(0.2, setpoint(0.0, 0.0, up))
@@ -81,17 +81,6 @@ def test_an_upward_position_or_velocity_takes_px4_off_along_a_ramp(message):
     assert 0.0 < flight.controller._ramp < 1.0
     flight.fly(4.0, message)
     assert flight.vehicle.position[2] > 0.4
-
-
-def test_px4_waits_until_its_motors_have_spun_up():
-    flight = Flight(start='landed', parameters=NEVER_DISARM)
-    flight.vehicle.thrust_error = 0.3
-    flight.send(setpoint())
-    assert flight.mode('OFFBOARD') == [0, 0] and flight.arm() == [0]
-    flight.fly(0.9, setpoint(0.0, 0.0, 0.05))
-    assert flight.controller.landed_state == ON_GROUND
-    flight.fly(0.3, setpoint(0.0, 0.0, 0.05))
-    assert flight.controller.landed_state == IN_AIR
 
 
 def test_px4_that_touches_the_ground_in_offboard_does_not_count_as_landed():

@@ -40,21 +40,6 @@ def test_every_scenario_of_the_package_is_valid_and_says_what_it_is(name: str) -
     assert len(scenario.summary) > 10
 
 
-def test_the_issues_scenarios_are_there() -> None:
-    assert {'indoor', 'outdoor', 'hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward',
-            'shuttle', 'fast_leader', 'marker_lost_1s', 'marker_lost_5s', 'vio_lost', 'latency',
-            'duplicate_marker'
-            } <= set(names())
-
-
-@pytest.mark.parametrize('name', ['indoor', 'outdoor'])
-def test_the_papers_flights_have_its_parameters(name: str) -> None:
-    flight, start = load(name).flight, load(name).start
-    assert (flight.d0, flight.d1, flight.beta) == (1.0, 8.0, 0.25)
-    assert (flight.a_max, flight.v_max) == (2.5, 0.5)
-    assert start.distance == (1.5, 1.5)
-
-
 def test_a_file_of_ones_own_is_read_with_integers_and_single_values(tmp_path: Path) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text(GOOD + 'wind: {speed: 2}\nduration: 30\n')

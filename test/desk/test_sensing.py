@@ -19,58 +19,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flock_desk.scenarios.courses import wind_course
 from flock_desk.scenarios.scenario import Wind
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.sensing import (
     facing,
-    Filters,
     in_view,
     PerceptionNoise,
     relative_noise,
 )
 from flock_desk.sensors.vio import turned
-from flock_desk.vehicles.vehicle import Quadrotor
-from flock_follower.geometry import Transform
-from flock_follower.perception.neighbor_filter import NeighborFilter
-
-
-def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() -> None:
-    rng = np.random.default_rng(0)
-    many, one = Filters(2), NeighborFilter()
-    noise = PerceptionNoise()
-    compared = restarts = surprises = 0
-    for k in range(400):
-        t = k / 30.0
-        p = np.array([1.5 + np.sin(t), 2.0 * np.cos(0.5 * t), 0.1 * t])
-        covariance = relative_noise(np.tile(p, (2, 1)), noise)
-        measured = p + np.linalg.cholesky(covariance[0]) @ rng.standard_normal(3)
-        if k % 50 == 1 or 180 < k < 190:
-            measured = measured + 1.0  # outliers
-        if k % 50 in (20, 21):
-            measured = measured + 7.0 * np.sqrt(np.diag(covariance[0])) * [1.0, -1.0, 1.0]
-        seen = np.array([k % 7 != 3 and not 250 < k < 350, True])  # misses, and a gap of 3 s
-        used = many.update(t, np.tile(measured, (2, 1)), covariance, seen)
-        if not seen[0]:
-            assert not used[0]
-            continue
-        full = 1e-4 * np.eye(6)
-        full[:3, :3] = covariance[0]
-        outcome = one.update(t, Transform(np.eye(3), measured), np.zeros(3), full)
-        assert used[0] == (outcome.name in ('USED', 'SURPRISING', 'STARTED'))
-        surprises += outcome.name == 'SURPRISING'
-        restarts += outcome.name == 'STARTED'
-        state = one.predict(t)
-        if used[0] and state is not None:
-            compared += 1
-            assert many.position[0] == pytest.approx(state.position, abs=1e-4)
-            assert many.velocity[0] == pytest.approx(state.velocity, abs=1e-4)
-            assert many.position_covariance[0] == pytest.approx(
-                state.covariance[:3, :3], rel=1e-3, abs=1e-9)
-            assert many.velocity_covariance[0] == pytest.approx(
-                state.covariance[3:6, 3:6], rel=1e-3, abs=1e-6)
-    assert compared > 200
-    assert surprises >= 4  # the first of them, and one again to the same side
-    assert restarts == 2  # the first, and after the gap
 
 
 def test_noise_along_and_across_the_line_of_sight_is_what_the_figures_say() -> None:
@@ -105,81 +62,8 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
         np.exp(-1.0), abs=0.1)
 
 
-def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
-    rng = np.random.default_rng(2)
-    start = np.array([[0.0, 0.0, 1.5], [3.0, 1.0, 0.0], [0.0, 5.0, 2.0]])
-    together = Quadrotor(start, np.array([0.0, 1.0, -2.0]))
-    alone = [Quadrotor(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
-    for _ in range(300):
-        wanted, yaws = rng.uniform(-2.5, 4.0, (3, 3)), rng.uniform(-3.0, 3.0, 3)
-        wind = rng.uniform(-3.0, 3.0, (3, 3))
-        together.step(wanted, yaws, 0.01, wind=wind)
-        for vehicle, *inputs, air in zip(alone, wanted, yaws, wind):
-            vehicle.step(*inputs, 0.01, wind=air)
-    for k, vehicle in enumerate(alone):
-        assert together.position[k] == pytest.approx(vehicle.position, abs=1e-9)
-        assert together.rotation[k] == pytest.approx(vehicle.rotation, abs=1e-9)
-        assert together.yaw[k] == pytest.approx(vehicle.yaw, abs=1e-9)
-
-
-def test_wind_carries_a_level_vehicle_along() -> None:
-    vehicle = Quadrotor((0.0, 0.0, 5.0))
-    for _ in range(100):
-        vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
-    assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)
-
-
 def test_a_marker_is_seen_from_its_front_only():
     """It is on the leader's tail: from behind, and up to an angle from there."""
     offsets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.5, 2.0, 0.0], [-2.0, 0.0, 0.0]])
     assert facing(offsets, np.tile(np.eye(3), (4, 1, 1)), 1.22).tolist() == [
         True, True, False, False]
-
-
-def test_blur_widens_the_error_along_the_line_of_sight_only():
-    offset = np.array([[2.0, 0.0, 0.0]])
-    sharp, blurred = (relative_noise(offset, PerceptionNoise(), turning)[0]
-                      for turning in (0.0, np.array([0.5])))
-    assert blurred[0, 0] == pytest.approx((1.0 + 1.6 * 0.5) ** 2 * sharp[0, 0])
-    assert blurred[1, 1] == sharp[1, 1]
-
-
-def test_with_distances_too_they_are_the_neighbor_filter_number_for_number() -> None:
-    rng, noise = np.random.default_rng(3), PerceptionNoise()
-    many, one = Filters(3), NeighborFilter()
-    outcomes = []
-    for k in range(300):
-        t = k / 20.0
-        p, own = np.array([2.0 + 0.3 * np.sin(t), 0.2 * t, 0.1]), np.array([0.0, 0.1 * t, 0.0])
-        if k < 60:
-            covariance = relative_noise(np.tile(p, (3, 1)), noise)
-            measured = p + np.linalg.cholesky(covariance[0]) @ rng.standard_normal(3)
-            full = 1e-4 * np.eye(6)
-            full[:3, :3] = covariance[0]
-            many.update(t, np.tile(measured, (3, 1)), covariance, np.ones(3, dtype=bool))
-            one.update(t, Transform(np.eye(3), measured), np.zeros(3), full)
-            continue
-        distance = np.linalg.norm(p - own) + rng.normal(0.0, 0.1)
-        if k % 20 == 0 or 150 <= k < 160:
-            distance += 0.8  # detours; ten in a row are the truth from the sixth on
-        if k % 50 in (7, 8):
-            distance -= 0.7  # too short, twice
-        given = np.array([True, False, k % 2 == 0])
-        used = many.update_range(t, np.full(3, distance), np.tile(own, (3, 1)), np.full(3, 0.01),
-                                 given)
-        outcome = one.update_range(t, float(distance), own, 0.01)
-        outcomes.append(outcome.name)
-        assert used[0] == (outcome.name in ('USED', 'SURPRISING'))
-        assert not used[1]
-        state = one.newest
-        assert state is not None
-        assert many.position[0] == pytest.approx(state.position, abs=1e-4)
-        assert many.velocity[0] == pytest.approx(state.velocity, abs=1e-4)
-        assert many.acceleration[0] == pytest.approx(state.acceleration, abs=1e-4)
-        assert many.position_covariance[0] == pytest.approx(
-            state.covariance[:3, :3], rel=1e-3, abs=1e-9)
-        assert many.velocity_covariance[0] == pytest.approx(
-            state.covariance[3:6, 3:6], rel=1e-3, abs=1e-6)
-    assert {name: outcomes.count(name) >= 4 for name in set(outcomes)} == {
-        'USED': True, 'SURPRISING': True, 'OUTLIER': True}
-    assert many.stamp[1] == 59 / 20.0

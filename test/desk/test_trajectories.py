@@ -17,9 +17,8 @@
 import numpy as np
 import pytest
 
-from flock_desk.camera.scene import T_BODY_MARKER
 from flock_desk.scenarios.trajectories import fly, leader_course, STEP
-from flock_follower.geometry import quaternion_to_matrix, R_FLU_OPTICAL, Transform
+from flock_follower.geometry import quaternion_to_matrix
 
 DRAG, GRAVITY = 0.25, 9.81
 
@@ -29,30 +28,12 @@ def flight():
     return fly(20.0)
 
 
-def distances(flight):
-    return np.linalg.norm(flight.leader.positions - flight.follower.positions, axis=1)
-
-
 def test_the_leaders_velocity_and_acceleration_are_the_derivatives_of_its_course():
     times = np.arange(4001) * STEP
     p, v, a, heading = leader_course(times)
     np.testing.assert_allclose(np.gradient(p, STEP, axis=0)[1:-1], v[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.gradient(v, STEP, axis=0)[1:-1], a[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.arctan2(v[:, 1], v[:, 0]), heading, atol=1e-6)
-
-
-def test_the_leader_turns_and_accelerates_up_to_but_not_above_1_m_s2():
-    _, v, a, heading = leader_course(np.arange(12001) * STEP)
-    assert 0.85 < np.linalg.norm(a, axis=1).max() <= 1.0
-    assert np.ptp(heading) > np.deg2rad(60)
-    assert np.linalg.norm(v, axis=1).max() < 1.6
-
-
-def test_the_distance_varies_over_most_of_1_2_to_2_6_m_and_never_leaves_it(flight):
-    recorded = distances(flight)[:2401]
-    assert 1.2 < recorded.min() < 1.4
-    assert 2.5 < recorded.max() < 2.6
-    assert distances(flight).min() > 1.2 and distances(flight).max() < 2.6
 
 
 def test_the_followers_states_are_consistent_and_within_its_limits(flight):
@@ -83,26 +64,10 @@ def test_body_rates_turn_each_attitude_into_the_next(flight, name):
     np.testing.assert_allclose([turn[2, 1], turn[0, 2], turn[1, 0]], rates, atol=1e-5)
 
 
-def test_the_marker_stays_in_view_and_is_seen_at_up_to_40_degrees(flight):
-    T_body_optical = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
-    board = 0.12 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    angles = []
-    for time in np.arange(0.0, 20.0, 0.05):
-        seen = ((flight.follower.pose(time) @ T_body_optical).inverse()
-                @ flight.leader.pose(time) @ T_BODY_MARKER)
-        corners = seen.apply(board)
-        pixels = 611.0 * corners[:, :2] / corners[:, 2:] + [322.0, 237.0]
-        assert np.all((pixels > 40) & (pixels < [600, 440]))
-        cosine = -seen.rotation[:, 2] @ seen.translation / np.linalg.norm(seen.translation)
-        angles.append(np.degrees(np.arccos(cosine)))
-    assert 40 < max(angles) < 50
-    assert np.median(angles) > 15
-
-
 def test_a_track_passes_through_its_samples_and_is_smooth_between(flight):
     track = flight.follower
     for k in (0, 777, len(track.positions) - 1):
-        pose = track.pose(track.times[k])
+        pose = track.pose(k * STEP)
         np.testing.assert_allclose(pose.translation, track.positions[k], atol=1e-9)
         np.testing.assert_allclose(pose.rotation, quaternion_to_matrix(track.quaternions[k]),
                                    atol=1e-7)
@@ -114,16 +79,3 @@ def test_a_track_passes_through_its_samples_and_is_smooth_between(flight):
 def test_a_time_outside_the_track_is_refused(flight, time):
     with pytest.raises(ValueError, match=r'must be a number in \[0, 20\] s'):
         flight.leader.pose(time)
-
-
-@pytest.mark.parametrize('duration', [0.0, 1e4, float('nan')])
-def test_an_impossible_duration_is_refused(duration):
-    with pytest.raises(ValueError, match=r'must be a number in \[0.1, 600\] s'):
-        fly(duration)
-
-
-def test_a_seed_gives_the_same_flight_again_and_another_one_other_buffeting():
-    first, again, other = fly(0.5, 1), fly(0.5, 1), fly(0.5, 2)
-    np.testing.assert_array_equal(first.follower.quaternions, again.follower.quaternions)
-    np.testing.assert_array_equal(first.follower.positions, other.follower.positions)
-    assert np.any(first.follower.quaternions != other.follower.quaternions)

@@ -110,12 +110,8 @@ def test_own_words_that_come_back_are_no_impostors() -> None:
     (state(frame='/odom'), EPOCH, 'frame of a word is not unique'),
     (state(frame='a/b/odom'), EPOCH, 'frame of a word is not unique'),
     (state(child=''), EPOCH, 'word of a vehicle without a name'),
-    (state(position=(math.nan, 0, 0)), EPOCH, 'word not finite, or too far'),
-    (state(position=(1e7, 0, 0)), EPOCH, 'word not finite, or too far'),
     (state(velocity=(0, math.inf, 0)), EPOCH, 'word not finite, or too fast'),
     (state(velocity=(60, 0, 0)), EPOCH, 'word not finite, or too fast'),
-    (state()._replace(quaternion=np.zeros(4)), EPOCH, 'word without an attitude'),
-    (state()._replace(quaternion=np.array([3.0, 0, 0, 1])), EPOCH, 'word without an attitude'),
     (state(child=LEADER, variance=0.0), EPOCH, 'word without a covariance'),
     (state(child=LEADER, variance=-1.0), EPOCH, 'word without a covariance'),
     (state(child=LEADER, variance=math.nan), EPOCH, 'word without a covariance'),
@@ -129,13 +125,6 @@ def test_a_word_that_cannot_be_is_refused_by_its_reason(
     assert reasons(sharing) == [reason]
     sharing.take_word(state(), EPOCH + 10 * MS)
     assert reasons(sharing) == ['not aligned with f2']
-
-
-def test_the_refusal_of_a_clock_tells_by_how_much_it_is_ahead() -> None:
-    sharing = listening()
-    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
-    assert sharing.told() == [
-        ('word from the future', 'f2: by 0.045 s: its clock is ahead by that at least')]
 
 
 def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:

@@ -142,8 +142,7 @@ def test_a_follower_of_the_papers_leader_reproduces_the_reference() -> None:
     assert extremum(m.time, m.max_r2, least=False).value == pytest.approx(2.0049, abs=5e-5)
 
 
-@pytest.mark.parametrize('model', ['cucker_smale', 'cucker_dong', 'vicsek',
-                                   'vicsek_mean_velocity'])
+@pytest.mark.parametrize('model', ['cucker_smale', 'cucker_dong', 'vicsek'])
 def test_the_other_models_lose_the_papers_leader(model: Any) -> None:
     run = led(model)
     assert run.metrics.max_r2[-1] > 10.0 * PARAMS.d1
@@ -154,7 +153,7 @@ def test_the_other_models_lose_the_papers_leader(model: Any) -> None:
     assert np.abs(error).max() < (0.5 if 'vicsek' in model else 1e-9)
 
 
-@pytest.mark.parametrize('dt', [0.005, 0.01, 0.05, 0.1])
+@pytest.mark.parametrize('dt', [0.01, 0.1])
 def test_semi_implicit_euler_keeps_the_band_behind_the_leader(dt: float) -> None:
     run = led('flocking', integrator='semi_implicit', dt=dt, sample_period=dt)
     assert PARAMS.d0 < run.metrics.min_r2.min() and run.metrics.max_r2.max() < PARAMS.d1
@@ -180,29 +179,6 @@ def test_no_step_of_the_adaptive_integrator_straddles_a_break() -> None:
     assert [v[0, 0] for _, v in states] == pytest.approx([0.0, 0.5, 1.0, 0.0], abs=1e-14)
 
 
-def test_all_methods_of_the_sum_give_the_same_motion() -> None:
-    start = random_start(30, 3, FLIGHT_PARAMS, seed=0)
-    whole, blocked = (simulate(start.positions, start.velocities, FLIGHT_PARAMS, duration=0.5,
-                               model='cucker_smale', integrator='semi_implicit', method=method)
-                      for method in ('whole', 'blocked'))
-    assert blocked.positions == pytest.approx(whole.positions, abs=1e-12)
-
-
-def test_two_runs_are_the_same_to_the_bit() -> None:
-    start = random_start(12, 2, FLIGHT_PARAMS, seed=5)
-    runs = [simulate(start.positions, start.velocities, FLIGHT_PARAMS, duration=1.0,
-                     neighbors='graph', integrator='semi_implicit') for _ in range(2)]
-    assert runs[0].positions.tobytes() == runs[1].positions.tobytes()
-    again = random_start(12, 2, FLIGHT_PARAMS, seed=5)
-    assert again.positions.tobytes() == start.positions.tobytes()
-
-
-def test_progress_rises_from_zero_to_one() -> None:
-    shares: list[float] = []
-    leaderless('flocking', duration=0.1, progress=shares.append)
-    assert shares[0] == 0.0 and shares[-1] == 1.0 and shares == sorted(shares)
-
-
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_vicsek_turns_to_the_mean_heading_of_those_in_sight(dimension: int) -> None:
     x = np.zeros((3, dimension))
@@ -215,12 +191,6 @@ def test_vicsek_turns_to_the_mean_heading_of_those_in_sight(dimension: int) -> N
     assert second[:2] == pytest.approx(np.full(2, 1.0 / np.sqrt(2.0)))
     assert alone == pytest.approx(v[2])
     assert run.positions[-1] == pytest.approx(x + 0.1 * v)
-
-
-def test_agents_of_vicsek_with_opposite_headings_keep_theirs() -> None:
-    run = simulate([[0.0, 0.0], [0.5, 0.0]], [[1.0, 0.0], [-1.0, 0.0]], duration=0.1,
-                   model='vicsek')
-    assert run.velocities[-1].tolist() == [[1.0, 0.0], [-1.0, 0.0]]
 
 
 def test_metrics_of_a_known_flock() -> None:

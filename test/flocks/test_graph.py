@@ -26,8 +26,7 @@ import pytest
 
 from flock_desk.flocks import graph as flock_graph
 from flock_desk.flocks.agents import simulate
-from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph
-from flock_desk.flocks.neighbor_search import nearest
+from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph, nearest
 from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
@@ -77,13 +76,6 @@ def test_agents_without_an_edge_only_separate_and_not_beyond_the_band() -> None:
     assert of_first(np.sqrt(8.0)) == pytest.approx([0.0, 0.0])
 
 
-def test_psi_falls_without_a_step_from_one_to_zero() -> None:
-    r2 = np.linspace(0.5, 9.0, 1000)
-    psi = neighbor_graph.fade(r2, FLIGHT_PARAMS)
-    assert np.all(np.diff(psi) <= 0.0) and np.abs(np.diff(psi)).max() < 0.005
-    assert np.all(psi[r2 <= 2.96] == 1.0) and np.all(psi[r2 >= 8.0] == 0.0)
-
-
 def test_edges_begin_at_once_below_d1_and_later_below_four_fifths_of_the_band() -> None:
     def at(r2: float) -> Array:
         return np.array([[0.0, 0.0], [np.sqrt(r2), 0.0]])
@@ -106,13 +98,6 @@ def test_a_graph_knows_whether_it_is_connected(count: int, pairs: list[tuple[int
     assert Graph(count, edges(*pairs)).connected is connected
 
 
-def test_a_long_chain_is_connected_in_any_order_of_its_agents() -> None:
-    order = np.random.default_rng(0).permutation(500)
-    chain = np.sort(np.stack([order[:-1], order[1:]], axis=1), axis=1)
-    assert Graph(500, chain).connected
-    assert not Graph(500, np.delete(chain, 250, axis=0)).connected
-
-
 @given(FLOCKS, COUPLINGS)
 def test_accelerations_on_a_graph_sum_to_zero(start: Any, coupling: Any) -> None:
     x, v = start.positions, start.velocities
@@ -133,26 +118,6 @@ def test_the_graph_law_moves_and_turns_with_the_axes(start: Any, coupling: Any,
     assert moved == pytest.approx(u @ turn.T, rel=1e-8, abs=1e-8 * (1.0 + np.abs(u).max()))
 
 
-@given(FLOCKS, st.randoms(use_true_random=False))
-def test_the_graph_law_does_not_depend_on_the_order_of_agents(start: Any, random: Any) -> None:
-    x, v = start.positions, start.velocities
-    order = random.sample(range(len(x)), len(x))
-    u = flock_graph.accelerations(x, v, FLIGHT_PARAMS, initial_graph(x, FLIGHT_PARAMS))
-    x, v = x[order], v[order]
-    shuffled = flock_graph.accelerations(x, v, FLIGHT_PARAMS, initial_graph(x, FLIGHT_PARAMS))
-    assert shuffled == pytest.approx(u[order], rel=1e-9, abs=1e-9 * (1.0 + np.abs(u).max()))
-
-
-@given(FLOCKS)
-def test_more_near_pairs_than_needed_change_nothing(start: Any) -> None:
-    x, v = start.positions, start.velocities
-    graph = initial_graph(x, FLIGHT_PARAMS)
-    some = flock_graph.accelerations(x, v, FLIGHT_PARAMS, graph)
-    more = flock_graph.accelerations(x, v, FLIGHT_PARAMS, graph,
-                                     near=complete_graph(len(x)).edges)
-    assert more == pytest.approx(some, rel=1e-12, abs=1e-12 * (1.0 + np.abs(some).max()))
-
-
 @given(arrays(float, (3, 2), elements=st.floats(-0.08, 0.08)),
        arrays(float, (3, 2), elements=st.floats(-1.0, 1.0)))
 def test_among_few_near_agents_the_nearest_are_the_law(noise: Array, v: Array) -> None:
@@ -170,9 +135,8 @@ def test_the_nearest_are_attended_to_without_return() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('coupling', ['flock', 'pair'])
-@pytest.mark.parametrize('params', [PARAMS, FLIGHT_PARAMS], ids=['narrow', 'wide'])
-@pytest.mark.parametrize(('agents', 'dimension'), [(10, 2), (10, 3), (30, 3)])
+@pytest.mark.parametrize(('agents', 'dimension', 'params', 'coupling'), [
+    (10, 2, PARAMS, 'flock'), (10, 3, FLIGHT_PARAMS, 'pair'), (30, 3, FLIGHT_PARAMS, 'flock')])
 def test_random_flocks_stay_apart_and_connected(agents: int, dimension: int, params: Any,
                                                 coupling: Any) -> None:
     start = random_start(agents, dimension, params, seed=agents)
@@ -240,7 +204,7 @@ def drawn_flock(seed: int, count: int = 7) -> tuple[Array, Array]:
     return places + rng.uniform(-0.2, 0.2, (count, 3)), rng.normal(0.0, 0.3, (count, 3))
 
 
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 def test_one_agent_that_knows_all_commands_itself_what_the_law_of_the_flock_does(
         seed: int) -> None:
     params = flocking.FlockingParams(beta=0.25, d1=8.0)

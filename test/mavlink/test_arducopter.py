@@ -16,7 +16,7 @@
 
 import math
 
-from embedded_flight import ARDUCOPTER_MODES, Flight, MASK, MASK_YAW, setpoint
+from embedded_flight import Flight, MASK, MASK_YAW, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -35,20 +35,6 @@ def speed(flight):
     return float(np.linalg.norm(flight.vehicle.velocity))
 
 
-def test_it_introduces_itself_as_arducopter_with_its_modes():
-    flight = guided()
-    flight.fly(1.5)
-    heartbeat = flight.last('HEARTBEAT')
-    assert (heartbeat.autopilot, heartbeat.type, heartbeat.base_mode, heartbeat.system_status) == (
-        mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_QUADROTOR, 1 | 128,
-        mavlink.MAV_STATE_ACTIVE)
-    for name, (number, _) in ARDUCOPTER_MODES.items():
-        flight = Flight('arducopter', start='landed')
-        assert flight.mode(name) == [ACCEPTED]
-        flight.fly(1.1)
-        assert (flight.controller.mode, flight.last('HEARTBEAT').custom_mode) == (name, number)
-
-
 @pytest.mark.parametrize(('command', 'params', 'result', 'mode'), [
     (mavlink.MAV_CMD_DO_SET_MODE, (1.0, 99.0), FAILED, 'GUIDED'),
     (mavlink.MAV_CMD_DO_SET_MODE, (0.0, 5.0), DENIED, 'GUIDED'),
@@ -60,57 +46,6 @@ def test_it_introduces_itself_as_arducopter_with_its_modes():
 def test_commands_have_one_answer(command, params, result, mode):
     flight = guided()
     assert flight.command(command, *params) == [result] and flight.controller.mode == mode
-
-
-def test_from_the_ground_into_the_air_and_down_again():
-    flight = guided(start='landed')
-    assert flight.arm() == flight.take_off(2.0) == [ACCEPTED]
-    flight.fly(6.0)
-    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.15)
-    flight.fly(1.0, setpoint(1.0))
-    assert flight.vehicle.velocity[0] == pytest.approx(0.85, abs=0.2)
-    assert flight.mode('LAND') == [ACCEPTED]
-    flight.fly(8.0)
-    assert flight.vehicle.landed and not flight.controller.armed
-
-
-@pytest.mark.parametrize('spoil', [
-    lambda f: f.arm(False), lambda f: f.mode('LOITER'), lambda f: f.fly(0.1, setpoint(up=1.0))],
-    ids=['disarmed', 'LOITER', 'in GUIDED'])
-def test_take_off_wants_guided_armed_and_on_the_ground_and_is_cancelled_by_a_setpoint(spoil):
-    flight = guided(start='landed')
-    flight.arm()
-    spoil(flight)
-    possible = flight.controller.armed and flight.controller.mode == 'GUIDED'
-    assert flight.take_off(2.0) == [ACCEPTED if possible else FAILED]
-    flight.fly(3.0, setpoint(up=1.0))
-    assert flight.vehicle.landed and not flight.vehicle.position.any()
-    assert flight.take_off(-1.0) == flight.take_off(math.nan) == guided().take_off(5.0) == [FAILED]
-
-
-def test_armed_on_the_ground_it_disarms_by_itself():
-    flight = guided(start='landed')
-    flight.arm()
-    for seconds, armed in ((9.5, True), (1.0, False)):
-        flight.fly(seconds)
-        assert flight.controller.armed == armed
-
-
-def test_arming_waits_for_the_ekf_and_says_so():
-    flight = guided(start='landed', ready_after=2.0)
-    assert flight.arm() == [FAILED] and flight.texts() == ['Arm: Need Position Estimate']
-    flight.fly(1.9)
-    assert 'LOCAL_POSITION_NED' not in flight.kinds()
-    flight.mode('STABILIZE')
-    assert flight.arm() == [ACCEPTED]  # it needs no position
-    assert flight.mode('GUIDED') == [FAILED]
-    flight.arm(False)
-    flight.fly(0.5)
-    assert flight.mode('GUIDED') == flight.arm() == [ACCEPTED]
-    flight = Flight('arducopter', start='landed', arming_denial='Compass not calibrated')
-    flight.fly(15.1)
-    assert 'PreArm: Compass not calibrated' in flight.texts()
-    assert flight.arm() == [FAILED] and flight.texts()[-1] == 'Arm: Compass not calibrated'
 
 
 @pytest.mark.parametrize(('sent', 'seconds', 'reached'), [
@@ -151,20 +86,3 @@ def test_it_keeps_accelerating_for_guid_timeout_then_stops_and_stays_in_guided(
     assert flight.vehicle.velocity[0] == pytest.approx(before + timeout, abs=0.4)
     flight.fly(4.0)
     assert speed(flight) < 0.2 and flight.controller.mode == 'GUIDED'
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf])
-def test_nan_is_obeyed_and_brings_it_down(bad):
-    flight = guided(altitude=20.0)
-    flight.fly(0.1, setpoint(bad))
-    flight.fly(1.0, setpoint(0.0))
-    assert flight.vehicle.velocity[2] < -4.0
-
-
-@pytest.mark.parametrize('mode', ['LOITER', 'BRAKE'])
-def test_setpoints_count_in_guided_only(mode):
-    flight = guided()
-    flight.fly(2.0, setpoint(1.0))
-    assert flight.mode(mode) == [ACCEPTED]
-    flight.fly(5.0, setpoint(1.0))
-    assert speed(flight) < 0.1

@@ -31,13 +31,9 @@ def test_offboard_is_taken_over_from_hold_and_commands_are_flown_in_a_steady_str
     flight.planner, start = EAST, flight.now
     flight.cycles.clear()
     flight.fly(2.0)
-    last = flight.setpoints()[-1]
-    assert (last.type_mask, last.coordinate_frame, last.afx, last.afz) == (
-        0x83F, 1, pytest.approx(0.0, abs=1e-6), pytest.approx(0.0, abs=0.2))
     assert flight.vehicle.velocity[0] > 0.4 and abs(flight.vehicle.velocity[1]) < 1e-3
     assert len(flight.setpoints(start)) == 40
-    assert sum(m.get_type() == 'HEARTBEAT' for t, m in flight.received if t >= start) == 2
-    # Each of 20 commands tells its latency once.
+    # Each of 20 commands shows its latency once.
     first = [cycle.first for cycle in flight.cycles if cycle.first]
     assert [c.time - c.source_time for c in first] == pytest.approx([0.04] * 20)
 
@@ -76,33 +72,6 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
     flight.planner, flight.bridge.cycle = None, lambda now: None  # the bridge is gone
     flight.fly(3.0)
     assert flight.mode == flight.modes.hold and flight.speed < 0.05
-
-
-def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
-    flight = Flight()
-    flight.fly(2.0)
-    flight.bridge.stop(flight.now)
-    assert flight.bridge.stopped(flight.now)
-    flight.wire.written = []
-    flight.bridge.finish(flight.now)
-    assert flight.wire.written == []
-
-
-@pytest.mark.parametrize('kind', ['brake', 'none'])
-def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(kind, monkeypatch):
-    flight = Flight()
-    flight.engage()
-    decide = flight.bridge.gate.decide
-
-    def decide_so(*arguments):
-        setpoint, command = decide(*arguments)
-        return setpoint._replace(kind=kind), command
-    monkeypatch.setattr(flight.bridge.gate, 'decide', decide_so)
-    flight.bridge.stop(flight.now)
-    flight.wire.written = []
-    flight.bridge.finish(flight.now)
-    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.written]
-    assert sent.count('SET_POSITION_TARGET_LOCAL_NED') == (kind == 'brake')
 
 
 @BOTH

@@ -14,7 +14,6 @@
 
 """Whole flights by the bridge's requests, with and without GPS, over good lines and bad ones."""
 
-import math
 
 from bridge_flight import BOTH, EAST, Flight, NO_GPS, SlowWire
 from faulty_autopilot import Fault
@@ -46,25 +45,16 @@ def test_two_whole_flights_from_arming_to_landing_need_nothing_but_the_services(
         for what, arguments in (('arm', [True]), ('takeoff', [2.5]), ('offboard', [True])):
             outcome = flight.ask(what, *arguments, seconds=30.0)
             assert outcome.success, outcome
-        assert flight.mode == flight.modes.offboard in outcome.message
-        fastest, height = 0.0, flight.vehicle.position[2]
-        assert height == pytest.approx(2.5, abs=0.35)
-        for tenth in range(60):
-            # A planner closes the altitude.
-            up = 2.0 * (height - flight.vehicle.position[2]) - 2.5 * flight.vehicle.velocity[2]
-            angle = 0.05 * tenth
-            flight.planner = np.array([0.4 * math.cos(angle), 0.4 * math.sin(angle), up])
-            flight.fly(0.1)
-            fastest = max(fastest, flight.speed)
-        assert 0.3 < fastest < 0.55
-        assert flight.vehicle.position[2] == pytest.approx(height, abs=0.2)
+        assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.35)
+        flight.planner = EAST
+        flight.fly(2.0)
+        assert flight.mode == flight.modes.offboard and 0.3 < flight.speed < 0.55
         flight.planner = None
-        assert flight.ask('offboard', False).success and flight.mode == flight.modes.hold
-        outcome = flight.ask('land')
-        assert outcome.success and flight.modes.land in outcome.message
+        for what, arguments in (('offboard', [False]), ('land', [])):
+            assert flight.ask(what, *arguments).success
+        assert flight.mode == flight.modes.land
         flight.fly_until(lambda: not flight.controller.armed, 15.0)
-        assert flight.vehicle.landed and not flight.controller.armed
-        flight.fly(1.0)
+        assert flight.vehicle.landed
         assert flight.bridge.state(flight.now).startswith('INACTIVE')
 
 
@@ -80,35 +70,7 @@ def test_losses_garbage_and_duplicates_on_the_line_move_nothing(faults):
     assert len(faults) == 1 or flight.bridge.link.ignored['undecodable'] > 0
 
 
-def test_a_link_that_turns_late_is_judged_stale_and_the_vehicle_does_not_swing():
-    flight = Flight(source='autopilot', faults=[Fault('delay', 4.0, 60.0, 'sent', by=0.5)])
-    flight.odometry = False
-    speeds = []
-    flight.follow(0.0, (0.0, 2.5, 0.0))
-    for tenth in range(80):
-        flight.planner = None if tenth == 40 else flight.planner
-        flight.fly(0.1)
-        speeds.append(flight.vehicle.velocity[1])
-    assert 0.45 < max(speeds) < 0.6 and min(speeds) > -0.1 and abs(speeds[-1]) < 0.1
-    assert 'velocity from autopilot stale' in {c.setpoint.reason for c in flight.cycles}
-    assert flight.bridge.alive(flight.now)
-    assert flight.bridge.link.ignored['LOCAL_POSITION_NED too old'] > 50
-
-
 # Without GPS.
-
-@BOTH
-def test_without_gps_the_forwarded_odometry_carries_a_whole_flight(personality):
-    flight = forwarding(Flight(
-        personality, start='landed', **without_gps(personality, origin=(47.4, 8.5, 488.0))))
-    flight.fly(3.0)
-    for what, arguments in (('arm', [True]), ('takeoff', [2.5]), ('offboard', [True])):
-        outcome = flight.ask(what, *arguments, seconds=30.0)
-        assert outcome.success, outcome
-    flight.planner = EAST
-    flight.fly(3.0)
-    assert flight.mode == flight.modes.offboard and 0.4 < flight.vehicle.velocity[0] < 0.55
-    assert flight.bridge.forwarder.counters['gaps over 100 ms'] == 0
 
 
 def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer():
@@ -130,29 +92,20 @@ def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer()
 def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(personality, action):
     flight = forwarding(Flight(personality, **without_gps(personality, blind_action=action)))
     flight.follow(2.0)
-    lost = flight.now
-    flight.forwards = flight.odometry = False
+    lost, flight.forwards, flight.odometry = flight.now, False, False
     flight.fly(0.4)
     # It brakes before the autopilot notices.
     assert (flight.reason, flight.kinds(1)) == ('velocity from odom stale', {'brake'})
-    assert flight.mode == flight.modes.offboard
-    assert flight.bridge.forwarder.silence(flight.now) > 0.1
     flight.fly(0.6)
-    sent = [t for t, m in flight.received if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
-    assert 0.6 < max(sent) - lost < 0.85
-    kinds = [cycle.setpoint.kind for cycle in flight.cycles[-20:]]
-    # No later than this it no longer brakes on what the estimate has become without odometry.
-    assert 'brake' not in kinds[10:] and kinds[11] == 'level'
+    silent = max(t for t, m in flight.received if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED')
+    assert 0.6 < silent - lost < 0.85
     assert flight.bridge.state(flight.now) == 'INACTIVE: fell silent: velocity from odom stale'
     flight.forwards = flight.odometry = True  # it comes back: setpoints alone would end a failsafe
     flight.fly(2.0)
-    assert not flight.setpoints(max(sent) + 0.01)
-    assert flight.bridge.withheld().startswith('fell silent')
-    assert (flight.bridge.blind_landing is not None) == (action == 'land')
-    if action == 'land':
-        assert flight.bridge.blind_landing.outcome.success and flight.mode == flight.modes.land
-    else:
-        assert not flight.commands(mavlink.MAV_CMD_DO_SET_MODE, lost)
+    assert not flight.setpoints(silent + 0.01)
+    landing = flight.bridge.blind_landing
+    assert (landing is not None and landing.outcome.success) == (action == 'land')
+    assert action == 'land' or not flight.commands(mavlink.MAV_CMD_DO_SET_MODE, lost)
 
 
 def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():

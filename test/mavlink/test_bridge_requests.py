@@ -16,7 +16,7 @@
 
 import math
 
-from bridge_flight import BOTH, Flight, NO_GPS
+from bridge_flight import Flight, NO_GPS
 from faulty_autopilot import Fault
 from memory_line import MemoryLine
 import numpy as np
@@ -24,16 +24,13 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.commands import LAND, OFFBOARD, Outcome, Request, takeoff
+from flock_follower.mavlink.commands import OFFBOARD, Outcome, Request, takeoff
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.requests import explains_mode
-from flock_follower.mavlink.telemetry import Telemetry
 
 pytestmark = pytest.mark.slow
-KEY = bytes(range(32))
 
 
 def never(message):
@@ -159,10 +156,20 @@ def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, wo
     flight = Flight(personality, start='landed', arming_denial='the safety button')
     bridge = flight.bridge
     flight.fly(2.0)
-    assert not bridge.housekeeping.has_reasons(flight.now)
+    assert bridge.unready(flight.now) is None
     flight.fly(3.0)
-    assert bridge.housekeeping.has_reasons(flight.now)
-    assert bridge.texts.unready(flight.now, bridge.telemetry.status.mode) == words
+    assert bridge.unready(flight.now) == words
+
+
+def test_the_mode_that_arm_leaves_first_speaks_against_nothing():
+    """After a landing out of OFFBOARD, PX4 is in OFFBOARD again, which it cannot fly."""
+    flight = Flight()
+    flight.engage()
+    assert flight.ask('land').success
+    flight.fly_until(lambda: not flight.controller.armed, 30.0)
+    flight.fly(5.0)
+    assert flight.mode == 'OFFBOARD' and flight.bridge.unready(flight.now) == ''
+    assert flight.ask('arm', True).success
 
 
 @pytest.mark.parametrize(('system', 'component', 'believed'), [
@@ -179,22 +186,6 @@ def test_only_answers_to_us_are_believed(system, component, believed):
     assert (request.outcome is not None and 'denied' in request.outcome.message) == believed
 
 
-@BOTH
-def test_land_is_asked_for_until_it_shows_whatever_is_acknowledged(personality):
-    flight = Flight(personality, faults=[
-        Fault('drop', 5.0, 1.0, 'received', message='COMMAND_LONG')])
-    flight.engage()
-    flight.fly(5.1 - flight.now)
-    request = flight.bridge.requests.land(flight.now)
-    flight.fly(0.2)
-    # As if from an earlier mode command of ours.
-    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
-        mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_ACCEPTED, target_system=1,
-        target_component=191).pack(mavlink.MAVLink(None, 1, 1)))
-    flight.fly(2.0)
-    assert request.outcome.success and flight.mode == flight.modes.land
-
-
 # Which take-off explains that an armed vehicle is in its offboard mode.
 
 CLIMB, AIR, GROUND = takeoff(2.5, 0.0, None, 0.0), 2, 1
@@ -203,50 +194,24 @@ CLIMB, AIR, GROUND = takeoff(2.5, 0.0, None, 0.0), 2, 1
 @pytest.mark.parametrize(('firmware', 'goal', 'success', 'landed', 'explained'), [
     (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, None, None, GROUND, True),
     (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, None, AIR, True),
-    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, True, AIR, True),
     (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, False, AIR, False),
     (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, OFFBOARD, True, AIR, False),
-    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, LAND, None, AIR, False),
-    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, None, None, AIR, False),  # somebody else's GUIDED
     (mavlink.MAV_AUTOPILOT_PX4, CLIMB, True, GROUND, False)])
 def test_a_take_off_of_arducopter_explains_guided(firmware, goal, success, landed, explained):
-    telemetry, request = Telemetry(), goal and Request(goal, 0.0)
-    telemetry.update(mavlink.MAVLink_heartbeat_message(2, firmware, 129, 4, 4, 3), 1.0)
-    telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, landed), 1.0)
-    if request:
-        request.outcome = None if success is None else Outcome(success, '')
-    assert explains_mode(request, telemetry, 1.0) == explained
+    bridge = Bridge(Link(MemoryLine()), Gate(), now=0.0)
+    bridge.telemetry.update(mavlink.MAVLink_heartbeat_message(2, firmware, 129, 4, 4, 3), 1.0)
+    bridge.telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, landed), 1.0)
+    if goal is not None:
+        bridge.requests.newest = Request(goal, 0.0)
+        bridge.requests.newest.outcome = None if success is None else Outcome(success, '')
+    assert bridge.requests.takeoff_explains_mode(1.0) == explained
 
 
-class SigningWire(MemoryLine):
-    """The wire to a vehicle that signs; unsigned messages it hears or drops without a word."""
-
-    def __init__(self, hears):
-        super().__init__()
-        self.hears = hears
-        self.reader = mavlink.MAVLink(None)
-        self.signer = mavlink.MAVLink(None, 1, 1)
-        self.signer.signing = Signing(KEY, 1.8e9).state
-
-    def read(self):
-        for data, peer in super().read():
-            for message in self.reader.parse_buffer(data) or []:
-                yield bytes(message.pack(self.signer)), peer
-
-    def write(self, data):
-        if self.hears or data[2] & mavlink.MAVLINK_IFLAG_SIGNED:
-            super().write(data)
-        return True
-
-
-@pytest.mark.parametrize(('hears', 'signing', 'told'), [
-    (False, None, 'the autopilot signs its messages and answers none of ours'), (True, None, ''),
-    (False, Signing(KEY, 1.8e9), '')])
-def test_an_autopilot_that_signs_and_answers_nothing_is_told(hears, signing, told):
-    flight = Flight('arducopter', wire=SigningWire(hears))
-    flight.bridge = Bridge(Link(flight.wire, signing=signing), Gate(), now=0.0)
-    flight.fly(4.0)
-    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
-    flight.fly(3.0)
-    assert flight.bridge.alive(flight.now) and flight.bridge.link.autopilot_signs
-    assert flight.bridge.housekeeping.unreceived(flight.now).partition(':')[0] == told
+@pytest.mark.parametrize(('options', 'told'), [
+    (never('TIMESYNC'), 'the autopilot signs its messages and answers none of ours'), ({}, '')])
+def test_an_autopilot_that_signs_and_answers_nothing_is_reported(options, told):
+    flight = Flight('arducopter', **options)
+    for seconds, expected in ((4.0, ''), (3.0, told)):
+        flight.fly(seconds)
+        flight.bridge.link.autopilot_signs = True  # as its newest message showed
+        assert flight.bridge.housekeeping.unreceived(flight.now).partition(':')[0] == expected

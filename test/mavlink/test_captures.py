@@ -67,14 +67,6 @@ def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
         'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']
 
 
-def test_px4_is_back_in_offboard_after_landing_and_does_not_arm():
-    bridge = heard('px4_refusals')
-    assert bridge.telemetry.status == (False, 'OFFBOARD', 'uninit', True)
-    answers = [(round(t, 1), m.command, m.result) for t, m in decoded('px4_refusals')
-               if m.get_type() == 'COMMAND_ACK' and t > 96.0]
-    assert answers == [(97.0, 400, 1)]
-
-
 def flags(name, kind, end):
     """Return the changes of an estimator's flags, and s since the vision ended."""
     changes, known = [], None
@@ -113,21 +105,6 @@ def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
     assert [value for _, value in states] == [value for _, value in real]
     for (ours, _), (theirs, _) in zip(states[1:], real[1:]):
         assert ours == pytest.approx(theirs, abs=0.6)
-
-
-@pytest.mark.parametrize(('personality', 'name', 'end'), [
-    ('px4', 'px4_vision_lost', 63.63), ('arducopter', 'ardupilot_vision_lost', 41.06)])
-def test_the_position_goes_on_after_the_vision_and_drifts(personality, name, end):
-    real = [t - end for t, m in decoded(name) if m.get_type() == 'LOCAL_POSITION_NED']
-    assert max(real) > 7.0
-    flight = lost(personality, 7.0)
-    told = [m for m in flight.messages if m.get_type() == 'LOCAL_POSITION_NED']
-    assert len(told) == 350
-    error = abs(told[-1].vy - flight.vehicle.velocity[0])
-    if personality == 'px4':  # measured: 0.7 m/s after 7 s
-        assert error == pytest.approx(0.7, abs=0.2)
-    else:  # 0.1 m/s
-        assert error == pytest.approx(0.1, abs=0.05)
 
 
 def test_ardupilots_words_say_why():

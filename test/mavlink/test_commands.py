@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import commands
-from flock_follower.mavlink.commands import Request, result_words, Vehicle
+from flock_follower.mavlink.commands import Request, Vehicle
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
@@ -116,7 +116,10 @@ def test_a_request_ends_as_the_vehicle_shows_it(goal, options, script, outcome):
 def test_what_is_sent_and_how_often():
     assert play(commands.OFFBOARD, [(1.5, HOLD)], streaming_for=1.5)[1] == [(1.5, SET_MODE, 0)]
     assert commands.OFFBOARD.params(PX4) == (1.0, 6.0, 0.0)
-    assert [count for _, _, count in play(commands.HOLD, every(OFFBOARD, 3.6))[1]] == [0, 1, 2, 3]
+    for goal, *answers in ((commands.HOLD,), (commands.LAND, ACCEPTED)):
+        # What ends a flight is sent again though it was acknowledged.
+        sent = play(goal, every(OFFBOARD, 3.4, *answers))[1]
+        assert [count for _, _, count in sent] == [0, 1, 2, 3]
     assert play(CLIMB, [(0.0, HOLD)])[1] == [(0.0, TAKEOFF, 0)] and CLIMB.params(PX4)[6] == 490.0
     sent = play(CLIMB, [(0.0, STABILIZE, ACCEPTED), (0.5, GUIDED), (0.6, GUIDED)],
                 dialect=ARDUPILOT)[1]
@@ -174,8 +177,3 @@ def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_fai
     assert not success and message.startswith('takeoff not reached within 16.7 s')
     assert f'; land: HEARTBEAT shows {land}, armed' in message
 
-
-@pytest.mark.parametrize(('result', 'words'), [
-    (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
-def test_results_have_words(result, words):
-    assert result_words(result) == words

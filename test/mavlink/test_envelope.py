@@ -14,6 +14,7 @@
 
 """The safety envelope: whatever is commanded, the vehicle stays inside, or is handed over."""
 
+from dataclasses import fields
 import math
 
 from hypothesis import example, given, settings
@@ -149,24 +150,6 @@ def test_a_thrust_that_cannot_be_offset_is_handed_over(thrust_error):
     assert 'hover thrust is wrong' in vehicle.gate.thrust_error(vehicle.now)
 
 
-@pytest.mark.parametrize('climb_error', [0.3, -0.3])
-def test_odometry_that_errs_vertically_is_noticed_by_the_barometer(climb_error):
-    vehicle = FlownGate(GateLimits(), 5.0, noise=0.05)
-    vehicle.fly(6.0)
-
-    def hold(flown):  # by the odometry, which errs
-        return np.array([0.0, 0.0, 2.25 * (5.0 - flown.odometry[2]) - 3.0 * (
-            flown.velocity[2] + flown.climb_error)])
-    vehicle.commander = hold
-    vehicle.fly(2.0)
-    vehicle.climb_error, began = climb_error, vehicle.now
-    vehicle.fly(10.0)
-    noticed = next(k for k, kind in enumerate(vehicle.kinds) if kind == BRAKE
-                   and k * CYCLE * STEP > began) * CYCLE * STEP - began
-    assert noticed * abs(climb_error) < 2.0
-    assert vehicle.handed_over - began < noticed + 1.5
-
-
 @pytest.mark.parametrize(('place', 'reason'), [
     (Location(0.2), 'height 0.20 m: below height_min = 0.5 m'),
     (Location(10.2), 'height 10.20 m: above height_max = 10 m'),
@@ -217,3 +200,20 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
                            place=gate.place(now)))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
+
+
+def test_the_flight_defaults():
+    assert {field.name: getattr(GateLimits(), field.name) for field in fields(GateLimits)} == {
+        'a_max': 2.5, 'v_max': 0.5, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
+        'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
+        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0,
+        'height_min': 0.5, 'height_max': 10.0, 'radius_max': 50.0}
+    with pytest.raises(ValueError, match=r'height_max = 0.5: must be .* where height_min = 0.5'):
+        GateLimits(height_max=0.5)
+
+
+@pytest.mark.parametrize(('limits', 'tolerance'), [
+    (GateLimits(), 0.4), (GateLimits(v_max=2.0), 1.0),
+    (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7)])
+def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
+    assert limits.velocity_tolerance == tolerance

@@ -21,7 +21,6 @@ from faulty_autopilot import Fault
 import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,
     BATTERY_TIMEOUT,
@@ -80,49 +79,42 @@ def step(end, now, flies=True, pending=False, why='', action=HOLD, held='', stat
 
 def test_hold_is_requested_once_and_again_if_it_failed():
     end, lost = FlightEnd(), 'no command for 3 s'
-    assert step(end, 1.0, pending=True, why=lost) is None  # a request under way goes on
-    assert step(end, 1.1, why=lost) == (HOLD, lost)
-    assert step(end, 1.2, pending=True) is None
-    assert step(end, 1.3) is None  # it failed: again after a while, though the cause is gone
-    assert step(end, 1.2 + RETRY_PERIOD) == (HOLD, lost)
-    assert step(end, 5.0, flies=False, held='AUTO.LOITER', status=HELD) is None
+    assert step(end, 1.0, pending=True, why=lost) == ''  # a request under way goes on
+    assert step(end, 1.1, why=lost) == HOLD and end.why == lost
+    assert step(end, 1.2, pending=True) == ''
+    assert step(end, 1.3) == ''  # it failed: again after a while, though the cause is gone
+    assert step(end, 1.2 + RETRY_PERIOD) == HOLD
+    assert step(end, 5.0, flies=False, held='AUTO.LOITER', status=HELD) == ''
     end.begin()
-    assert end.why == '' and step(end, 99.0) is None
+    assert end.why == '' and step(end, 99.0) == ''
 
 
 def handed_over(status=HELD):
     end = FlightEnd()
     step(end, 1.0, why='lost', action=LAND)
-    assert step(end, 2.0, flies=False, held='AUTO.LOITER', status=status) is None
+    assert step(end, 2.0, flies=False, held='AUTO.LOITER', status=status) == ''
     return end
 
 
 def test_a_landing_follows_only_in_the_mode_that_was_requested():
     end = handed_over()
-    assert step(end, 1.9 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) is None
-    assert step(end, 2.0 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) == (LAND, 'lost')
-    assert step(end, 9.0, False, held='AUTO.LOITER', status=HELD) is None  # once
+    assert step(end, 1.9 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) == ''
+    assert step(end, 2.0 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) == LAND
+    assert step(end, 9.0, False, held='AUTO.LOITER', status=HELD) == ''  # once
 
 
 @pytest.mark.parametrize('status', [
     HELD._replace(mode='POSCTL'), OURS, HELD._replace(armed=False)])
 def test_any_other_mode_once_or_a_new_request_cancels_the_landing(status):
     later, asked = handed_over(), handed_over()
-    assert step(later, 2.5, False, held='AUTO.LOITER', status=status) is None
+    assert step(later, 2.5, False, held='AUTO.LOITER', status=status) == ''
     asked.begin()
     for end in (later, asked, handed_over(status)):
-        assert step(end, 99.0, False, held='AUTO.LOITER', status=HELD) is None
-
-
-@pytest.mark.parametrize(('name', 'value', 'valid'), [
-    ('battery_low', 1.1, r'a number in \[0, 1\]'), ('engage_timeout', 0.5, r'\[1, 3600\] s'),
-    ('battery_action', 'rtl', 'one of hold, land'), ('leader_lost_action', '', 'one of hold')])
-def test_a_wrong_parameter_is_named_with_its_value_and_range(name, value, valid):
-    with pytest.raises(ValueError, match=f'{name} = .*{valid}'):
-        EndParams(**{name: value})
+        assert step(end, 99.0, False, held='AUTO.LOITER', status=HELD) == ''
 
 
 # Whole flights against the embedded autopilots.
+
 
 @pytest.mark.slow
 @BOTH
@@ -185,23 +177,3 @@ def test_a_low_battery_ends_the_flight_and_bars_the_next(personality, action):
     wanted = flight.modes.hold if action == HOLD else flight.modes.land
     flight.fly_until(lambda: flight.mode == wanted, 20.0)
     assert flight.mode == wanted and 'battery_low' in flight.ask('offboard', True).message
-
-
-@pytest.mark.slow
-def test_a_barometer_that_jumps_brakes():
-    flight, reasons = Flight(faults=[Fault('barometer', 6.0, offset=2.0)]).follow(2.5), set()
-    for _ in range(40):
-        flight.fly(0.05)
-        reasons.add(flight.reason)
-    assert 'height jumped' in reasons and flight.bridge.gate.heights.steps == 1
-    assert flight.mode == 'OFFBOARD' and flight.vehicle.position[2] == pytest.approx(2.0, abs=0.3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('push', 'low', 'high'), [(-2.5, 0.2, 2.2), (2.5, 1.8, 4.3)])
-def test_a_commander_that_pushes_down_or_up_stays_within_the_heights(push, low, high):
-    flight, heights = Flight(limits=GateLimits(height_max=4.0)).follow(0.0, (0.0, 0.0, push)), []
-    for _ in range(80):
-        flight.fly(0.1)
-        heights.append(flight.vehicle.position[2])
-    assert low < min(heights) and max(heights) < high

@@ -71,26 +71,6 @@ def test_what_is_no_message_is_counted_and_costs_none(pieces, found, unused):
         'undecodable', 'unknown message'}
 
 
-def test_half_of_the_messages_spoilt_by_garbage_leaves_the_other_half():
-    lot = random.Random(1)
-    pieces, good = [], []
-    for n, data in enumerate(messages(400)):
-        if lot.random() < 0.5:
-            cut = lot.randrange(2, len(data))
-            data = data[:cut] + bytes(lot.choice([0xFD, 0xFE, lot.randrange(256)])
-                                      for _ in range(32)) + data[cut:]
-        else:
-            good.append(n)
-        pieces.append(data)
-    assert fed(framer(), *pieces)[0] == good
-
-
-def test_mavlink_1_is_understood():
-    codec = mavlink.MAVLink(None, 1, 1)
-    data = mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3).pack(codec, force_mavlink1=True)
-    assert framer().feed(bytes(data))[0][0].get_type() == 'HEARTBEAT'
-
-
 @pytest.mark.parametrize('pattern', [
     b'\xfd', b'\xfe', b'\xfe\x03', b'\xfd\x02\x00', b'\xfe\xff\xff', b'\xfe\x08\x08\x08\x08\x03'])
 def test_a_flood_of_false_starts_ends_soon(pattern):

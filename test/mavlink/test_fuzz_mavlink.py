@@ -16,19 +16,13 @@
 
 import math
 
-from embedded_flight import setpoint
 from fuzz_mavlink import (
     fuzz_autopilot,
     fuzz_bridge,
-    FuzzError,
-    judge_moment,
-    judge_setpoint,
 )
-from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 pytestmark = pytest.mark.slow
-AIR, GROUND = mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_ON_GROUND
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 
@@ -49,7 +43,6 @@ def test_with_signing_nothing_forged_is_heard():
     assert under_fire.link.ignored['wrong signature'] > 200
     autopilot = under_fire.traffic.autopilot
     assert under_fire.link.telemetry.status.mode in autopilot.controller.PROFILE.modes
-    assert under_fire.link.received > 200
     assert not under_fire.link.other_autopilots
 
 
@@ -57,23 +50,3 @@ def test_with_signing_nothing_forged_is_heard():
 def test_no_byte_stops_the_embedded_autopilot(personality):
     autopilot = fuzz_autopilot(100_000, 3, personality)
     assert all(math.isfinite(value) for value in autopilot.vehicle.position)
-
-
-@pytest.mark.parametrize(('bad', 'landed', 'was_active', 'since_takeover', 'complaint'), [
-    ({'east': math.nan}, AIR, True, math.inf, 'not finite'),
-    ({'yaw': math.inf}, AIR, True, math.inf, 'not finite'),
-    ({'east': 2.0, 'north': 2.0}, AIR, True, math.inf, 'above a_max'),
-    ({'mask': 0xDF8}, AIR, True, math.inf, 'unknown meaning'),
-    ({'frame': 8}, AIR, True, math.inf, 'unknown meaning'),
-    ({'up': 0.1}, GROUND, False, math.inf, 'upward setpoint on the ground'),
-    ({}, AIR, False, 9.9, r'setpoint 9\.90 s after a takeover')])
-def test_a_setpoint_that_must_not_leave_would_be_found(
-        bad, landed, was_active, since_takeover, complaint):
-    def judge(message, moment):
-        judge_setpoint(message, 2.5)
-        judge_moment(message, *moment)
-    with pytest.raises(FuzzError, match=complaint):
-        judge(setpoint(**bad), (landed, was_active, since_takeover))
-    for up, moment in ((0.0, (GROUND, False, 10.0)), (0.1, (GROUND, True, math.inf)),
-                       (0.1, (AIR, False, math.inf))):
-        judge(setpoint(2.4, up=up), moment)

@@ -15,17 +15,14 @@
 """On the ground no setpoint leaves, whatever the noise: upward ones start PX4's take-off."""
 
 from bridge_flight import BOTH, Flight
-from faulty_autopilot import Fault
 import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import (
-    EndRequested,
     OffboardRequested,
     Permission,
-    Phase,
 )
 from flock_follower.mavlink.setpoint_rules import NONE
 
@@ -59,22 +56,6 @@ def test_armed_on_the_ground_nothing_leaves_though_offboard_is_requested(persona
     assert max(abs(v) for v in flight.vehicle.position) < 0.01
 
 
-def test_a_landing_while_offboard_is_requested_ends_the_request(monkeypatch):
-    flight = Flight(faults=[  # it does not hear the request
-        Fault('drop', 1.4, 99.0, direction='received', message='COMMAND_LONG')])
-    flight.fly(1.5)
-    request = flight.bridge.requests.offboard(True, flight.now)
-    flight.fly(0.1)
-    assert flight.bridge.gate.permission.phase is Phase.READY and flight.setpoints()
-    monkeypatch.setattr(flight.bridge.telemetry, 'flying', lambda now: False)
-    flight.fly(1.2)
-    assert flight.bridge.state(flight.now).startswith('INACTIVE: on the ground')
-    assert not request.outcome.success
-    ended = flight.now
-    flight.fly(1.0)
-    assert not flight.setpoints(ended)
-
-
 def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
     flight = Flight().follow(1.0)
     monkeypatch.setattr(flight.bridge.telemetry, 'flying', lambda now: False)
@@ -99,14 +80,3 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
     assert ended.index(True) == 40 and all(ended[40:])
     assert control.permission == Permission(reason='on the ground')
 
-
-def test_what_is_given_back_without_having_been_flown_may_be_on_the_ground():
-    control = Gate(velocity_source='odom')
-    control.permit(OffboardRequested(0.0))
-    control.update_velocity('odom', np.array([0.0, 0.0, -0.1]), 0.0, 1.0)
-    control.see(OURS, 1.0, airborne=None)
-    control.permit(EndRequested('hold requested'))
-    for airborne in (None, False):
-        control.see(OURS, 1.0, airborne)
-        setpoint, _ = control.decide(1.0)
-        assert control.permission.phase is Phase.GIVING_BACK and setpoint.acceleration[2] <= 0.0

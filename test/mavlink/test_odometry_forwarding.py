@@ -21,10 +21,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import (
-    quaternion_from_rpy,
     quaternion_from_yaw,
-    quaternion_ned_frd_to_enu_flu,
-    quaternion_to_matrix,
 )
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.odometry_forwarding import (
@@ -63,16 +60,6 @@ def test_each_autopilot_gets_its_frame_and_the_same_numbers(dialect, frame):
     assert (message.rollspeed, message.pitchspeed, message.yawspeed) == (0.1, -0.2, -0.3)
     # The size that the link budget counts with.
     assert len(message.pack(mavlink.MAVLink(None, 1, 191))) <= 247
-
-
-def test_pose_and_velocity_survive_the_way_out_and_back():
-    q = quaternion_from_rpy(0.1, -0.2, 2.0)
-    message = encode_odometry(sample(quaternion=q, velocity=(0.3, -0.2, 0.1)), PX4, 0)
-    w, x, y, z = message.q
-    back = quaternion_ned_frd_to_enu_flu([x, y, z, w])
-    np.testing.assert_allclose(back, q, atol=1e-12)
-    flu = np.array([message.vx, -message.vy, -message.vz])
-    np.testing.assert_allclose(quaternion_to_matrix(back) @ flu, [0.3, -0.2, 0.1], atol=1e-12)
 
 
 def test_covariances_turn_with_their_axes():

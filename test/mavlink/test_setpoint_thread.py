@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The stream's thread: cycles on time, odometry at once, and errors that stop neither."""
+"""The stream's thread: cycles on time, actions at once, and errors that stop neither."""
 
 import socket
 import threading
@@ -25,49 +25,36 @@ from flock_follower.mavlink.setpoint_thread import SetpointThread, SHORTEST_PERI
 
 pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 5.0
+NEVER = 10 * DEADLINE
 
 
-class Transport:
-    """A datagram socket that may be gone, and be broken."""
+class Bridge:
+    """A bridge, its gate, link and transport in one, which notes its calls."""
 
     def __init__(self):
+        self.gate = self.link = self.transport = self
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.fault = ''
+        self.fault, self.broken, self.new_command = '', False, False
+        self.calls = []
 
     def fileno(self):
         return -1 if self.fault else self.ours.fileno()
 
-
-class Bridge:
-    """Notes who called it, and when."""
-
-    def __init__(self):
-        self.transport = self.link = Transport()
-        self.link.transport = self.transport
-        self.gate = self
-        self.new_command = False
-        self.calls = []
-        self.called = threading.Condition()
-        self.broken = False
-
-    def count(self, name):
-        return sum(called == name for called, _ in self.calls)
-
     def times(self, name):
         return [now for called, now in self.calls if called == name]
 
-    def note(self, name, now=0.0):
-        with self.called:
-            self.calls.append((name, now))
-            self.called.notify_all()
+    def wait_for(self, name, more):
+        count, end = len(self.times(name)) + more, time.monotonic() + DEADLINE
+        while len(self.times(name)) < count:
+            assert time.monotonic() < end, self.calls
+            time.sleep(0.001)
 
-    def wait_for(self, name, count=1):
-        with self.called:
-            assert self.called.wait_for(lambda: self.count(name) >= count, DEADLINE), self.calls
+    def note(self, name, now=0.0):
+        self.calls.append((name, now))
 
     def receive(self, now):
-        if not self.transport.fault:
-            self.transport.ours.recv(100)
+        if not self.fault:
+            self.ours.recv(100)
         self.note('receive', now)
         return ['a message']
 
@@ -95,22 +82,20 @@ class Bridge:
         self.note('finish', now)
 
 
-NEVER = 10 * DEADLINE
-
-
 @pytest.fixture
 def make_stream():
     streams = []
 
     def make(period):
-        """Return a bridge, its stream after the first cycle, and what that tells."""
+        """Return a bridge, its stream after the first cycle, and the arguments of callbacks."""
         bridge, told = Bridge(), {'messages': [], 'cycles': [], 'errors': []}
         stream = SetpointThread(
             bridge, period, lambda messages, now: told['messages'].append(messages),
             lambda cycle, now: told['cycles'].append((cycle, now)), told['errors'].append)
         streams.append(stream)
         stream.start()
-        bridge.wait_for('cycle')
+        while not told['cycles']:
+            time.sleep(0.001)
         return bridge, stream, told
     yield make
     for stream in streams:
@@ -119,48 +104,24 @@ def make_stream():
 
 def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream):
     bridge, stream, told = make_stream(NEVER)
-    bridge.transport.theirs.send(b'x')
-    bridge.wait_for('receive')
+    bridge.theirs.send(b'x')
+    bridge.wait_for('receive', 1)
     threads = []
     for action in (lambda: threads.append(threading.current_thread().name), lambda: 1 / 0,
                    lambda: bridge.note('forward')):
         assert stream.submit(action)
-    bridge.wait_for('forward')
+    time.sleep(2 * SHORTEST_PERIOD)
     assert threads == ['stream'] and told['messages'] == [['a message']]
     assert [str(error) for error in told['errors']] == ['division by zero']
-    time.sleep(2 * SHORTEST_PERIOD)
-    assert bridge.count('cycle') == 1  # without a new command
-    assert bridge.calls[-1][0] == 'odometry'  # what was submitted may have been that
-    assert [cycle for cycle, _ in told['cycles']] == ['a cycle']
-
-
-def test_what_was_submitted_before_a_cycle_is_done_before_it_though_that_is_late(make_stream):
-    bridge, stream, _ = make_stream(0.01)
-    receive, submitted = bridge.receive, threading.Event()
-
-    def slow_receive(now):
-        receive(now)
-        assert submitted.wait(DEADLINE)
-        time.sleep(0.03)  # so that a cycle is overdue
-    bridge.receive = slow_receive
-    bridge.transport.theirs.send(b'x')
-    bridge.wait_for('receive')
-    with bridge.called:
-        before = len(bridge.calls)
-    for _ in range(40):  # fewer than are run at once
-        stream.submit(lambda: None)
-    stream.submit(lambda: bridge.note('command'))
-    submitted.set()
-    bridge.wait_for('cycle', 1 + bridge.count('cycle'))
-    names = [name for name, _ in bridge.calls[before:]]
-    assert names.index('command') < names.index('cycle')
+    # No cycle without a new command; what was submitted may have been odometry.
+    assert len(bridge.times('cycle')) == 1 and bridge.calls[-1][0] == 'odometry'
 
 
 def test_a_new_command_is_sent_at_once_and_the_next_cycle_comes_a_period_later(make_stream):
     bridge, stream, _ = make_stream(0.5)
     time.sleep(0.1)
     stream.submit(bridge.take_command)
-    bridge.wait_for('cycle', 3)
+    bridge.wait_for('cycle', 2)
     taken, (_, early, regular) = bridge.times('command')[0], bridge.times('cycle')[:3]
     # Well before the regular one, which was due 0.4 s after the command.
     assert 0.0 <= early - taken < 0.2 and regular - early >= 0.5
@@ -173,65 +134,51 @@ def test_new_commands_make_at_most_one_setpoint_per_20_ms(make_stream, period):
     while time.monotonic() < end:
         stream.submit(bridge.take_command)
         time.sleep(0.001)
-    bridge.wait_for('cycle', 5)
     begun = bridge.times('cycle')
     # A shorter period is kept, and commands add no cycle to it.
-    assert len(begun) <= (begun[-1] - begun[0]) / min(period, SHORTEST_PERIOD) + 2
+    assert 5 <= len(begun) <= (begun[-1] - begun[0]) / min(period, SHORTEST_PERIOD) + 2
     assert period < SHORTEST_PERIOD or min(np.diff(begun)) >= SHORTEST_PERIOD
 
 
 def test_a_flood_of_actions_neither_starves_the_cycle_nor_grows_without_end(make_stream):
     bridge, stream, _ = make_stream(0.01)
-    stop, refused = threading.Event(), []
+    refused = threading.Event()
 
     def again():  # each brings two more, so that the inbox never gets empty
         time.sleep(1e-4)
         for _ in range(2):
-            if not stop.is_set() and not stream.submit(again):
-                refused.append(1)
+            if not refused.is_set() and not stream.submit(again):
+                refused.set()
     stream.submit(again)
-    end = time.monotonic() + DEADLINE
-    while not refused and time.monotonic() < end:
-        bridge.wait_for('cycle', 1 + bridge.count('cycle'))
-    bridge.wait_for('cycle', bridge.count('cycle') + 20)
-    stop.set()
-    assert refused
+    assert refused.wait(DEADLINE)
+    bridge.wait_for('cycle', 20)
 
 
 def test_every_action_that_was_taken_is_run_or_refused_at_the_end(make_stream):
     bridge, stream, _ = make_stream(0.01)
-    answers, finishing = [], threading.Event()
+    answers = []
 
     def submit(n):
-        return stream.submit(lambda: answers.append((n, 'run')),
-                             lambda: answers.append((n, 'refused')))
+        return stream.submit(lambda: answers.append(n), lambda: answers.append(-n))
 
     def finish(now):  # the last thing the thread does
         bridge.note('finish', now)
-        assert submit('late')
-        finishing.set()
+        assert submit(1)
     bridge.finish = finish
-    taken = [n for n in range(500) if submit(n)]
-    stopper = threading.Thread(target=stream.stop)
-    stopper.start()
-    while stopper.is_alive():
-        taken.append(len(taken) + 1000)
-        if not submit(taken[-1]):
-            taken.pop()
-    stopper.join(DEADLINE)
-    assert finishing.is_set() and ('late', 'refused') in answers
-    assert sorted(n for n, _ in answers if n != 'late') == taken
+    taken = [n for n in range(2, 500) if submit(n)]
+    stream.stop()
+    assert -1 in answers and sorted(map(abs, answers)) == [1, *taken]
     assert [name for name, _ in bridge.calls if name != 'odometry'][-2:] == ['stop', 'finish']
-    assert not submit('after the end')
+    assert not submit(501)
 
 
 def test_neither_a_device_that_is_away_nor_a_cycle_that_raises_ends_the_cycles(make_stream):
     bridge, _, told = make_stream(0.01)
-    bridge.transport.fault, bridge.broken = 'unplugged', True
+    bridge.fault, bridge.broken = 'unplugged', True
     bridge.wait_for('receive', 3)
-    bridge.wait_for('cycle', bridge.count('cycle') + 3)
+    bridge.wait_for('cycle', 3)
     bridge.broken = False
-    bridge.wait_for('cycle', bridge.count('cycle') + 3)
+    bridge.wait_for('cycle', 3)
     assert {str(error) for error in told['errors']} == {'broken'} and len(told['errors']) >= 2
-    # The end of a cycle is told, not its beginning.
+    # The callback gets the time of the end of the cycle, not of its beginning.
     assert told['cycles'][0][1] >= bridge.times('cycle')[0]

@@ -19,7 +19,6 @@ import pytest
 
 from flock_follower.mavlink.status_texts import (
     CHUNK_TIMEOUT,
-    MOST_CHUNKS,
     MOST_UNFINISHED,
     StatusTexts,
 )
@@ -65,27 +64,12 @@ def test_a_text_whose_end_is_lost_is_told_after_a_while():
     assert told(texts, 1.1 + CHUNK_TIMEOUT) == texts.since(1.0) == [A + '...']
 
 
-def test_a_series_of_chunks_that_never_ends_is_told_in_parts():
-    texts, heard = StatusTexts(), ''
-    for chunk in range(600):
-        texts.add(statustext(f'{chunk:050}', number=3, chunk=chunk % 256), chunk * 0.1)
-        new = told(texts, chunk * 0.1)
-        assert all(len(text) <= 50 * MOST_CHUNKS + 6 for text in new)
-        heard += ''.join(new)
-    assert all(f'{chunk:050}' in heard for chunk in range(600 - MOST_CHUNKS))
-
-
 def test_many_unfinished_texts_are_told_and_do_not_add_up():
     texts = StatusTexts()
     for number in range(1, 101):
         texts.add(statustext(f'{number:050}', number=number), 1.0)
     assert told(texts, 1.0) == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
     assert len(told(texts, 9.0)) == MOST_UNFINISHED and told(texts, 99.0) == []
-
-
-@pytest.mark.parametrize('text', ['', '\t', '\0'])
-def test_an_empty_text_is_no_error(text):
-    assert StatusTexts().add(statustext(text), 1.0) == ''
 
 
 def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():

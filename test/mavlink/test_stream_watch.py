@@ -61,11 +61,6 @@ def test_what_comes_well_below_the_rate_asked_for_comes_too_seldom(wanted, share
         0.0, min(period, 0.02), 20)} == {low}
 
 
-def test_a_fall_to_four_hertz_is_noticed_within_half_a_second():
-    arrivals = arrived(*np.arange(0.0, 10.0, 0.02), 10.2, 10.45)
-    assert [arrivals.too_seldom(POSITION, 50.0, now) for now in (10.25, 10.45)] == [False, True]
-
-
 def test_the_longest_pause_is_told_while_it_lasts_and_for_five_seconds():
     assert Arrivals().longest_pause(7.0) == 0.0 and arrived(3.0).longest_pause(7.0) == 4.0
     arrivals, told = Arrivals(), {}
@@ -118,9 +113,8 @@ def sets_rate(flight, message_id, hertz):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('personality', 'message_id', 'hertz', 'seconds'), [
-    ('px4', POSITION, 4.0, 1.0), ('arducopter', POSITION, 4.0, 1.0),
-    # What shows the pilot's switch.
-    ('px4', mavlink.MAVLINK_MSG_ID_CURRENT_MODE, 0.4, 5.0), ('arducopter', 0, 0.4, 5.0)])
+    # HEARTBEAT shows the pilot's switch.
+    ('px4', POSITION, 4.0, 1.0), ('arducopter', 0, 0.4, 5.0)])
 def test_all_is_asked_for_at_the_start_and_what_another_one_lowers_again(
         personality, message_id, hertz, seconds):
     flight = Flight(personality)
@@ -143,8 +137,6 @@ def test_all_is_asked_for_at_the_start_and_what_another_one_lowers_again(
     # Below half of what was asked for; none at all has other causes than the link.
     ({'message': 'LOCAL_POSITION_NED', 'share': 0.7},
      r'LOCAL_POSITION_NED comes at 1[2-8] Hz of 50 asked for'),
-    ({'message': 'LOCAL_POSITION_NED'}, ''),
-    ({'at': 6.5, 'duration': 0.2}, ''),
     ({'at': 6.5, 'duration': 0.6},
      r'nothing came from the autopilot for 0.6[0-3] s in the last 5 s')])
 def test_a_slow_link_is_told_after_seven_seconds(fault, told):
@@ -153,17 +145,6 @@ def test_a_slow_link_is_told_after_seven_seconds(fault, told):
     assert flight.bridge.housekeeping.too_slow(flight.now) == ''
     flight.fly(2.6)
     assert re.fullmatch(told, flight.bridge.housekeeping.too_slow(flight.now))
-
-
-@pytest.mark.slow
-def test_an_estimate_that_comes_late_and_slowly_is_asked_for_two_seconds_later():
-    flight = Flight(faults=[Fault('drop', 0.0, 20.0, 'sent', message='LOCAL_POSITION_NED')])
-    flight.fly(19.0)
-    assert 3 <= intervals(flight).count(POSITION) <= 6  # less and less often
-    since = flight.now
-    sets_rate(flight, POSITION, 4.0)
-    flight.fly(3.5)
-    assert intervals(flight, since) == [POSITION]
 
 
 @pytest.mark.slow

@@ -14,22 +14,18 @@
 
 """Lines that are lost and come back: a serial device, a TCP connection; and slow ones."""
 
-import errno
 import fcntl
 import os
 import select
 import socket
 import struct
 import termios
-import time
 
 import pytest
 
 from flock_follower.mavlink.transport import (
-    LONGEST_TCP_DELAY,
     open_transport,
     RETRY_PERIOD,
-    TCP_BUFFER,
 )
 
 TIOCGEXCL = 0x80045440  # of Linux; the termios module names it from Python 3.13 on
@@ -101,11 +97,6 @@ def test_a_serial_device_that_is_away_is_told_and_opened_when_it_comes(terminal,
     carries(transport, device.main)
 
 
-def test_a_file_that_is_no_serial_device_is_told():
-    transport = open_transport('/dev/null')
-    assert transport.fileno() == -1 and transport.fault == 'Inappropriate ioctl for device'
-
-
 def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(terminal):
     device, transport = terminal()
     sent, message = 0, bytes(range(256)) * 4
@@ -141,7 +132,7 @@ def exclusive(device):
     return struct.unpack('i', fcntl.ioctl(device.replica, TIOCGEXCL, b'\0' * 4))[0] == 1
 
 
-def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal, monkeypatch):
+def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
     device, first = terminal()
     _, second = terminal()
     assert first.capacity == 5760.0  # a tenth of its baud rate
@@ -152,12 +143,6 @@ def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal, mon
     assert not exclusive(device)
     second.reopen(1.0)
     carries(second, device.main)
-
-    def busy(*_):
-        raise OSError(errno.EBUSY, 'Device or resource busy')  # what all but root get
-    monkeypatch.setattr(os, 'open', busy)
-    first.reopen(2.0)
-    assert first.fault == 'another process uses /dev/ttyTEST'
 
 
 @pytest.fixture
@@ -190,9 +175,6 @@ def test_tcp_connects_when_somebody_listens_and_again_after_a_close(tcp):
     assert transport.fault == 'Connection refused' and not transport.write(b'x')
     peer = accept(1.0)
     carries(transport, peer.fileno())
-    with socket.socket(fileno=os.dup(transport.fileno())) as ours:
-        assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == LONGEST_TCP_DELAY
-        assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 4 * TCP_BUFFER
     peer.close()
     assert wait(transport) == b'' and transport.fault == 'closed by the other end'
     peer = accept(200.0)
@@ -205,16 +187,28 @@ def test_tcp_connects_when_somebody_listens_and_again_after_a_close(tcp):
 
 def test_odometry_is_held_back_while_tcp_waits_for_the_other_end(tcp):
     transport, accept = tcp
-    peer = accept(0.0)
+    accept(0.0)
     assert not transport.congested()
-    sent = received = 0
     while not transport.congested():  # nobody reads
-        assert transport.write(bytes(70)) and sent < 1e6
-        sent += 70
+        assert transport.write(bytes(70))
     assert transport.write(bytes(70))  # there is room for setpoints
-    while received < sent + 70:
-        received += len(peer.recv(4096))
-    end = time.monotonic() + 2.0
-    while transport.congested() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not transport.congested()
+
+
+@pytest.mark.parametrize(('url', 'reason'), [
+    ('14540', 'must be udpin:HOST:PORT'), ('udpin:127.0.0.1', 'must be udpin:HOST:PORT'),
+    ('tcp:127.0.0.1:0', r'port = \d+: must be an integer in \[1, 65535\]'),
+    ('udpin:127.0.0.1:70000', r'port = \d+: must be an integer in \[0, 65535\]'),
+    ('udpout:127.0.0.1:0', r'port = \d+: must be an integer in \[1, 65535\]'),
+    ('udpin:no.such.host.invalid:14540', 'unknown host no.such.host.invalid'),
+    ('/dev/ttyACM0,12345', 'baud rate must be one of 9600')])
+def test_a_bad_url_is_refused_with_the_valid_forms(url, reason):
+    with pytest.raises(ValueError, match=f'connection = .*{reason}'):
+        open_transport(url)
+
+
+def test_a_port_in_use_is_named():
+    first = open_transport('udpin:127.0.0.1:0')
+    url = f'udpin:127.0.0.1:{first.address[1]}'
+    with pytest.raises(OSError, match=f'connection = .{url}.: cannot listen there: Address'):
+        open_transport(url)
+    first.close()

@@ -12,10 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How the nodes answer on the command line: help, and what cannot be started."""
+"""The nodes on the command line: help, and what cannot be started."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 import os
 from pathlib import Path
@@ -24,37 +25,45 @@ import sys
 from unittest import mock
 
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from flock_desk.parameter_tables import NODES
 from flock_desk.program import PROGRAMS
+from flock_follower.bags.bag import typestore
+from flock_follower.bags.writer import BagWriter
 from flock_follower.nodes.support.node_parameters import ValidatedNode
-from flock_follower.nodes.support.usage import asked_for, misplaced
+from flock_follower.resources import resource
 
-ROOT = Path(__file__).resolve().parents[2]
 BRIDGE = 'connection:=udpin:127.0.0.1:0'
+SAMPLE = str(resource('bags/sample'))
 
 
 def run(node: str, *arguments: str) -> int:
-    """Run a node in this process, where it ends by itself; return its exit code."""
-    with mock.patch.dict(os.environ), mock.patch.object(  # some set how DDS is to talk
+    """Run a node that ends by itself in this process; return its exit code."""
+    named = [] if node in ('replay', 'flock_desk.recorder_node') else [node]
+    with mock.patch.dict(os.environ), mock.patch.object(  # some set the transport of DDS
             ValidatedNode, 'parameter_files', ()):
-        return int(import_module(PROGRAMS[node]).main([node, *arguments]))
+        return int(import_module(PROGRAMS.get(node, node)).main([*named, *arguments]))
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_help_tells_what_a_node_is_and_its_parameters_and_starts_nothing(
+def test_help_describes_a_node_and_its_parameters_and_starts_nothing(
         node: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(node, '--help') == 0
-    out, error = capsys.readouterr()
-    assert error == '' and f'\nUsage: {node} [--ros-args -p NAME:=VALUE' in out
-    for spec in import_module(PROGRAMS[node]).SPECS:
-        assert f'\n  {spec.name} ' in out
+    for option in ('--help', '-h'):
+        assert run(node, option) == 0
+        out, error = capsys.readouterr()
+        assert error == '' and f'\nUsage: {node} [--ros-args -p NAME:=VALUE' in out
+        for spec in import_module(PROGRAMS[node]).SPECS:
+            assert f'\n  {spec.name} ' in out
 
 
-def test_which_words_of_a_command_line_are_whose() -> None:
-    assert asked_for(['planner', '-h']) and asked_for(['--help', '--ros-args'])
-    assert not asked_for(['planner']) and not asked_for(['planner', '--ros-args', '-h'])
-    assert not misplaced(['replay', 'bags/sample', '--ros-args', '-p', 'rate:=2.0'])
+def refused(capfd: pytest.CaptureFixture[str], node: str, *arguments: str) -> str:
+    """Return the one line in which a node refuses to start."""
+    assert run(node, *arguments) == 1
+    lines = [line for line in capfd.readouterr().err.splitlines() if 'not played' not in line]
+    assert len(lines) == 1 and lines[0].startswith('error: '), lines
+    return lines[0]
 
 
 @pytest.mark.parametrize(('node', 'arguments', 'said'), [
@@ -73,24 +82,86 @@ def test_which_words_of_a_command_line_are_whose() -> None:
     ('flock', '--ros-args -p vehicle_name:=a/b', "vehicle_name = 'a/b'"),
     ('sharing', '--ros-args -p yaw_std_max:=4.0', 'yaw_std_max for node sharing: it was'),
     ('simulator', '--ros-args -p scenario:=outdor', "scenario = 'outdor': must be one of "),
+    ('simulator', '--ros-args -p scenari:=indoor', 'did you mean scenario?'),
     ('simulator', '--ros-args -p connection:=192.168.1.9:14540', 'must be a loopback address'),
     ('simulator', '--ros-args -p vehicle:=external -p leader_topic:=/ahead/truth/motion',
-     "only with vehicle = 'embedded'")])
-def test_what_cannot_be_started_is_one_line_and_exit_code_1(
-        node: str, arguments: str, said: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert run(node, *arguments.split()) == 1
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith('error: ') and said in line
+     "only with vehicle = 'embedded'"),
+    ('simulator', '--ros-args -p leader_truth_connection:=udpin:127.0.0.1:19411',
+     "only with vehicle = 'external'"),
+    ('simulator', '--ros-args -p vehicle:=external -p truth_connection:=udpin:127.0.0.1:0 '
+     '-p leader_truth_connection:=tcp:5772', "'tcp:5772': must be udpin:HOST:PORT"),
+    ('replay', '', 'no bag given; usage: replay BAG'),
+    ('replay', '/nowhere/none', 'none: no such bag'),
+    ('replay', f'{SAMPLE} --ros-args -p topics:=[vio]', 'holds no topic /vio, only /'),
+    ('replay', f'{SAMPLE} --ros-args -p wait_for:=[imu]', 'holds no topic /imu'),
+    ('replay', f'{SAMPLE} --ros-args -p start:=5000.0', 'start = 5000.0: must be a number in [0'),
+    ('replay', f'{SAMPLE} --ros-args -p remap:=[odom]', "remap = 'odom': must be from:=to"),
+    ('replay', f"{SAMPLE} --ros-args -p remap:=['odom:=camera_info']",
+     "/odom cannot be published as 'camera_info'"),
+    ('replay', f'{SAMPLE} --ros-args -p topics:=[camera_info] -p start:=0.5 -p duration:=0.001 '
+     '-p wait_for_subscribers:=0.0', 'no message of /camera_info between start'),
+    ('flock_desk.recorder_node', '{tmp} words:zoo_msgs/msg/Animal', "'zoo_msgs/msg/Animal': not"),
+    ('flock_desk.recorder_node', '{tmp} words:std_msgs/String', "type 'std_msgs/String': not"),
+    ('flock_desk.recorder_node', '{tmp} words:', "message type '': not installed, or not PACKAGE"),
+    ('flock_desk.recorder_node', '{tmp} words:std_msgs/msg/__name__', 'not installed, or not'),
+    ('flock_desk.recorder_node', '{tmp} two?words:std_msgs/msg/String', 'Invalid topic name: ')])
+def test_a_start_that_fails_is_one_line_and_exit_code_1(
+        node: str, arguments: str, said: str, tmp_path: Path,
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert said in refused(capfd, node, *arguments.format(tmp=tmp_path / 'bag').split())
+    assert not (tmp_path / 'bag').exists()
 
 
-def test_a_parameter_file_that_misses_the_node_ends_it_or_is_told(
+def animal_bag(path: Path) -> Path:
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg('float32 size', 'zoo_msgs/msg/Animal'))
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/animal', 'zoo_msgs/msg/Animal', typestore=types)
+        writer.write(connection, 10**18, b'\x00\x01\x00\x00\x00\x00\x80\x3f')
+    return path
+
+
+def cut_bag(path: Path) -> Path:
+    with BagWriter(path / 'whole') as writer:
+        for k in range(1000):
+            writer.write('word', 'std_msgs/msg/String', 10**18 + k,
+                         typestore().types['std_msgs/msg/String'](str(k)))
+    whole = next((path / 'whole').glob('*.mcap')).read_bytes()
+    (path / 'cut.mcap').write_bytes(whole[:len(whole) // 2])
+    return path / 'cut.mcap'
+
+
+def empty_bag(path: Path) -> Path:
+    with BagWriter(path):
+        pass
+    return path
+
+
+@pytest.mark.parametrize(('make', 'said'), [
+    (cut_bag, 'cut.mcap: incomplete (cut.mcap was'),
+    (empty_bag, 'bag: holds no message that can be read'),
+    (animal_bag, "topic /animal: message type 'zoo_msgs/msg/An")])
+def test_a_bag_that_cannot_be_played_is_one_line(
+        make: Callable[[Path], Path], said: str, tmp_path: Path,
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert said in refused(capfd, 'replay', str(make(tmp_path / 'bag')))
+
+
+def test_a_wrong_scenario_file_is_refused_with_file_line_and_the_valid_values(
+        tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text('summary: mine\nleader:\n  motion: loop\n')
+    assert f"{path}:3: leader.motion = 'loop': must be one of legs, circle" in refused(
+        capfd, 'simulator', '--ros-args', '-p', f'scenario:={path}')
+
+
+def test_a_parameter_file_that_misses_the_node_ends_it_or_is_a_warning(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('planners: {ros__parameters: {odom_twist_frame: odom}}')
-    assert run('planner', '--ros-args', '--params-file', str(path)) == 1
-    assert capfd.readouterr().err == (
+    assert refused(capfd, 'planner', '--ros-args', '--params-file', str(path)) == (
         f'error: {path}: holds parameters for /planners, but none for /planner: name the section '
-        '/planner, or /**/planner\n')
+        '/planner, or /**/planner')
     assert run('simulator', '--ros-args', '--params-file', str(path), '-p', 'seed:=-1') == 1
     assert 'holds no parameters for /simulator, only for /planners' in capfd.readouterr().err
 

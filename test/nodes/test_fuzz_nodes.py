@@ -15,20 +15,13 @@
 """Malformed messages into every callback of the nodes; ``make fuzz`` sends more."""
 
 import math
-import sys
 
-import cv2
-from fuzz_messages import MessageFuzzer
-from fuzz_nodes import fuzz_node, FuzzError, node_under_fire, NODES, silent_decoders
+from fuzz_nodes import fuzz_node, FuzzError, node_under_fire, NODES
 from nav_msgs.msg import Odometry
-import numpy as np
 import pytest
-from sensor_msgs.msg import CameraInfo, Image
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-# Overflows and NaN in the middle of a calculation are no errors where its result is thrown away.
-from flock_follower.perception.images import decode_compressed
-
+# Overflows and NaN in the middle of a calculation are no errors if its result is discarded.
 pytestmark = [pytest.mark.filterwarnings('ignore::RuntimeWarning'), pytest.mark.usefixtures('ros')]
 COUNT = 2000
 #: What shows that the messages reached the depths of a node, by what it published.
@@ -53,37 +46,6 @@ def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
                 break
             counters += fuzz_node(kind, COUNT, seed).node.diagnostics.counters
         assert min(counters[why] for why in wrong) > 0  # they reached the gate
-
-
-def test_broken_images_leave_nothing_in_the_log(capfd):
-    whole = bytearray(cv2.imencode('.png', np.arange(6400, dtype=np.uint8).reshape(80, 80))[1])
-    whole[100] ^= 0x55  # its checksum is wrong then
-    with pytest.raises(ValueError, match='cannot be decoded'):
-        decode_compressed(bytes(whole))
-    assert 'libpng' in capfd.readouterr().err
-    with silent_decoders(), pytest.raises(ValueError, match='cannot be decoded'):
-        decode_compressed(bytes(whole))
-    print('heard again', file=sys.stderr, flush=True)
-    assert capfd.readouterr().err == 'heard again\n'
-
-
-def test_equal_seeds_make_equal_messages():
-    makers = [MessageFuzzer(seed) for seed in (1, 1, 2)]
-    messages = [[str(maker.any_message(kind)) for kind in (Odometry, Image, CameraInfo)]
-                for maker in makers]
-    assert messages[0] == messages[1] != messages[2]
-
-
-def test_spoiling_changes_a_few_fields_and_reaches_every_depth():
-    fuzzer, changed = MessageFuzzer(3), set()
-    for _ in range(600):
-        message = fuzzer.spoil(MultiDOFJointTrajectory(points=[MultiDOFJointTrajectoryPoint()]))
-        clean = MultiDOFJointTrajectory(points=[MultiDOFJointTrajectoryPoint()])
-        changed |= {name for name in ('header', 'joint_names', 'points')
-                    if getattr(message, name) != getattr(clean, name)}
-        if message.points and message.points[0].time_from_start.sec:
-            changed.add('time_from_start')
-    assert changed == {'header', 'joint_names', 'points', 'time_from_start'}
 
 
 @pytest.mark.parametrize('kind', ['planner', 'relative_pose', 'sharing'])

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The layouts for Foxglove, RViz and PlotJuggler name only topics and fields that there are."""
+"""The layouts of viewers and the page about security name the topics and fields of the nodes."""
 
 from __future__ import annotations
 
@@ -38,25 +38,46 @@ from flock_follower.nodes.visualizer import Visualizer
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 #: What PlotJuggler makes of every quaternion.
 ANGLES = {'roll', 'pitch', 'yaw'}
+PAGE = CONFIG.parent / 'docs' / 'deploy.md'
+OF_ALL = {'rosout', 'parameter_events', 'diagnostics'}
+OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_type_description')
 
 
 @pytest.fixture(scope='module')
-def topics(ros: Any) -> Iterator[dict[str, str]]:
-    """Return the topics of the nodes, and their types."""
+def graph(ros: Any) -> Iterator[Node]:
+    """Return a node that sees all nodes of a follower."""
     nodes: list[Node] = [RelativePose(), Planner(), Visualizer(), MavlinkBridge(
         parameter_overrides=[Parameter('connection', value='udpin:127.0.0.1:0')])]
-    found: dict[str, str] = {}
     end = time.monotonic() + 10.0
-    while not {'/mavlink/odom', '/visualizer/markers', '/odom'} <= found.keys():
-        assert time.monotonic() < end, f'waited in vain; found {sorted(found)}'
-        for node in nodes:
-            for ask in (node.get_publisher_names_and_types_by_node,
-                        node.get_subscriber_names_and_types_by_node):
-                found |= {name: kinds[0] for name, kinds in ask(
-                    node.get_name(), node.get_namespace())}
-    yield found
+    while not {'/mavlink/odom', '/visualizer/markers', '/odom'} <= dict(
+            nodes[0].get_topic_names_and_types()).keys():
+        assert time.monotonic() < end, 'waited in vain'
+    yield nodes[0]
     for node in nodes:
         node.destroy_node()
+
+
+def inputs_and_outputs(graph: Node, node: str) -> list[list[tuple[str, list[str]]]]:
+    """Return what a node publishes, subscribes and serves, with the types."""
+    return [ask(node, '/') for ask in (
+        graph.get_publisher_names_and_types_by_node, graph.get_subscriber_names_and_types_by_node,
+        graph.get_service_names_and_types_by_node)]
+
+
+@pytest.fixture(scope='module')
+def topics(graph: Node) -> dict[str, str]:
+    """Return the topics of the nodes, and their types."""
+    return {name: kinds[0] for node in ('relative_pose', 'planner', 'visualizer', 'mavlink_bridge')
+            for found in inputs_and_outputs(graph, node)[:2] for name, kinds in found}
+
+
+def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(graph: Node) -> None:
+    rows = re.findall(r'^\| `(\w+)` \|(.*)\|(.*)\|(.*)\|$', PAGE.read_text(), re.M)
+    assert len(rows) == 3
+    for node, *cells in rows:
+        assert [set(re.findall('`(.+?)`', cell)) for cell in cells] == [
+            {name.lstrip('/') for name, _ in names if not name.endswith(OF_PARAMETERS)} - OF_ALL
+            for names in inputs_and_outputs(graph, node)]
 
 
 def named_topics() -> list[str]:

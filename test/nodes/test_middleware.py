@@ -19,6 +19,7 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
+from unittest import mock
 
 import pytest
 
@@ -28,6 +29,7 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
+from flock_follower.nodes import mavlink_bridge, planner
 from flock_follower.nodes.support.files_in_use import environments_of_processes
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
@@ -108,14 +110,14 @@ def test_fast_dds_opens_no_shared_memory(avoid, range_, shares):
     assert looked.stdout == f'{shares}\n', looked.stderr
 
 
-def test_the_bridge_and_the_planner_run_without():
-    for module in ('mavlink_bridge', 'planner'):
-        script = (f'from flock_follower.nodes import {module}\n'
-                  f'{module}.run = lambda *_: print(__import__("os").environ["{PROFILE}"])\n'
-                  f'{module}.main([])\n')
-        told = subprocess.run([sys.executable, '-c', script], text=True, capture_output=True,
-                              env={**os.environ, PROFILE: OWN}, timeout=30.0)
-        assert told.stdout.strip() == UDP, told.stderr
+@pytest.mark.parametrize('module', [mavlink_bridge, planner])
+def test_the_bridge_and_the_planner_run_without(module, monkeypatch):
+    profiles = []
+    monkeypatch.setattr(module, 'never_block_output', list, raising=False)
+    monkeypatch.setattr(module, 'run', lambda *_: profiles.append(os.environ[PROFILE]))
+    with mock.patch.dict(os.environ, {PROFILE: OWN}):
+        module.main([])
+    assert profiles == [UDP]
 
 
 def test_the_bridge_warns_where_it_must_share_memory(tmp_path):

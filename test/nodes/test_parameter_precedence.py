@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import time
+from unittest import mock
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
@@ -27,6 +28,7 @@ from rclpy.parameter import Parameter
 from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.support.node_parameters import ValidatedNode
 from flock_follower.parameters.files import files_in, given, read_parameters, TABLE
 from flock_follower.parameters.planner_table import SPECS
 
@@ -37,14 +39,14 @@ ALL = '/**:\n  ros__parameters:\n    v_max: 0.7\n'
 
 def flown(*arguments: str) -> float:
     rclpy.init(args=['planner', '--ros-args', *arguments])
-    Planner.parameter_files = files_in(['planner', '--ros-args', *arguments])
-    node = Planner()
+    with mock.patch.object(ValidatedNode, 'parameter_files',
+                           files_in(['planner', '--ros-args', *arguments])):
+        node = Planner()
     try:
         return float(node.get_parameter('v_max').value)
     finally:
         node.destroy_node()
         rclpy.shutdown()
-        Planner.parameter_files = ()
 
 
 @pytest.mark.parametrize(('text', 'value'), [(OWN + ALL, 0.7), (ALL + OWN, 0.9)])

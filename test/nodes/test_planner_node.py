@@ -174,6 +174,14 @@ def acceleration(command: MultiDOFJointTrajectory) -> Any:
     return to_array(command.points[0].accelerations[0].linear)
 
 
+def test_silence_of_neighbors_is_a_fault_only_if_no_image_is_processed(rig: Rig) -> None:
+    rig.run(0.1)
+    time.sleep(2.1)
+    rig.run(0.1, None)  # images without a leader in them
+    assert not rig.reports('no /neighbors for ')
+    assert rig.reports('no /neighbors for ', ahead=2.6)
+
+
 def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(rig: Rig) -> None:
     message = rig.engage()
     assert message.startswith('engaged; waiting for: the bridge: INACTIVE')
@@ -223,11 +231,6 @@ def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -
     moving = {'velocity': (0.3, 0.0, 0.0), 'yaw': np.pi / 2}  # forward is north
     north = (0.0, 2.0, 2.0)
     rig.fly(leader=north, **moving)
-    rig.run(0.44, None, **moving)  # a leader that is covered is another matter
-    rig.wait(lambda: rig.reports('HOLD: neighbor occluded'))
-    rig.run(0.3, north, **moving)
-    rig.wait(lambda: rig.states[-1] == 'TRACK')
-    rig.run(0.04, north, **moving)
     rig.run(0.18, None, **moving, looking=False)
     assert rig.states[-1] == 'TRACK'
     rig.commands.clear()
@@ -239,27 +242,11 @@ def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -
     rig.wait(lambda: rig.states[-1] == 'TRACK')
 
 
-def test_lost_odometry_stops_the_commands_and_a_clock_that_jumps_back_begins_anew(
-        rig: Rig) -> None:
-    rig.fly()
-    rig.run(0.5, velocity=None)
-    rig.wait(lambda: rig.states[-1] == 'HOLD')
-    rig.commands.clear()
-    rig.run(0.3, velocity=None)
-    assert rig.commands == []
-    rig.wait(lambda: rig.reports('HOLD: odometry too old'))
-    rig.now -= 30 * 10 ** 9
-    rig.run(0.2, None)
-    rig.wait(lambda: rig.states[-1] == 'SEARCH')
-    rig.run(0.3)
-    rig.wait(lambda: rig.states[-1] == 'TRACK')
-
-
 def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> None:
     counters, values = rig.planner.diagnostics.counters, rig.planner.diagnostics.values
     rig.run(0.1, frame='map')
     assert counters['invalid neighbors'] > 0
-    rig.planner._loop.view = None
+    rig.planner._loop.view = ()
     rig.send('camera_info', CameraInfo(width=640, height=480, k=np.zeros(9)))
     rig.fly()
     assert counters['invalid camera_info'] == 1

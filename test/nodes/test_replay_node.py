@@ -33,8 +33,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage
@@ -201,23 +199,18 @@ def test_start_duration_and_topics_choose_what_is_played_latched_messages_includ
     assert deserialize_message(ear.heard['/mode'][0], String).data == 'hover'
 
 
-def test_the_rate_is_kept(bag, replay):
-    began = time.monotonic()
-    assert finish(replay(bag, *playing('rate:=0.5', wait=0.0)))[0] == 0
-    assert time.monotonic() - began >= 0.98 / 0.5
-
-
-def test_namespace_remap_parameter_and_ros_remap_apply(bag, ear, replay):
-    for topic in ('/drone/vio', '/drone/camera', '/mode_out'):
-        ear.listen(Header if topic == '/drone/vio' else CompressedImage if 'camera' in topic
-                   else String, topic)
+def test_namespace_and_remaps_apply_and_the_clock_can_be_left_out(bag, ear, replay):
+    for kind, topic in ((Header, '/drone/vio'), (CompressedImage, '/drone/camera'),
+                        (String, '/mode_out'), (Clock, '/clock')):
+        ear.listen(kind, topic)
     process = replay(bag, *playing(
-        "remap:=['/stamps:=vio', 'image_raw/compressed:=camera']", 'rate:=10.0'),
+        "remap:=['/stamps:=vio', 'image_raw/compressed:=camera']", 'rate:=10.0', 'clock:=false'),
         '-r', '__ns:=/drone', '-r', '/drone/mode:=/mode_out')
     assert ear.wait(lambda: process.poll() is not None)
     assert finish(process)[0] == 0
     assert ear.wait(lambda: [len(ear.heard[t]) for t in (
         '/drone/vio', '/drone/camera', '/mode_out')] == [COUNT, 10, 1])
+    assert not ear.heard['/clock']
 
 
 def test_pause_stops_messages_and_clock_and_resume_goes_on(bag, ear, replay):
@@ -243,8 +236,7 @@ def test_pause_stops_messages_and_clock_and_resume_goes_on(bag, ear, replay):
     assert ear.wait(lambda: len(ear.heard['/stamps']) == COUNT)
 
 
-@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
-def test_a_loop_steps_the_clock_back_tells_its_state_and_ends_when_asked(bag, ear, replay, stop):
+def test_a_loop_steps_the_clock_back_reports_its_state_and_ends_on_sigterm(bag, ear, replay):
     ear.listen(Header, '/stamps')
     ear.listen(Clock, '/clock')
     ear.listen(DiagnosticArray, '/diagnostics')
@@ -269,7 +261,8 @@ def test_a_loop_steps_the_clock_back_tells_its_state_and_ends_when_asked(bag, ea
     assert int(values['loops']) >= 2
     assert int(values['published /stamps']) >= 2 * COUNT
     assert 0.0 <= float(values['position_s']) <= 1.0
-    process.send_signal(stop)
+    assert float(values['lateness_p99_ms']) >= 0.0 and float(values['dropped_backlog_s']) >= 0.0
+    process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=DEADLINE)
     # Where others take the processor, the deadline of the shutdown may come first.
     busy = os.getloadavg()[0] > (os.cpu_count() or 1)
@@ -277,42 +270,11 @@ def test_a_loop_steps_the_clock_back_tells_its_state_and_ends_when_asked(bag, ea
     assert err == ''
 
 
-def test_a_stall_shows_as_lateness_and_a_long_one_as_backlog_that_was_dropped(bag, ear, replay):
-    ear.listen(DiagnosticArray, '/diagnostics')
-    process = replay(bag, *playing('loop:=true', 'rate:=2.0', wait=0.0))
-
-    def told(key):
-        last = [status(raw) for raw in ear.heard['/diagnostics'][-1:]]
-        return max((float(values.get(key, 0.0)) for values in last), default=0.0)
-
-    def stall(seconds):
-        ear.heard['/diagnostics'].clear()
-        process.send_signal(signal.SIGSTOP)
-        ear.wait(lambda: False, timeout=seconds)
-        process.send_signal(signal.SIGCONT)
-        assert ear.wait(lambda: len(ear.heard['/diagnostics']) >= 2)
-
-    assert ear.wait(lambda: told('published /stamps') > 0)
-    # One near the end of the bag is over before many messages are late.
-    deadline = time.monotonic() + DEADLINE
-    while told('lateness_p99_ms') < 100.0:
-        assert time.monotonic() < deadline
-        stall(0.3)
-    assert told('lateness_p99_ms') < 1e3 * DEADLINE
-    stalled = time.monotonic()
-    before = told('dropped_backlog_s')
-    while told('dropped_backlog_s') < before + 0.5:
-        assert time.monotonic() < stalled + DEADLINE
-        stall(1.0)
-    assert told('dropped_backlog_s') <= before + time.monotonic() - stalled
-
-
-@pytest.mark.parametrize('left_out', ['/rosout', '/drone1/command/trajectory'])
-def test_what_the_recorded_system_said_or_commanded_is_played_only_if_named(
-        tmp_path, ear, replay, left_out):
+def test_statements_and_commands_of_the_recorded_system_are_played_only_if_named(
+        tmp_path, ear, replay):
     types = typestore().types
     with BagWriter(tmp_path / 'bag') as writer:
-        for topic in ('mode', left_out):
+        for topic in ('mode', '/rosout', '/drone1/command/trajectory'):
             writer.write(topic, 'std_msgs/msg/String', START, types['std_msgs/msg/String'](topic))
     ear.listen(String, '/mode')
     process = replay(tmp_path / 'bag', *playing('rate:=10.0'))
@@ -320,93 +282,7 @@ def test_what_the_recorded_system_said_or_commanded_is_played_only_if_named(
     code, out, err = finish(process)
     assert code == 0
     assert 'replayed 1 messages of 1 topics' in out
-    assert f'not played unless named: {left_out}' in err
-
-
-def test_without_a_clock_none_is_published(bag, ear, replay):
-    ear.listen(Header, '/stamps')
-    ear.listen(Clock, '/clock')
-    process = replay(bag, *playing('clock:=false', 'wait_for:=[stamps]', 'rate:=5.0'))
-    assert ear.wait(lambda: process.poll() is not None)
-    assert finish(process)[0] == 0
-    assert ear.wait(lambda: len(ear.heard['/stamps']) == COUNT)
-    assert not ear.heard['/clock']
-
-
-def animal_bag(path):
-    types = get_typestore(Stores.EMPTY)
-    types.register(get_types_from_msg('float32 size', 'zoo_msgs/msg/Animal'))
-    with Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection('/animal', 'zoo_msgs/msg/Animal', typestore=types)
-        writer.write(connection, START, b'\x00\x01\x00\x00\x00\x00\x80\x3f')
-    return path
-
-
-def cut_bag(path, bag):
-    whole = (bag / 'flight.mcap').read_bytes()
-    path.write_bytes(whole[:len(whole) // 2])
-    return path
-
-
-def empty_bag(path):
-    with BagWriter(path):
-        pass
-    return path
-
-
-@pytest.mark.parametrize(('make', 'parameters', 'message'), [
-    (lambda tmp, bag: tmp / 'none', [], 'none: no such bag'),
-    (lambda tmp, bag: cut_bag(tmp / 'cut.mcap', bag), [], 'cut.mcap: incomplete (cut.mcap was'),
-    (lambda tmp, bag: empty_bag(tmp / 'empty'), [], 'empty: holds no message that can be read'),
-    (lambda tmp, bag: animal_bag(tmp / 'zoo'), [], "topic /animal: message type 'zoo_msgs/msg/An"),
-    (lambda tmp, bag: bag, ['topics:=[odom]'], 'holds no topic /odom, only /image_raw/compressed'),
-    (lambda tmp, bag: bag, ['rate:=0.01'], 'rate = 0.01: must be a number in [0.1, 100]'),
-    (lambda tmp, bag: bag, ['rat:=1.0'], 'unknown parameter rat for node replay: did you mean'),
-    (lambda tmp, bag: bag, ['start:=5.0'], 'start = 5.0: must be a number in [0, 0.98] s'),
-    (lambda tmp, bag: bag, ['remap:=[stamps]'], "remap = 'stamps': must be from:=to"),
-    (lambda tmp, bag: bag, ["remap:=['stamps:=mode']"], "/stamps cannot be published as 'mode'"),
-    (lambda tmp, bag: bag, ["remap:=['stamps:=a b']"], "/stamps cannot be published as 'a b'"),
-    (lambda tmp, bag: bag, ['topics:=[mode]', 'start:=0.5'], 'no message of /mode between start'),
-    (lambda tmp, bag: '', [], 'no bag given; usage: replay BAG'),
-    (lambda tmp, bag: bag, ['wait_for:=[imu]'], 'holds no topic /imu'),
-])
-def test_what_cannot_be_played_is_one_line_and_exit_code_1(
-        tmp_path, bag, replay, make, parameters, message):
-    path = make(tmp_path, bag)
-    code, _, err = finish(replay(*([path] if path else []), *playing(*parameters, wait=0.0)))
-    assert code == 1
-    assert message in err
-    assert [line[:7] for line in err.splitlines()] == ['error: ']
-
-
-def test_help_names_every_parameter(replay):
-    code, out, err = finish(replay('--help'))
-    assert (code, err) == (0, '')
-    for name in ('bag', 'rate', 'start', 'duration', 'loop', 'clock', 'topics', 'remap'):
-        assert f'\n  {name} ' in out
-
-
-def test_damage_in_the_middle_ends_playback_with_one_line(tmp_path, ear, replay):
-    path = tmp_path / 'bag'
-    types = typestore().types
-    with BagWriter(path) as writer:
-        for i in range(40):
-            stamp = START + i * PERIOD
-            writer.write('image', 'sensor_msgs/msg/CompressedImage', stamp,
-                         types['sensor_msgs/msg/CompressedImage'](
-                             header(stamp), 'jpeg', np.zeros(100_000, np.uint8)))
-    file = path / 'bag.mcap'
-    damaged = bytearray(file.read_bytes())
-    damaged[len(damaged) * 2 // 3] ^= 255
-    file.write_bytes(damaged)
-    ear.listen(CompressedImage, '/image')
-    process = replay(path, *playing('rate:=2.0'))
-    assert ear.wait(lambda: process.poll() is not None)
-    code, out, err = finish(process)
-    assert code == 1
-    assert err.startswith(f'error: {path}: corrupt') and err.count('\n') == 1
-    assert 'replayed' not in out
-    assert ear.wait(lambda: len(ear.heard['/image']) > 5)
+    assert 'not played unless named: /drone1/command/trajectory, /rosout' in err
 
 
 def test_ros1_topics_of_unknown_type_are_named_and_left_out(tmp_path, ear, replay):
@@ -447,18 +323,3 @@ def test_real_ros1_bags_arrive_as_ros2_messages(ear, replay, name, height):
     info = deserialize_message(ear.heard['/camera_info'][0], CameraInfo)
     assert (info.width, info.height, info.distortion_model) == (1280, height, 'plumb_bob')
     assert info.k[8] == 1.0 and info.k[0] > 1000.0
-
-
-def test_a_terminal_gets_a_bar_on_one_line(bag):
-    terminal = ('import os, pty, sys; '
-                'sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))')
-    done = subprocess.run(
-        [sys.executable, '-c', terminal, sys.executable, '-m', 'flock_follower.nodes.replay',
-         str(bag), *playing(wait=0.0)],
-        cwd=REPO, stdin=subprocess.DEVNULL, capture_output=True, timeout=DEADLINE)
-    assert done.returncode == 0, done.stderr
-    bar, _, summary = done.stdout.replace(b'\r\n', b'\n').strip().rpartition(b'\n')
-    assert summary.startswith(b'replayed 61 messages of 3 topics in ')
-    assert b'\n' not in bar
-    assert bar.count(b'\r') > 5
-    assert bar.rpartition(b'\r')[2].startswith(b'[####')

@@ -31,7 +31,7 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.resources import resource
 
-CYCLES = 5
+MOMENTS = (0.3, 1.2, 2.5)  # s: during the imports, at the start, and in flight
 WRITER = """
 import os
 from flock_follower.nodes.support.runtime import never_block_output
@@ -114,7 +114,7 @@ def test_a_context_that_is_gone_already_is_no_failure():
 
 @pytest.mark.slow
 def test_cycles_of_start_and_ctrl_c_are_clean(tmp_path):
-    for cycle in range(CYCLES):
+    for cycle, delay in enumerate(MOMENTS):
         with Processes(private_environment(), tmp_path / str(cycle)) as processes:
             connection = f'connection:=udpin:127.0.0.1:{free_udp_port()}'
             for node, arguments in (
@@ -123,8 +123,7 @@ def test_cycles_of_start_and_ctrl_c_are_clean(tmp_path):
                     ('mavlink_bridge', ['-p', connection]),
                     ('replay', ['-p', f'bag:={resource("bags/sample")}', '-p', 'loop:=true'])):
                 processes.start(node, f'flock_follower.nodes.{node}', ['--ros-args', *arguments])
-            # Early cycles interrupt the imports, later ones nodes that exchange messages.
-            moment = time.monotonic() + 0.2 + 0.7 * cycle
+            moment = time.monotonic() + delay
             wait_until(lambda moment=moment: time.monotonic() > moment, 10.0, 'the moment')
             children = dict(processes.children)
             for child in children.values():

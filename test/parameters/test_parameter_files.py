@@ -55,14 +55,6 @@ def test_the_name_of_a_node_may_have_a_namespace(section: str) -> None:
     assert parse_parameters(of(section, K=3.0), TABLE)['planner']['K'] == 3.0
 
 
-def test_of_a_nodes_own_name_and_the_wildcard_the_last_counts_as_in_ros() -> None:
-    values = parse_parameters({**of('/**', v_max=0.3), **of('planner', v_max=0.7)}, TABLE)
-    assert values['planner']['v_max'] == 0.7
-    assert values['mavlink_bridge']['v_max'] == 0.3
-    values = parse_parameters({**of('planner', v_max=0.7), **of('/**', v_max=0.3)}, TABLE)
-    assert values['planner']['v_max'] == values['mavlink_bridge']['v_max'] == 0.3
-
-
 def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
     path = resource('config/follower.yaml')
     sections = yaml.safe_load(path.read_text())

@@ -25,6 +25,7 @@ from typing import Any
 
 from bag_excerpts import excerpt
 from geometry_msgs.msg import AccelWithCovarianceStamped
+from memory_line import MemoryLine
 from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -181,40 +182,11 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
             assert np.array_equal(a, b)
 
 
-class Line:
-    """A transport whose other end is this test."""
-
-    url, peer, fault, capacity, delivers_late = 'memory', None, '', 0.0, False
-
-    def __init__(self) -> None:
-        self.arrived: list[bytes] = []
-
-    def fileno(self) -> int:
-        return -1
-
-    def reopen(self, now: float) -> None:
-        pass
-
-    def congested(self) -> bool:
-        return False
-
-    def read(self) -> Iterator[tuple[bytes, str]]:
-        arrived, self.arrived = self.arrived, []
-        for data in arrived:
-            yield data, 'vehicle'
-
-    def write(self, data: bytes) -> bool:
-        return True
-
-    def close(self) -> None:
-        pass
-
-
 def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open_bag(bag) as messages:
         start = next(iter(messages.messages(list(PLAYED)))).stamp_ns
-    clock, line = BagClock(), Line()
+    clock, line = BagClock(), MemoryLine()
     clock.nanoseconds = start
 
     def seconds() -> float:

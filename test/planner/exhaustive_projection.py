@@ -13,11 +13,10 @@
 # limitations under the License.
 
 """
-Projection by trying all active sets: slow, but plainly right. The planner's is held to it.
+Projection by trying all candidates: slow, but plainly right. The planner's is held to it.
 
-The best point within some bounds is the best of the points that meet some of them with equality,
-at most n of them, among those that keep the others. All such choices are tried, for every search
-anew; the number of choices grows with the n-th power of the number of bounds.
+The best point within some bounds is a corner, or the best point of one boundary alone, or the
+goal itself. All of them are tried, for every search anew.
 """
 
 from __future__ import annotations
@@ -25,198 +24,67 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 import math
-from typing import NamedTuple
 
-import numpy as np
-
-from flock_follower.geometry import Array
-from flock_follower.planner import projection
-from flock_follower.planner.projection import Discs, Side
+from flock_follower.planner.projection import Discs, product, Side
 
 TOLERANCE = 1e-9
 
 
-class Ball(NamedTuple):
-    """All points at most ``radius`` from ``centre`` (n,)."""
-
-    centre: Array
-    radius: float
-
-    def holds(self, point: Array) -> bool:
-        """Return whether the point is inside, but for rounding."""
-        return length(point - self.centre) <= self.radius + TOLERANCE
+def holds(point: complex, sides: Sequence[Side], discs: Discs) -> bool:
+    """Return whether a point is within all bounds and both discs, but for rounding."""
+    return all(product(normal, point) >= least - TOLERANCE for normal, least in sides) and all(
+        abs(point - centre) <= radius + TOLERANCE for centre, radius in (discs[:2], discs[2:]))
 
 
-class Bound(NamedTuple):
-    """All points x with ``normal . x >= least``; the normal (n,) need not be of unit length."""
-
-    normal: Array
-    least: float
-
-    def holds(self, point: Array) -> bool:
-        """Return whether the point is inside, but for rounding."""
-        return float(self.normal @ point) >= self.least - TOLERANCE
-
-
-class Lens(NamedTuple):
-    """All points in both of two balls; they must have one in common."""
-
-    first: Ball
-    second: Ball
-
-    def nearest(self, wanted: Array) -> Array:
-        """Return the point of the lens that is nearest to the wanted one."""
-        one, other = self.first, self.second
-        if one.holds(wanted) and other.holds(wanted):
-            return wanted
-        for ball, rest in ((one, other), (other, one)):
-            away = wanted - ball.centre
-            distance = length(away)
-            point = wanted if distance <= ball.radius else (
-                ball.centre + away * (ball.radius / distance))
-            if rest.holds(point):
-                return point
-        return self._on_rim(wanted - one.centre)
-
-    def farthest(self, direction: Array) -> Array:
-        """Return the point of the lens that is farthest in a direction, which is not zero."""
-        unit = direction / length(direction)
-        for ball, rest in (self, self[::-1]):
-            point = ball.centre + ball.radius * unit
-            if rest.holds(point):
-                return point
-        return self._on_rim(unit)
-
-    def _on_rim(self, towards: Array) -> Array:
-        """Return the point where both surfaces meet that lies farthest in a direction."""
-        (centre, radius), (other, other_radius) = self
-        axis = other - centre
-        distance = length(axis)
-        if distance == 0.0:
-            return centre
-        axis = axis / distance
+def corners(sides: Sequence[Side], discs: Discs) -> Iterator[complex]:
+    """Yield the points that two boundaries share."""
+    for (one, level), (other, other_level) in combinations(sides, 2):
+        cross = (one.conjugate() * other).imag
+        if abs(cross) > 1e-6 * abs(one) * abs(other):
+            yield -1j * (level * other - other_level * one) / cross
+    for centre, radius in (discs[:2], discs[2:]):
+        for normal, least in sides:
+            offset = (least - product(normal, centre)) / abs(normal)
+            yield from chord(centre, normal / abs(normal), offset, radius)
+    (centre, radius), (other, other_radius) = discs[:2], discs[2:]
+    if distance := abs(other - centre):
         along = (distance + (radius - other_radius) * (radius + other_radius) / distance) / 2.0
-        along = min(max(along, -radius), radius)
-        across = towards - axis * float(axis @ towards)
-        middle = centre + along * axis
-        wide = length(across)
-        if wide <= TOLERANCE * length(towards):
-            return middle  # every direction is as good, and the middle lies inside
-        return middle + across * (math.sqrt(max(radius ** 2 - along ** 2, 0.0)) / wide)
+        yield from chord(centre, (other - centre) / distance, along, radius)
 
 
-def planners(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array:
-    """Return what the planner's own search finds; in two dimensions."""
-    return as_array(projection.lexicographic(as_number(wanted), sides(bounds), discs(lens)))
+def chord(centre: complex, axis: complex, along: float, radius: float) -> Iterator[complex]:
+    """Yield the points of a circle at a distance from its centre along an axis, if any."""
+    square = radius ** 2 - along ** 2
+    if square > -TOLERANCE * max(radius, 1.0):
+        for side in (1j, -1j):
+            yield centre + axis * (along + side * math.sqrt(max(square, 0.0)))
 
 
-def planners_best(goal: Array, far: bool, bounds: Sequence[Bound], lens: Lens) -> Array | None:
-    """Return the planner's own nearest or farthest point within all bounds, or None."""
-    point, met = projection.optimum(as_number(goal), far, sides(bounds), discs(lens))
-    return as_array(point) if met == len(bounds) else None
+def nearest(goal: complex, sides: Sequence[Side], discs: Discs) -> complex | None:
+    """Return the point within all bounds that is nearest to a goal, or None."""
+    feet = [goal + (least - product(normal, goal)) / abs(normal) ** 2 * normal
+            for normal, least in sides]
+    rims = [centre + radius * (goal - centre) / (abs(goal - centre) or 1.0)
+            for centre, radius in (discs[:2], discs[2:])]
+    return min((point for point in (goal, *feet, *rims, *corners(sides, discs))
+                if holds(point, sides, discs)), key=lambda point: abs(point - goal), default=None)
 
 
-def sides(bounds: Sequence[Bound]) -> list[Side]:
-    return [(as_number(bound.normal), bound.least) for bound in bounds]
+def farthest(direction: complex, sides: Sequence[Side], discs: Discs) -> complex | None:
+    """Return a point within all bounds that is farthest in a direction, or None."""
+    unit = direction / abs(direction)
+    rims = [centre + radius * unit for centre, radius in (discs[:2], discs[2:])]
+    return max((point for point in (*rims, *corners(sides, discs)) if holds(point, sides, discs)),
+               key=lambda point: product(direction, point), default=None)
 
 
-def discs(lens: Lens) -> Discs:
-    (centre, radius), (other, other_radius) = lens
-    return Discs(as_number(centre), radius, as_number(other), other_radius)
-
-
-def as_number(vector: Array) -> complex:
-    return complex(*vector.tolist())
-
-
-def as_array(number: complex) -> Array:
-    return np.array([number.real, number.imag])
-
-
-
-def nearest(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array | None:
-    """Return the point of the lens within all bounds that is nearest to ``wanted``, or None."""
-    best, least = None, math.inf
-    for flat in flats(bounds, lens):
-        point = flat.nearest(wanted)
-        if all(bound.holds(point) for bound in bounds):
-            distance = length(point - wanted)
-            if distance < least:
-                best, least = point, distance
-    return best
-
-
-def farthest(direction: Array, bounds: Sequence[Bound], lens: Lens) -> Array | None:
-    """Return a point of the lens within all bounds farthest in a direction, or None."""
-    best, most = None, -math.inf
-    for flat in flats(bounds, lens):
-        point = flat.farthest(direction)
-        if all(bound.holds(point) for bound in bounds):
-            reach = float(direction @ point)
-            if reach > most:
-                best, most = point, reach
-    return best
-
-
-def lexicographic(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array:
-    """Return the point of the lens nearest to ``wanted`` that meets the first bounds first."""
-    met: list[Bound] = []
-    best: Array | None = None
-    for bound in bounds:
-        best = farthest(bound.normal, met, lens)
-        if best is not None:
-            met.append(Bound(bound.normal, min(bound.least, float(bound.normal @ best))))
-    point = nearest(wanted, met, lens)
-    if point is not None:
-        return point
-    # Only rounding leads here: the bounds leave one point, and the last search found it.
-    return lens.nearest(wanted) if best is None else best
-
-
-class Flat(NamedTuple):
-    """A lens cut by the flat ``foot + basis y``; in the coordinates y it is a lens again."""
-
-    foot: Array
-    basis: Array
-    lens: Lens
-
-    def nearest(self, wanted: Array) -> Array:
-        return self.foot + self.basis @ self.lens.nearest(self.basis.T @ (wanted - self.foot))
-
-    def farthest(self, direction: Array) -> Array:
-        inside = self.basis.T @ direction
-        if length(inside) <= TOLERANCE * length(direction):
-            return self.nearest(self.foot)
-        return self.foot + self.basis @ self.lens.farthest(inside)
-
-
-def flats(bounds: Sequence[Bound], lens: Lens) -> Iterator[Flat]:
-    """Yield the lens itself, and its cuts by every choice of at most n planes."""
-    n = len(lens.first.centre)
-    for count in range(min(n, len(bounds)) + 1):
-        for chosen in combinations(bounds, count):
-            if not chosen:
-                yield Flat(np.zeros(n), np.eye(n), lens)
-                continue
-            _, sizes, rows = np.linalg.svd(np.array([b.normal for b in chosen]))
-            if sizes[-1] <= 1e-6 * sizes[0]:
-                continue  # parallel bounds: no common point, or one is superfluous
-            foot = np.linalg.lstsq(np.array([b.normal for b in chosen]),
-                                   np.array([b.least for b in chosen]), rcond=None)[0]
-            basis = rows[count:].T
-            balls = []
-            for centre, radius in lens:
-                offset = centre - foot
-                inside = basis.T @ offset
-                left = radius ** 2 - length(offset - basis @ inside) ** 2
-                if left < -TOLERANCE * max(radius, 1.0):
-                    break
-                balls.append(Ball(inside, math.sqrt(max(left, 0.0))))
-            # A flat may cut both balls and yet miss what they have in common.
-            if len(balls) == 2 and (length(balls[0].centre - balls[1].centre)
-                                    <= balls[0].radius + balls[1].radius + TOLERANCE):
-                yield Flat(foot, basis, Lens(*balls))
-
-
-def length(vector: Array) -> float:
-    return math.sqrt(float(vector @ vector))
+def lexicographic(wanted: complex, sides: Sequence[Side], discs: Discs) -> complex:
+    """Return the point of the discs nearest to ``wanted`` that meets the first bounds first."""
+    met, best = list[Side](), None
+    for normal, least in sides:
+        if (best := farthest(normal, met, discs)) is not None:
+            met.append((normal, min(least, product(normal, best))))
+    # Only rounding leaves nothing: then the bounds leave one point, and the last search found it.
+    found = nearest(wanted, met, discs)
+    found = best if found is None else found
+    return discs.best(wanted) if found is None else found

@@ -48,10 +48,6 @@ def test_who_flies_along_and_is_known_of_by_nothing_is_told() -> None:
     assert told(Memory(), 0.0, seen='l', heard='a')[1] == ('b' + NOT_KEPT_CLEAR,)
 
 
-def test_with_one_neighbour_and_no_file_nothing_is_missed() -> None:
-    assert told(Memory(), 0.0, seen='l', params=PlannerParams())[1] == ()
-
-
 def test_who_was_there_is_missed_once_it_is_not_kept_clear_of_any_more() -> None:
     params = PlannerParams(resume_timeout=5.0)
     memory, _ = told(Memory(), 0.0, seen='la', params=params)

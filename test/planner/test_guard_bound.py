@@ -63,8 +63,7 @@ def least_gap(unknown: float, delay: float, velocity_error: float, range_error: 
         told = distance + side * range_error
         closing = rate + side * velocity_error - pending
         found = radial_bounds(-told * AHEAD, -closing * AHEAD, BAND, PARAMS)
-        assert found is not None
-        queue.append(guard(side * 5.0 * AHEAD, np.zeros(3), ordered([found]), 20.0, 90.0,
+        queue.append(guard(side * 5.0 * AHEAD, np.zeros(3), ordered(found), 20.0, 90.0,
                            PERIOD).acceleration)
         acceleration = queue.popleft()
         for _ in range(STEPS):

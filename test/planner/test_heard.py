@@ -16,30 +16,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from flown import own, PARAMS, seen
 import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import Neighbor, OwnState
+from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import next_state, State
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
-PARAMS = PlannerParams()
-
-
-def own(stamp: float = 0.0) -> OwnState:
-    return OwnState(stamp, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
-
 
 def told(stamp: float, x: float = 2.0, heard: bool = True, name: str = 'leader',
          variance: float = 0.0, speed: float = 0.0) -> Neighbor:
-    return Neighbor(
-        name, stamp, np.array([x, 0.0, 2.0]), np.array([speed, 0.0, 0.0]),
-        position_covariance=variance * np.eye(3), heard=heard)
+    return seen(stamp, (x, 0.0, 2.0), (speed, 0.0, 0.0), name,
+                position_covariance=variance * np.eye(3), heard=heard)
 
 
 def decide(memory: Memory, now: float, *neighbors: Neighbor,
@@ -65,18 +57,6 @@ def test_eyes_beat_words_at_once_even_newer_ones(x: float) -> None:
     memory, decision = decide(memory, 0.2, told(0.05, x, heard=False))
     assert place(memory) == x and decision.rejected == ()
     assert set(memory.flock) == {'leader'}  # nobody at the place that was only told
-
-
-def test_the_same_estimates_seen_or_heard_fly_alike_while_they_are_sure() -> None:
-    results = []
-    for heard in (False, True):
-        decision = decide(Memory(), 0.1, told(0.1, 2.4, heard, speed=0.2))[1]
-        results.append(decision)
-        assert decision.acceleration is not None
-    assert np.array_equal(results[0].acceleration, results[1].acceleration)
-    assert results[0].reason == ''
-    assert results[1].reason == 'nobody seen: flies by what others tell'
-    assert results[1].warnings[0] == results[1].reason
 
 
 def test_words_are_used_up_to_their_own_age() -> None:
@@ -114,44 +94,20 @@ def test_the_less_sure_a_word_the_farther_away_it_stays() -> None:
 
 
 def test_one_heard_is_kept_clear_of_beside_one_that_is_seen() -> None:
-    near = replace(told(0.0, 1.1, name='follower_2', speed=-0.2), position=np.array(
-        [0.0, 1.1, 2.0]), velocity=np.array([0.0, -0.2, 0.0]))
+    near = seen(0.0, (0.0, 1.1, 2.0), (0.0, -0.2, 0.0), 'follower_2', heard=True)
     decision = decide(Memory(), 0.0, told(0.0, 2.0, heard=False), near)[1]
     assert decision.acceleration is not None and decision.acceleration[1] < -1.0
     assert 'separation' in decision.limits and decision.reason == ''
     known = {each.name: each for each in decision.known}
-    assert (known['leader'].seen, known['follower_2'].seen) == (True, False)
-    assert (known['leader'].role, known['follower_2'].role) == ('leader', 'follower')
+    assert (known['leader'].heard, known['follower_2'].heard) == (False, True)
+    assert (known['leader'].who.role, known['follower_2'].who.role) == ('leader', 'follower')
 
 
 def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
     params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
     ahead = told(0.0, 2.0, heard=False, name='follower_2')
-    aside = replace(told(0.0), position=np.array([0.0, 2.0, 2.0]))
+    aside = seen(0.0, (0.0, 2.0, 2.0), heard=True)
     memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
     assert memory.faced == 'follower_2' and decision.yaw == pytest.approx(0.0)
     memory, decision = decide(Memory(), 0.0, aside, params=params)
     assert memory.faced == 'leader' and decision.yaw is not None and decision.yaw > 0.05
-
-
-def test_it_follows_the_altitude_of_a_leader_it_hears_of() -> None:
-    params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
-    ahead = told(0.0, 2.0, heard=False, name='follower_2')
-    above = replace(told(0.0), position=np.array([0.0, 2.0, 3.0]))
-    memory, _ = decide(Memory(), 0.0, ahead, above, params=params)
-    assert memory.altitude is not None and memory.altitude.climb > 0.0
-
-
-def test_words_that_come_late_and_with_gaps_do_not_push_harder_than_fresh_ones() -> None:
-    """One keeps its distance and its speed; half of the words are lost, the others 0.3 s old."""
-    pushed = []
-    for stamps in (np.arange(20) / 10.0, np.array([0.0, 0.3, 0.4, 0.9, 1.0])):
-        memory, most = Memory(), 0.0
-        for tick in range(4, 20):
-            arrived = [told(s, 1.5, speed=0.03 * (-1) ** k) for k, s in enumerate(stamps)
-                       if tick / 10.0 - 0.05 < s + 0.3 < tick / 10.0 + 0.05]
-            memory, decision = decide(memory, tick / 10.0, *arrived)
-            if decision.acceleration is not None:
-                most = max(most, float(np.abs(decision.acceleration).max()))
-        pushed.append(most)
-    assert pushed[1] < 1.2 * pushed[0] + 0.1

@@ -17,9 +17,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from exhaustive_projection import Ball, Bound, farthest, Lens, lexicographic
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -52,7 +50,6 @@ def test_any_input_gives_a_finite_acceleration_within_a_max(
     command = limit_command(a, v, a_max, v_max, period)
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
-    assert command.limited == bool(command.reason)
 
 
 @given(ANYTHING, FLYABLE, LIMIT, st.floats(0.0, 6.0), PERIOD)
@@ -64,27 +61,19 @@ def test_speed_ends_within_v_max_or_does_not_rise(a: Vector, v: Vector, a_max: f
     assert reached <= (v_max if speed <= v_max else speed)
 
 
-@given(FINITE, FINITE)
-def test_absurd_velocities_are_braked_not_multiplied_into_nan(a: Vector, v: Vector) -> None:
-    command = limit_command(a, v, A_MAX, V_MAX, T)
-    if math.hypot(*v) > V_MAX + A_MAX * T:
-        assert np.linalg.norm(command.acceleration) == pytest.approx(A_MAX)
-        assert np.asarray(v) / math.hypot(*(x / 4 for x in v)) @ command.acceleration <= 0.0
-
-
 @given(FLYABLE, FLYABLE)
 def test_a_limited_command_passes_a_second_time_unchanged(a: Vector, v: Vector) -> None:
     once = limit_command(a, np.clip(v, -0.28, 0.28), A_MAX, V_MAX, T).acceleration
     again = limit_command(once, np.clip(v, -0.28, 0.28), A_MAX, V_MAX, T)
     assert np.array_equal(again.acceleration, once)
-    assert not again.limited
+    assert not again.reason
 
 
 @given(st.tuples(*[st.floats(-1.4, 1.4)] * 3), st.tuples(*[st.floats(-0.1, 0.1)] * 3))
 def test_a_command_within_the_limits_is_returned_bit_for_bit(a: Vector, v: Vector) -> None:
     command = limit_command(a, v, A_MAX, V_MAX, T)
     assert command.acceleration.tobytes() == np.array(a).tobytes()
-    assert (command.limited, command.reason) == (False, '')
+    assert command.reason == ''
 
 
 @given(ANYTHING | FLYABLE, FLYABLE, st.floats(0.01, 20.0), st.floats(0.0, 3e-7),
@@ -128,14 +117,7 @@ def test_limits_act_as_specified(a: list[float], v: list[float], expected: list[
                                  reason: str) -> None:
     command = limit_command(a, v, A_MAX, V_MAX, T)
     assert command.acceleration == pytest.approx(np.array(expected), abs=1e-6)
-    assert (command.limited, command.reason) == (bool(reason), reason)
-
-
-def test_at_top_speed_a_turn_costs_speed_not_the_turn() -> None:
-    command = limit_command([0.0, 2.0, 0.0], [0.5, 0.0, 0.0], A_MAX, V_MAX, T)
-    reached = np.array([0.5, 0.0, 0.0]) + command.acceleration * T
-    assert np.linalg.norm(reached) == pytest.approx(V_MAX)
-    assert reached[1] / reached[0] == pytest.approx(0.2 / 0.5)
+    assert command.reason == reason
 
 
 @given(ANYTHING, LIMIT, st.floats(0.05, 5.0))
@@ -157,31 +139,6 @@ def test_braking_falls_with_the_time_constant_and_ends_at_rest() -> None:
     for _ in range(40):
         v = v + brake(v, A_MAX) * T
     assert np.linalg.norm(v) < 1e-3
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'a_max': 0.0}, r'^a_max = 0\.0: must be a number in \(0, 100\] m/s\^2$'),
-    ({'a_max': math.nan}, r'^a_max = nan'),
-    ({'v_max': -0.1}, r'^v_max = -0\.1: must be a number in \[0, 100\] m/s$'),
-    ({'v_max': math.inf}, r'^v_max = inf'),
-    ({'period': 0.0}, r'^period = 0\.0: must be a number in \(0, 10\] s$'),
-    ({'acceleration': [0.0, 0.0]}, r'^acceleration has shape \(2,\): must be \(3,\)$'),
-    ({'velocity': [[0.0] * 3]}, r'^velocity has shape \(1, 3\): must be \(3,\)$'),
-])
-def test_bad_limits_are_named_with_value_and_range(change: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {
-        'acceleration': np.zeros(3), 'velocity': np.zeros(3), 'a_max': A_MAX, 'v_max': V_MAX,
-        'period': T}
-    with pytest.raises(ValueError, match=message):
-        limit_command(**{**arguments, **change})
-
-
-def test_bad_braking_parameters_are_named() -> None:
-    valid = r'must be a number in \(0, 10\] s$'
-    with pytest.raises(ValueError, match=rf'^time_constant = 0\.0: {valid}'):
-        brake(np.zeros(3), A_MAX, 0.0)
-    with pytest.raises(ValueError, match=r'^a_max = -1\.0'):
-        brake(np.zeros(3), -1.0)
 
 
 @given(ANYTHING, st.floats(-2.0, 2.0), ANYTHING)
@@ -211,27 +168,23 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
         command = limit_horizontal(wanted, 0.0, v, A_MAX, V_MAX, T, climb)
         assert v[0] + T * command.acceleration[0] == pytest.approx(
             max(fastest, 0.3 - A_MAX * T), abs=1e-6)
-        assert command.limited == (climb != 0.0)
+        assert bool(command.reason) == (climb != 0.0)
 
 
 @given(st.integers(0, 2 ** 32))
 def test_what_keeps_clear_of_a_neighbor_is_cut_last(seed: int) -> None:
-    """Held to the search over all active sets, in three dimensions."""
+    """No sampled acceleration within the limits keeps more of what is wanted along ``away``."""
     rng = np.random.default_rng(seed)
-    v, wanted = rng.uniform(-0.4, 0.4, 3), rng.uniform(-4.0, 4.0, 3)
-    away = rng.normal(size=3)
+    v, wanted, away = rng.uniform(-0.4, 0.4, 3), rng.uniform(-4.0, 4.0, 3), rng.normal(size=3)
     away = away / np.linalg.norm(away)
     if seed % 4 == 0:
         v = rng.uniform(-0.6, 0.6) * away  # the centres and the direction on one line
-    command = limit_command(wanted, v, A_MAX, V_MAX, T, away)
-    assert np.linalg.norm(command.acceleration) <= A_MAX
-    speed = float(np.linalg.norm(v))
-    assert np.linalg.norm(v + T * command.acceleration) <= max(V_MAX, speed)
-    if command.limited and away @ wanted > 0.0:
-        lens = Lens(Ball(np.zeros(3), A_MAX), Ball(-v / T, max(V_MAX, speed) / T))
-        level = min(away @ wanted, away @ farthest(away, [], lens))
-        best = lexicographic(wanted, [Bound(away, level), Bound(-away, -level)], lens)
-        clipped = limit_command(wanted, v, A_MAX, V_MAX, T).acceleration
-        assert away @ command.acceleration >= max(away @ clipped, level - 1e-5)
-        if level > away @ clipped + 1e-3:
-            assert command.acceleration == pytest.approx(best, abs=3e-3)
+    a = limit_command(wanted, v, A_MAX, V_MAX, T, away).acceleration
+    fastest = max(V_MAX, float(np.linalg.norm(v)))
+    assert np.linalg.norm(a) <= A_MAX and np.linalg.norm(v + T * a) <= fastest
+    samples = np.vstack([rng.uniform(-A_MAX, A_MAX, (3000, 3)),
+                         a + 0.1 * rng.normal(size=(3000, 3))])
+    inside = samples[(np.linalg.norm(samples, axis=1) <= A_MAX)
+                     & (np.linalg.norm(v + T * samples, axis=1) <= fastest)]
+    kept = min(float(away @ wanted), float((inside @ away).max()))
+    assert away @ a >= kept - 1e-5 or away @ wanted <= 0.0

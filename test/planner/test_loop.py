@@ -16,19 +16,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import Command, OdometryState
-from flock_follower.planner import loop as loop_module
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()
 START = 1_700_000_000 * 10**9  # ns
@@ -63,14 +59,6 @@ def fly(loop: PlannerLoop, now: int, seen: int | None = None) -> tuple[Decision,
     decision, command = loop.tick(now, PARAMS)
     assert command is not None
     return decision, command
-
-
-def test_it_is_engaged_from_when_it_was_told_until_it_is_told_otherwise() -> None:
-    loop = PlannerLoop()
-    assert loop.engaged is False
-    for wanted in (True, False):
-        loop.engage(wanted)
-        assert loop.engaged is wanted
 
 
 @pytest.mark.parametrize('start', [START, TICK], ids=['wall time', 'simulated time'])
@@ -116,12 +104,6 @@ def test_neighbors_count_only_in_the_frame_of_the_odometry(frame: str, other: st
     decision, command = loop.tick(START + TICK, PARAMS)
     assert decision.state is State.TRACK
     assert command is not None and command.frame == frame
-
-
-def test_a_tick_before_any_odometry_commands_nothing_and_says_why() -> None:
-    loop = engaged()
-    decision, command = loop.tick(START, PARAMS)
-    assert (decision.state, decision.reason, command) == (State.SEARCH, 'no odometry', None)
 
 
 def test_what_came_is_handed_on_once() -> None:
@@ -179,45 +161,8 @@ def test_images_that_cease_after_a_clock_jumped_back_are_missed_no_later() -> No
     assert watched(loop, late).state is State.HOLD
 
 
-def test_seconds_count_from_the_first_tick_and_before_it_from_the_zero_of_the_clock() -> None:
-    loop = engaged()
-    assert [loop.seconds(nanoseconds) for nanoseconds in (0, 1)] == [0.0, 1e-9]
-    fly(loop, START)
-    fly(loop, START + TICK)
-    assert [loop.seconds(START + late) for late in (0, 1, TICK, -TICK)] == [
-        0.0, 1e-9, pytest.approx(0.1, abs=1e-12), pytest.approx(-0.1, abs=1e-12)]
-
-
-def test_odometry_is_at_fault_once_it_is_too_old_for_the_present_time() -> None:
-    loop = engaged()
-    assert loop.odometry_fault(START, PARAMS) == 'no odometry'
-    fly(loop, START)
-    assert loop.odometry_fault(START, PARAMS) == ''
-    at_last = START - 10 * MS + round(PARAMS.odom_timeout * 1e9)
-    assert loop.odometry_fault(at_last - MS, PARAMS) == ''
-    assert loop.odometry_fault(at_last + MS, PARAMS).startswith('odometry too old')
-
-
 def test_ticks_before_their_time_make_up_for_none_that_was_missed() -> None:
     loop = engaged()
     for now in (0, TICK, TICK + 20 * MS, TICK + 30 * MS, 4 * TICK, 5 * TICK):
         fly(loop, START + now)
     assert loop.missed == 2
-
-
-def test_several_cameras_see_from_the_yaw_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    views: list[FieldOfView | None] = []
-
-    def watched(*arguments: Any) -> Any:
-        views.append(arguments[8])
-        return step(*arguments)
-
-    monkeypatch.setattr(loop_module, 'step', watched)
-    loop = engaged()
-    loop.view = FieldsOfView.together((FieldOfView(0.5, 0.5, 0.4, 0.4),
-                                       FieldOfView(0.5, 0.5, 0.4, 0.4, heading=np.pi)))
-    loop.tick(START, PARAMS)  # before any odometry
-    fly(loop, START + TICK, START + 50 * MS)
-    loop.tick(START + 2 * TICK, PARAMS)  # and where none is new
-    yaws = [view.yaw for view in views if isinstance(view, FieldsOfView)]
-    assert yaws == pytest.approx([0.0, 0.3, 0.3])

@@ -18,49 +18,18 @@ from __future__ import annotations
 
 import math
 
+from flown import commanded, Follower, own, PARAMS, seen
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array, wrap_angle
-from flock_follower.planner.inputs import (
-    expected,
-    FRESH,
-    Neighbor,
-    OwnState,
-    since_measured,
-)
+from flock_follower.geometry import wrap_angle
+from flock_follower.planner.inputs import expected, FRESH
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.step import step
 
-PARAMS = PlannerParams()
 AHEAD = np.array([2.0, 0.0, 0.0])
-
-
-class Follower:
-    """A point mass that flies what one step after the other commands, with yaw at once."""
-
-    def __init__(self, params: PlannerParams = PARAMS) -> None:
-        self.params, self.memory = params, Memory()
-        self.now, self.yaw = 0.0, 0.0
-        self.position: Array = np.array([0.0, 0.0, 2.0])
-        self.velocity: Array = np.zeros(3)
-        self.decision = Decision(State.IDLE)
-
-    def tick(self, leader: Array | None = None, speed: tuple[float, ...] = (0.0, 0.0, 0.0)
-             ) -> Decision:
-        own = OwnState(self.now, self.position.copy(), self.velocity.copy(), self.yaw)
-        seen = [] if leader is None else [
-            Neighbor('leader', self.now, np.array(leader), np.array(speed))]
-        self.memory, self.decision = step(
-            self.memory, self.now, True, own, seen, self.params, ground=0.0)
-        assert self.decision.acceleration is not None and self.decision.yaw is not None
-        for _ in range(10):
-            self.velocity = self.velocity + 0.01 * self.decision.acceleration
-            self.position = self.position + 0.01 * self.velocity
-        self.now, self.yaw = self.now + 0.1, self.decision.yaw
-        return self.decision
 
 
 def lost(distance: float = 1.6, closing: float = 0.4, params: PlannerParams = PARAMS) -> Follower:
@@ -68,8 +37,8 @@ def lost(distance: float = 1.6, closing: float = 0.4, params: PlannerParams = PA
     follower = Follower(params)
     for tick in range(10):
         place = np.array([distance + closing * 0.1 * (9 - tick), 0.0, 2.0])
-        follower.tick(place, (-closing, 0.0, 0.0))
-    assert follower.decision.state is State.TRACK
+        decision = follower.tick(seen(follower.now, place, (-closing, 0.0, 0.0)))
+    assert decision.state is State.TRACK
     return follower
 
 
@@ -80,7 +49,7 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
         decision = follower.tick()
         said.append(decision.warnings)
         heights.append(follower.position[2])
-    assert follower.decision.state is State.HOLD
+    assert decision.state is State.HOLD
     # What it moved while the leader was still predicted comes on top.
     most = PARAMS.retreat_max + 2.0 * 0.4  # it was coming at 0.4 m/s
     assert most - 0.2 < math.dist(begin, follower.position) < most + 0.2
@@ -95,7 +64,8 @@ def test_it_does_not_catch_up_in_height_beside_a_closing_one_that_it_lost() -> N
     """The climb would take the speed with which it backs away."""
     follower = Follower()
     for tick in range(25):
-        follower.tick(np.array([1.4 - 0.045 * tick, 0.0, 2.0 - 0.03 * tick]), (-0.45, 0.0, -0.3))
+        follower.tick(seen(follower.now, [1.4 - 0.045 * tick, 0.0, 2.0 - 0.03 * tick],
+                           (-0.45, 0.0, -0.3)))
     for _ in range(16):
         follower.tick()
         assert follower.velocity[0] < -0.42  # 0.29 where it sank at 0.3 m/s
@@ -110,7 +80,7 @@ def test_where_it_shall_not_retreat_it_stays() -> None:
 
 
 def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
-    n = Neighbor('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.array([0.3, 0.0, 0.0]))
+    n = seen(velocity=(0.3, 0.0, 0.0))
     ages = np.linspace(0.0, 5.0, 51)
     spreads = np.array([expected(n, np.zeros(3), age, PARAMS).spread for age in ages])
     rates = np.array([expected(n, np.zeros(3), age, PARAMS).spreading for age in ages])
@@ -127,28 +97,19 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
                                                      (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
 def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(told: float, least: float,
                                                                      most: float) -> None:
-    n = Neighbor('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.zeros(3))
-    believed = expected(n, np.array([0.0, -told, 0.0]), 0.1, PARAMS).acceleration
+    believed = expected(seen(), np.array([0.0, -told, 0.0]), 0.1, PARAMS).acceleration
     assert least <= -believed[1] <= most
     assert believed[0] == believed[2] == 0.0
-
-
-def test_what_was_not_flown_yet_when_the_velocity_was_measured_counts() -> None:
-    pending, velocity, age = np.array([0.12, 0.0, 0.0]), 0.3, 0.06
-    # It is being flown at pending / response_time.
-    now = velocity + age * pending[0] / PARAMS.response_time
-    assert velocity + pending[0] * since_measured(age, PARAMS) == pytest.approx(now + pending[0])
-    assert since_measured(age, PlannerParams(response_time=0.0)) == 1.0
 
 
 def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> None:
     follower = Follower()
     for tick in range(10):
-        follower.tick(np.array([2.0, 0.06 * tick, 2.0]), (0.0, 0.6, 0.0))
-    seen = follower.yaw
-    while follower.decision.state is not State.HOLD:
-        follower.tick()
-    assert follower.yaw > seen + 0.1  # it went on to the left
+        follower.tick(seen(follower.now, [2.0, 0.06 * tick, 2.0], (0.0, 0.6, 0.0)))
+    before = follower.yaw
+    while follower.tick().state is not State.HOLD:
+        pass
+    assert follower.yaw > before + 0.1  # it went on to the left
     towards = follower.yaw
     turned = []
     for _ in range(200):
@@ -163,7 +124,7 @@ def test_it_follows_again_by_itself_within_resume_timeout() -> None:
     follower = lost()
     for _ in range(250):
         follower.tick()
-    assert follower.tick(follower.position + AHEAD).state is State.TRACK
+    assert follower.tick(seen(follower.now, follower.position + AHEAD)).state is State.TRACK
 
 
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])
@@ -178,9 +139,8 @@ def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str)
     last = memory.now
     for tick in range(1, 400):
         now = (last or 0.0) + 0.1 * tick
-        own = None if fault == 'no odometry' else OwnState(
-            now, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
-        memory, decision = step(memory, now, True, own, [], PARAMS,
+        me = None if fault == 'no odometry' else own(now)
+        memory, decision = step(memory, now, True, me, [], PARAMS,
                                 looked=last or 0.0 if fault == 'no image' else None)
         if now > end + 0.15:
             assert decision.state is (State.HOLD if seen_before else State.SEARCH)
@@ -190,16 +150,14 @@ def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str)
         elif now < end - 0.15 and fault != 'no odometry':
             assert decision.acceleration is not None
     assert memory.pending == pytest.approx(np.zeros(3))
-    leader = Neighbor('leader', now, 2.0 * AHEAD, np.zeros(3))
-    here = OwnState(now, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
-    assert step(memory, now, True, here, [leader], PARAMS)[1].acceleration is None
+    assert step(memory, now, True, own(now), [seen(now)], PARAMS)[1].acceleration is None
 
 
 def test_one_that_returns_too_near_is_not_faded_in() -> None:
     follower = lost()
     for _ in range(100):
         follower.tick()
-    decision = follower.tick(follower.position + 0.4 * AHEAD, (-0.3, 0.0, 0.0))
-    assert decision.acceleration is not None
-    assert decision.acceleration[0] < -1.0
-    assert math.hypot(*decision.acceleration) <= PARAMS.a_max
+    decision = follower.tick(seen(
+        follower.now, follower.position + 0.4 * AHEAD, (-0.3, 0.0, 0.0)))
+    assert commanded(decision)[0] < -1.0
+    assert math.hypot(*commanded(decision)) <= PARAMS.a_max

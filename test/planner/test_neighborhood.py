@@ -27,8 +27,9 @@ from flock_desk.flocks.graph import Graph
 from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
-from flock_follower.planner.neighborhood import edges, gathered, Tie
-from flock_follower.planner.params import Member, PlannerParams
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.neighborhood import edges, gathered
+from flock_follower.planner.params import AVOID, FOLLOWER, LEADER, Member, PlannerParams
 
 PARAMS = PlannerParams()
 
@@ -37,8 +38,11 @@ def own(position: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> OwnState:
     return OwnState(0.0, np.array(position), np.zeros(3), 0.0)
 
 
-def at(name: str, *position: float, heard: bool = False) -> Neighbor:
-    return Neighbor(name, 0.0, np.array(position), np.zeros(3), heard=heard)
+def at(name: str, *position: float, heard: bool = False, role: str = '',
+       radius: float = 0.0) -> Neighbor:
+    role = role or (FOLLOWER if heard else LEADER)
+    return Neighbor(name, 0.0, np.array(position), np.zeros(3), heard=heard,
+                    who=Member(role, radius))
 
 
 def chosen(places: Array, held: Sequence[set[str]] | None = None) -> list[set[str]]:
@@ -73,14 +77,6 @@ def test_the_graph_is_connected_and_mutual_where_all_is_known(seed: int, count: 
         assert graph(joined).connected and mutual(joined)
 
 
-def test_in_a_lattice_each_attends_to_those_next_to_it() -> None:
-    places = np.array([[2.0 * k, 2.0 * row, 0.0] for row in range(3) for k in range(4)])
-    for names, place in zip(chosen(places), places):
-        near = {str(k) for k, other in enumerate(places) if 0.1 < np.linalg.norm(
-            other - place) < 2.1}
-        assert names == near
-
-
 def changes(noise: float, hold: bool, seed: int = 1) -> int:
     """Return how often an edge of nine in a lattice, or of a triangle, came or went in 20 s."""
     rng = np.random.default_rng(seed)
@@ -112,45 +108,43 @@ def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> Non
     leader = at('leader', 3.0, 0.0, 0.0)
     between = at('follower_2', 1.5, 0.0, 0.0, heard=True)
     assert edges(set(), own(), [leader, between], PARAMS) == {'leader', 'follower_2'}
-    other = at('follower_3', -2.0, 0.0, 0.0)
-    params = PlannerParams(vehicles={'follower_3': Member('follower')})
-    assert edges(set(), own(), [leader, between, other], params) == {'follower_2', 'follower_3'}
+    other = at('follower_3', -2.0, 0.0, 0.0, role=FOLLOWER)
+    assert edges(set(), own(), [leader, between, other], PARAMS) == {'follower_2', 'follower_3'}
 
 
 def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
-    params = PlannerParams(vehicles={'stranger': Member('avoid')})
-    flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0)]
-    assert edges(set(), own(), flock, params) == {'leader'}
-    neighbors = gathered({}, '', own(), flock, params, 0.1)
+    flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
+    assert edges(set(), own(), flock, PARAMS) == {'leader'}
+    neighbors = gathered(Memory(), own(), flock, PARAMS, 0.1)
     assert neighbors.faced is flock[0] and neighbors.level is flock[0]
-    assert [each.role for each in neighbors.known(params)] == ['leader', 'avoid']
 
 
 def test_lengths_are_between_hulls() -> None:
     """A big one in the middle is as near to both as its hull is."""
     flock = [at('far', 3.0, 0.0, 0.0), at('big', 1.5, 2.7, 0.0)]
     assert edges(set(), own(), flock, PARAMS) == {'far', 'big'}
-    big = PlannerParams(vehicles={'big': Member('follower', 0.5)})
-    assert edges(set(), own(), flock, big) == {'big'}
+    flock[1] = at('big', 1.5, 2.7, 0.0, role=FOLLOWER, radius=0.5)
+    assert edges(set(), own(), flock, PARAMS) == {'big'}
 
 
 def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
-    flock = [at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0)]
-    ties = gathered({}, '', own(), flock, PARAMS, 0.1).ties
-    assert all(tie == Tie(True, 1.0) for tie in ties.values())
-    flock = [*flock, at('c', -2.0, 0.0, 0.0)]
-    shares = []
+    def after(memory: Memory, *flock: Neighbor) -> Memory:
+        found = gathered(memory, own(), flock, PARAMS, 0.1)
+        return Memory(shares=found.shares, edges=found.edges)
+
+    a, b, c = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0), at('c', -2.0, 0.0, 0.0)
+    memory, shares = after(Memory(), a, b), []
+    assert memory == Memory(shares={'a': 1.0, 'b': 1.0}, edges=frozenset('ab'))
     for _ in range(6):
-        ties = gathered(ties, '', own(), flock, PARAMS, 0.1).ties
-        shares.append(ties['c'].share)
+        memory = after(memory, a, b, c)
+        shares.append(memory.shares['c'])
     assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
-    assert gathered(ties, '', own(), flock[:1], PARAMS, 0.1).ties == {'a': Tie(True, 1.0)}
+    assert after(memory, a) == Memory(shares={'a': 1.0}, edges=frozenset('a'))
 
 
-def test_whom_it_faces_changes_only_for_one_clearly_nearer() -> None:
-    a, b = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0)
-    for faced, expected in (('', 'b'), ('a', 'a'), ('b', 'b')):
-        neighbors = gathered({}, faced, own(), [a, b], PARAMS, 0.1)
-        assert neighbors.faced is not None and neighbors.faced.name == expected
-    neighbors = gathered({}, 'a', own(), [a, at('b', 0.0, 1.7, 0.0)], PARAMS, 0.1)
-    assert neighbors.faced is not None and neighbors.faced.name == 'b'
+@pytest.mark.parametrize(('before', 'expected'), [('', 'b'), ('a', 'a'), ('b', 'b')])
+def test_whom_it_faces_changes_only_for_one_clearly_nearer(before: str, expected: str) -> None:
+    a, b, near = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0), at('c', -1.5, 0.0, 0.0)
+    for flock, found in (([a, b], expected), ([a, b, near], 'c')):
+        faced = gathered(Memory(faced=before), own(), flock, PARAMS, 0.1).faced
+        assert faced is not None and faced.name == found

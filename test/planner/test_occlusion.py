@@ -16,22 +16,21 @@
 
 import math
 
+from flown import Follower, own, seen
 import numpy as np
 import pytest
 
-from flock_follower.planner.inputs import Neighbor, OwnState
-from flock_follower.planner.memory import Memory
+from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, FieldsOfView, Occlusion, occlusion
-from flock_follower.planner.step import step
+from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion
 
-VIEW = FieldOfView(0.5, 0.5, 0.35, 0.35)
-ME = OwnState(1.0, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
+VIEW = (FieldOfView(0.5, 0.5, 0.35, 0.35),)
+ME = own(1.0)
 
 
 def leader(stamp: float, x: float = 2.0, y: float = 0.0, z: float = 2.0) -> Neighbor:
-    return Neighbor('leader', stamp, np.array([x, y, z]), np.zeros(3))
+    return seen(stamp, (x, y, z))
 
 
 def frames(*stamps: float) -> list[float]:
@@ -56,9 +55,9 @@ def test_a_camera_that_is_tilted_by_an_acceleration_looks_elsewhere() -> None:
 
 def test_without_a_calibration_or_by_hearsay_nothing_is_occluded() -> None:
     images = frames(0.8, 0.9, 1.0)
-    assert occlusion(None, leader(0.7), ME, images, None, 0.0) is None
+    assert occlusion(None, leader(0.7), ME, images, (), 0.0) is None
     assert occlusion(None, None, ME, images, VIEW, 0.0) is None
-    told = Neighbor('leader', 0.7, np.array([2.0, 0.0, 2.0]), np.zeros(3), heard=True)
+    told = seen(0.7, heard=True)
     assert occlusion(None, told, ME, images, VIEW, 0.0) is None
 
 
@@ -76,37 +75,23 @@ def test_three_detections_in_a_row_end_it() -> None:
 @pytest.mark.parametrize('heading', [0.0, math.pi / 2.0, math.pi, -math.pi / 2.0])
 def test_of_several_cameras_the_one_that_should_show_it_counts(heading: float) -> None:
     sides = tuple(FieldOfView(0.6, 0.6, 0.4, 0.4, at) for at in (0.0, math.pi / 2.0, math.pi))
-    view = FieldsOfView.together(sides)
     there = leader(0.7, 2.0 * math.cos(heading), 2.0 * math.sin(heading))
-    found = occlusion(None, there, ME, frames(0.8, 0.9, 1.0), view, 0.0)
+    found = occlusion(None, there, ME, frames(0.8, 0.9, 1.0), sides, 0.0)
     assert (found is not None) == (heading >= 0.0)
 
 
-def flown(shown: float, v: float = 0.5) -> list[tuple[float, State, float]]:
-    """Return time, state and speed behind a leader that is hidden from a time on until 2 s."""
-    memory, params, speed, place, record = Memory(), PlannerParams(v_max=2.0), v, 0.0, []
-    stamps: list[float] = []
-    newest: list[Neighbor] = []
-    for tick in range(1, 40):
-        now = 0.1 * tick
-        stamps += [now - 0.1 + 0.033 * k for k in range(1, 4)]
-        seen = [s for s in stamps[-3:] if s < shown or s > 2.0]
-        newest = [Neighbor('leader', s, np.array([2.1 + v * s, 0.0, 2.0]),
-                                   np.array([v, 0.0, 0.0])) for s in seen]
-        me = OwnState(now, np.array([place, 0.0, 2.0]), np.array([speed, 0.0, 0.0]), 0.0)
-        memory, decision = step(memory, now, True, me, newest, params, looked=now, view=VIEW,
-                                frames=stamps[-20:])
-        assert decision.acceleration is not None
-        for _ in range(10):
-            speed += 0.01 * float(decision.acceleration[0])
-            place += 0.01 * speed
-        record.append((now, decision.state, speed))
-    return record
-
-
 def test_it_brakes_at_once_and_follows_again() -> None:
-    record = flown(1.0)
-    states = [state for _, state, _ in record]
+    """Behind a leader that is hidden from 1 to 2 s."""
+    follower, speed, stamps = Follower(PlannerParams(v_max=2.0)), np.array([0.5, 0.0, 0.0]), []
+    follower.velocity, follower.now, states = speed, 0.1, []
+    for tick in range(1, 40):
+        now = follower.now
+        stamps += [now - 0.1 + 0.033 * k for k in range(1, 4)]
+        decision = follower.tick(*[
+            seen(s, np.array([2.1, 0.0, 2.0]) + s * speed, speed) for s in stamps[-3:]
+            if s < 1.0 or s > 2.0], looked=now, view=VIEW, frames=stamps[-20:])
+        states.append(decision.state)
+        if tick == 19:
+            assert abs(follower.velocity[0]) < 0.15
     assert states[:10] == [State.TRACK] * 10 and states[10:20] == [State.HOLD] * 10
-    assert abs(record[18][2]) < 0.15
     assert State.TRACK in states[20:23] and states[-1] is State.TRACK

@@ -24,7 +24,6 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.messages import from_odometry, odometry, OdometryState
-from flock_follower.planner.inputs import overdue, REMEMBERED, Rhythm, Span, too_slow
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
@@ -58,7 +57,13 @@ class Source:
         return sent
 
 
-def fly(source: Source, seconds: float = 20.0,
+def take(loop: PlannerLoop, stamp: int, arrival: int) -> None:
+    loop.take_odometry(OdometryState(
+        stamp, 'odom', 'base_link', np.array([0.0, 0.0, 2.0]), IDENTITY_QUATERNION, np.zeros(3),
+        np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(3)), arrival)
+
+
+def fly(source: Source, seconds: float = 10.0,
         lost: float = np.inf) -> list[tuple[float, Decision]]:
     """
     Return the decisions of ticks at 10 Hz beside a leader who is always in sight, by their times.
@@ -74,9 +79,7 @@ def fly(source: Source, seconds: float = 20.0,
         now = START + tick * SECOND // 10
         while waiting and waiting[0][0] <= now:
             arrival, stamp = waiting.pop(0)
-            loop.take_odometry(OdometryState(
-                stamp, 'odom', 'base_link', np.array([0.0, 0.0, 2.0]), IDENTITY_QUATERNION,
-                np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(3)), arrival)
+            take(loop, stamp, arrival)
         loop.take_neighbor(from_odometry(odometry(
             empty, now, 'odom', 'leader', (2.0, 0.0, 2.0), IDENTITY_QUATERNION, (0.0, 0.1, 0.0))))
         decisions.append((tick / 10, loop.tick(now, PARAMS)[0]))
@@ -90,10 +93,8 @@ def changes(decisions: list[tuple[float, Decision]]) -> list[State]:
 
 
 @pytest.mark.parametrize('source', [
-    Source(10.0), Source(10.0, phase=0.03), Source(10.0, phase=0.05, jitter=0.001), Source(9.9),
-    Source(10.1), Source(10.0, 0.1), Source(20.0, 0.1), Source(15.0, 0.08, jitter=0.03),
-    Source(9.5, jitter=0.01), Source(10.0, phase=0.04, jitter=0.02), Source(7.0), Source(6.0),
-    Source(7.0, jitter=0.02), Source(10.0, jitter=0.04), Source(60.0, 0.01), Source(30.0, 0.09),
+    Source(10.0, phase=0.05, jitter=0.001), Source(9.9), Source(10.0, 0.1),
+    Source(15.0, 0.08, jitter=0.03), Source(6.0), Source(10.0, jitter=0.04), Source(60.0, 0.01),
     Source(30.0, 0.06, jitter=0.05)], ids=str)
 def test_slow_odometry_is_followed_on_steadily(source: Source) -> None:
     decisions = fly(source)
@@ -103,8 +104,7 @@ def test_slow_odometry_is_followed_on_steadily(source: Source) -> None:
 
 
 @pytest.mark.parametrize('source', [
-    Source(5.0), Source(4.5, jitter=0.02), Source(10.0, 0.17), Source(30.0, 0.2),
-    Source(60.0, 0.16)], ids=str)
+    Source(4.5, jitter=0.02), Source(10.0, 0.17), Source(60.0, 0.16)], ids=str)
 def test_odometry_too_slow_to_fly_on_brakes_steadily_and_says_so(source: Source) -> None:
     decisions = fly(source)
     assert len(changes(decisions)) <= 4
@@ -114,22 +114,16 @@ def test_odometry_too_slow_to_fly_on_brakes_steadily_and_says_so(source: Source)
     assert any(d.reason.startswith('odometry too slow (0.') for d in late)
 
 
-def test_odometry_at_the_very_limit_does_not_come_and_go() -> None:
-    decisions = fly(Source(30.0, 0.15, jitter=0.02), 60.0)
-    assert len(changes(decisions)) <= 4
-
-
 @pytest.mark.parametrize(('source', 'most'), [
-    (Source(60.0, 0.007), 0.15), (Source(30.0, 0.01), 0.15), (Source(20.0, 0.06), 0.15),
-    (Source(10.0, 0.06), 0.16 * 1.2), (Source(7.0, 0.06), 0.24),
+    (Source(60.0, 0.007), 0.15), (Source(20.0, 0.06), 0.15), (Source(7.0, 0.06), 0.24),
     (Source(10.0, 0.06, jitter=0.02), 0.18 * 1.2)], ids=str)
-@pytest.mark.parametrize('lost', [9.98, 10.01, 10.04, 10.07])
+@pytest.mark.parametrize('lost', [5.98, 6.04])
 def test_lost_odometry_is_braked_on_at_the_first_tick_after_it_is_overdue(
         source: Source, most: float, lost: float) -> None:
-    last = max(stamp for arrival, stamp in source.arrivals(20.0)
+    last = max(stamp for arrival, stamp in source.arrivals(8.0)
                if arrival < START + lost * SECOND)
     ended = (last - START) / SECOND
-    for time, decision in fly(source, lost=lost):
+    for time, decision in fly(source, 8.0, lost=lost):
         if time > ended + most + 1e-6:
             assert decision.state is State.HOLD
             assert decision.reason.startswith(('odometry late', 'odometry too old'))
@@ -137,57 +131,10 @@ def test_lost_odometry_is_braked_on_at_the_first_tick_after_it_is_overdue(
             assert decision.acceleration is None
 
 
-def test_a_hiccup_of_fast_odometry_makes_nobody_patient_for_long() -> None:
-    rhythm = Rhythm()
-    for k in range(120):
-        stamp = START + k * SECOND // 60
-        rhythm.take(stamp, stamp + (SECOND // 5 if k == 60 else SECOND // 100))
-        patient = not overdue(0.16, rhythm.spans, TIMEOUT)
-        assert patient == (60 <= k < 60 + REMEMBERED)
-        assert too_slow(rhythm.spans, TIMEOUT, before=False) is None
-
-
-def test_an_outage_leaves_what_comes_after_it_usable() -> None:
-    rhythm = Rhythm()
-    for stamp in [*range(0, SECOND, SECOND // 30), 3 * SECOND]:
-        rhythm.take(START + stamp, START + stamp + SECOND // 100)
-    assert rhythm.spans[-1].last > 1.0
-    assert too_slow(rhythm.spans, TIMEOUT, before=False) is None
-    assert not overdue(0.1, rhythm.spans, TIMEOUT)
-    assert overdue(0.25, rhythm.spans, TIMEOUT)
-
-
 def test_the_same_odometry_again_tells_no_rhythm_and_a_jump_back_ends_it() -> None:
-    rhythm = Rhythm()
-    for now in (0, 1, 2):
-        rhythm.take(START, START + now * SECOND)
-    assert not rhythm.spans
-    rhythm.take(START + SECOND, START + 3 * SECOND)
-    assert list(rhythm.spans) == [Span(0.0, 3.0)]
-    rhythm.take(START - SECOND, START)
-    assert not rhythm.spans
-
-
-def test_whatever_the_rhythm_nothing_is_overdue_before_half_of_the_timeout() -> None:
-    for usual in (0.0, 0.05, 0.2, 0.24):
-        spans = [Span(0.0, usual)] * REMEMBERED
-        assert not overdue(0.149, spans, TIMEOUT)
-        assert overdue(0.241, spans, TIMEOUT)
-    assert overdue(0.151, (), TIMEOUT)
-
-
-@pytest.mark.parametrize(('span', 'slow', 'stays'), [
-    (Span(0.06, 0.16), False, False), (Span(0.0, 0.23), False, True),
-    (Span(0.0, 0.25), True, True), (Span(0.14, 0.16), False, True),
-    (Span(0.16, 0.18), True, True)])
-def test_what_was_too_slow_has_to_become_clearly_faster(span: Span, slow: bool,
-                                                        stays: bool) -> None:
-    for before, expected in ((False, slow), (True, stays)):
-        age = too_slow([span] * 3, TIMEOUT, before)
-        assert age == (span.last if expected else None)
-
-
-@pytest.mark.parametrize(('slow', 'told'), [(9, None), (11, 0.28)])
-def test_what_counts_is_how_it_usually_is(slow: int, told: float | None) -> None:
-    spans = [Span(0.08, 0.28)] * slow + [Span(0.01, 0.03)] * (REMEMBERED - slow)
-    assert too_slow(spans, TIMEOUT, before=False) == told
+    loop = PlannerLoop(require_bridge=False)
+    arrived = [(0, 0), (0, 1), (0, 2), (1, 3), (1, 4), (2, 4), (-1, 5)]  # stamp and arrival, s
+    for (stamp, arrival), spans in zip(arrived, ([], [], [], [(0, 3)], [(0, 3)],
+                                                 [(0, 3), (2, 3)], [])):
+        take(loop, START + stamp * SECOND, START + arrival * SECOND)
+        assert list(loop._spans) == spans

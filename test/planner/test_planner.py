@@ -20,6 +20,9 @@ from dataclasses import replace
 import math
 from typing import Any
 
+import flown
+from flown import commanded, STILL
+from flown import seen as leader
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -27,30 +30,23 @@ from numpy.typing import ArrayLike
 import pytest
 
 from flock_follower.flocking import acceleration, FlockingParams
-from flock_follower.geometry import Array, wrap_angle
+from flock_follower.geometry import Array
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import next_state, odometry_fault, State
-from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams
+from flock_follower.planner.params import ALTITUDE_MODES, AVOID, Member, PlannerParams, ROLES
 from flock_follower.planner.step import Decision, step
 
-PARAMS = PlannerParams()
+PARAMS = flown.PARAMS
 LOOSE = PlannerParams(a_max=20.0, v_max=20.0)  # limits that bind nowhere below
 # The law as it is, at once, within limits.
 LAW = PlannerParams(guard=False, handover_time=0.0, yaw_rate_max=6.0, period=1.0)
 FREE = replace(LAW, a_max=20.0, v_max=20.0, altitude_mode='hold')
-STILL = (0.0, 0.0, 0.0)
 
 
 def own(stamp: float = 0.0, position: ArrayLike = (0.0, 0.0, 2.0),
         velocity: ArrayLike = STILL, yaw: float = 0.3) -> OwnState:
-    return OwnState(stamp, np.array(position), np.array(velocity), yaw)
-
-
-def leader(stamp: float = 0.0, position: ArrayLike = (2.0, 0.0, 2.0),
-           velocity: ArrayLike = STILL, name: str = 'leader',
-           **covariances: Array) -> Neighbor:
-    return Neighbor(name, stamp, np.array(position), np.array(velocity), **covariances)
+    return flown.own(stamp, position, velocity, yaw)
 
 
 def decide(now: float, *neighbors: Neighbor, me: OwnState | None = None,
@@ -64,11 +60,6 @@ def tracking(now: float = 0.0, params: PlannerParams = PARAMS, **state: Any) -> 
     memory, decision = step(Memory(), now, True, own(now), [leader(now, **state)], params)
     assert decision.state is State.TRACK
     return memory
-
-
-def commanded(decision: Decision) -> Array:
-    assert decision.acceleration is not None
-    return decision.acceleration
 
 
 @pytest.mark.parametrize(('engaged', 'fault', 'youngest', 'followed', 'expected'), [
@@ -96,16 +87,6 @@ def test_state_follows_from_the_age_of_the_inputs(engaged: bool, fault: str,
     assert fault in reason or not engaged
 
 
-def test_nothing_is_commanded_before_engaging_nor_after_disengaging() -> None:
-    memory, decision = step(Memory(), 0.0, False, own(), [leader()], PARAMS)
-    assert (decision.state, decision.acceleration, decision.yaw) == (State.IDLE, None, None)
-    memory, decision = step(memory, 0.1, True, own(0.1), [], PARAMS)
-    assert decision.state is State.TRACK
-    memory, decision = step(memory, 0.2, False, own(0.2), [leader(0.2)], PARAMS)
-    assert (decision.state, decision.acceleration) == (State.IDLE, None)
-    assert (memory.followed, memory.altitude, memory.yaw) == (None, None, None)
-
-
 def test_track_applies_the_law_to_states_predicted_to_now() -> None:
     me = own(0.9, (0.1, -0.2, 2.0), (0.2, 0.0, 0.0))
     it = leader(0.8, (2.0, 0.5, 2.1), (0.1, 0.4, 0.0))
@@ -118,13 +99,6 @@ def test_track_applies_the_law_to_states_predicted_to_now() -> None:
     w = it.velocity - me.velocity
     passing = (x * w[1] - y * w[0]) / (x ** 2 + y ** 2)
     assert decision.yaw == pytest.approx(math.atan2(y, x) + 0.4 * passing)  # of when it is there
-
-
-@pytest.mark.parametrize(('distance', 'sign'), [(1.05, -1), (2.7, 1), (3.5, 1), (0.8, -1)])
-def test_a_leader_too_far_ahead_is_approached_and_one_too_near_avoided(distance: float,
-                                                                       sign: int) -> None:
-    it = leader(0.0, (distance, 0.0, 2.0), (0.0, 0.05, 0.0))
-    assert np.sign(commanded(decide(0.0, it))[0]) == sign
 
 
 def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_back() -> None:
@@ -196,13 +170,16 @@ def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
 
 
 def test_odometry_that_jumps_takes_its_new_altitude_and_forgets_the_neighbors() -> None:
-    memory, _ = step(Memory(), 0.0, True, own(0.0), [leader(0.0)], PARAMS)
-    higher = own(0.1, position=(0.0, 0.0, 7.0))
-    memory, decision = step(memory, 0.1, True, higher, [], PARAMS)
-    assert decision.rejected[0].reason == 'odometry jumped'
-    assert commanded(decision)[2] == 0.0
+    memory, jumped = tracking(), (0.0, 0.0, 2.35)
+    memory, decision = step(memory, 0.1, True, own(0.1, jumped), [], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['odometry jumped']
+    assert commanded(decision)[2] == pytest.approx(0.0)
     assert not memory.neighbors
-    assert memory.altitude is not None and memory.altitude.held == 7.0
+    assert memory.altitude is not None and memory.altitude.held == 2.35
+    late = leader(0.05)  # seen before, in the frame that was
+    memory, decision = step(memory, 0.2, True, own(0.2, jumped), [late], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['estimate older than the jump of odometry']
+    assert not memory.neighbors
 
 
 def test_odometry_that_comes_late_does_not_replace_newer() -> None:
@@ -216,7 +193,6 @@ def test_odometry_that_comes_late_does_not_replace_newer() -> None:
     (leader(1.0, (math.nan, 0.0, 0.0)), 'not finite', 'holds NaN or infinity'),
     (leader(math.inf), 'not finite', 'holds NaN or infinity'),
     (leader(1.0, velocity=(math.inf, 0.0, 0.0)), 'not finite', 'holds NaN or infinity'),
-    (leader(1.0, (1.0, 2.0)), 'malformed', 'position and velocity must have 3 components'),
     (leader(1.0, velocity=(0.0, 51.0, 0.0)), 'too fast', '51 m/s'),
     (leader(1.0, (0.0, 101.0, 2.0)), 'too far', '101 m'),
     (leader(1.0, (1e308, -1e308, 0.0)), 'too far', '1.41e+308 m'),
@@ -269,24 +245,6 @@ def test_a_jump_back_in_time_forgets_the_inputs_of_before() -> None:
         assert decision.state is State.SEARCH
 
 
-def test_a_stamp_slightly_ahead_of_the_clock_is_accepted() -> None:
-    assert decide(1.0, leader(1.0 + 0.9 * FUTURE_TOLERANCE)).state is State.TRACK
-
-
-def test_altitude_is_held_where_it_was_engaged_while_the_leader_climbs() -> None:
-    params = replace(PARAMS, altitude_mode='hold', v_max=2.0)
-    memory = tracking(params=params)
-    high = leader(0.1, (2.0, 0.0, 3.0))
-    _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 1.9)), [high], params)
-    assert commanded(decision)[2] == pytest.approx(0.1 * PARAMS.altitude_frequency ** 2)
-    for k, z in enumerate((2.2, 2.4, 2.6, 2.8)):
-        now = 0.1 * (k + 1)
-        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)),
-                                [leader(now, (2.0, 0.0, 3.0))], params)
-    most = PARAMS.max_vertical_acceleration
-    assert -most - 0.2 < commanded(decision)[2] <= -most  # and the integral
-
-
 @pytest.mark.parametrize('age', [0.1, 1.0, 3.0])  # TRACK, COAST then HOLD, HOLD
 def test_altitude_hold_acts_in_every_state_and_damps_out(age: float) -> None:
     memory, z, vz = tracking(params=LOOSE), 1.8, 0.1
@@ -301,20 +259,6 @@ def test_altitude_hold_acts_in_every_state_and_damps_out(age: float) -> None:
         heights.append(z)
     assert heights[-1] == pytest.approx(2.0, abs=1e-2)
     assert max(heights) < 2.05  # of 0.2 m; without the integral nothing
-
-
-def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
-    params = replace(LAW, period=0.1, v_max=5.0)
-    memory = Memory()
-    for k, z in enumerate((2.0, 1.8, 1.6, 1.4, 1.2)):  # faster it would be taken for a jump
-        now = 0.1 * k
-        far = leader(now, (6.0, 0.02 * k, 2.0), (0.0, 0.2, 0.0))
-        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)), [far], params)
-    u = commanded(decision)
-    assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration, abs=0.15)  # and the integral
-    assert np.linalg.norm(u) == pytest.approx(PARAMS.a_max)
-    assert u[0] > 1.9
-    assert decision.limits == 'a_max'
 
 
 def test_v_max_limits_what_the_law_asks_for_and_is_reported() -> None:
@@ -344,90 +288,13 @@ def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
     assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
 
 
-def test_search_turns_round_once_in_about_thirteen_seconds_and_stops_when_it_sees() -> None:
-    memory, yaws = Memory(), [0.3]
-    for tick in range(126):
-        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
-        assert decision.state is State.SEARCH
-        yaws.append(decision.yaw)
-    assert np.mod(np.diff(yaws), 2.0 * math.pi) == pytest.approx(0.05)
-    assert yaws[-1] == pytest.approx(0.3 + 126 * 0.05 - 2.0 * math.pi)
-    ahead = leader(12.6, (2.0 * math.cos(yaws[-1]), 2.0 * math.sin(yaws[-1]), 2.0))
-    memory, decision = step(memory, 12.6, True, own(12.6), [ahead], PARAMS)
-    assert decision.state is State.TRACK
-    assert decision.yaw == pytest.approx(yaws[-1])
-
-
-def test_nothing_turns_in_search_where_the_yaw_is_to_be_held() -> None:
-    decision = decide(0.0, params=PlannerParams(yaw_mode='hold'))
-    assert (decision.state, decision.yaw) == (State.SEARCH, 0.3)
-
-
-def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
-    params = PlannerParams(yaw_mode='hold')
+def test_yaw_and_altitude_of_the_engagement_are_held_if_their_modes_say_so() -> None:
+    params = PlannerParams(yaw_mode='hold', altitude_mode='hold')
     memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
-    _, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [leader(0.1)], params)
+    above = leader(0.1, (2.0, 0.0, 3.0))
+    memory, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [above], params)
     assert decision.yaw == 1.1
-
-
-def turned(bearing: float, turning: float = 0.0, yaw: float = 0.0,
-           **changes: Any) -> list[tuple[float, float, Decision]]:
-    """
-    Return bearing, own yaw and decision of 10 s of flight under yaw rate control.
-
-    The vehicle's rate follows the commanded one within 0.2 s, and odometry is 50 ms late.
-
-    :param bearing: of the leader at the start, rad, which turns by ``turning``, rad/s.
-    """
-    params = replace(PARAMS, **changes)
-    memory, rate, past, flown = Memory(), 0.0, [yaw] * 5, []
-    for tick in range(100):
-        now = 0.1 * tick
-        angle = bearing + turning * now
-        place = (2.0 * math.cos(angle), 2.0 * math.sin(angle), 2.0)
-        memory, decision = step(memory, now, True, own(now - 0.05, yaw=past[-5]),
-                                [leader(now, place)], params)
-        flown.append((angle, past[-1], decision))
-        for _ in range(10):
-            rate += 0.01 / 0.2 * (decision.yaw_rate - rate)
-            past.append(wrap_angle(past[-1] + 0.01 * rate))
-    return flown
-
-
-@pytest.mark.parametrize('bearing', [0.0, 0.5, -1.0, 3.0, -3.1])
-def test_the_yaw_rate_alone_turns_the_vehicle_to_the_leader(bearing: float) -> None:
-    flown = turned(bearing)
-    assert all(abs(d.yaw_rate) <= PARAMS.yaw_rate_max for _, _, d in flown)
-    assert abs(wrap_angle(flown[-1][1] - bearing)) < 0.01
-    beyond = [math.copysign(1.0, bearing) * wrap_angle(yaw - bearing) for _, yaw, _ in flown
-              if abs(wrap_angle(yaw - bearing)) < 1.0]
-    assert max(beyond) < 0.1  # rad of overshoot
-
-
-def test_the_yaw_rate_turns_along_with_a_leader_that_circles() -> None:
-    flown = turned(0.0, turning=0.4)
-    assert flown[-1][2].yaw_rate == pytest.approx(0.4, abs=0.02)
-    late = [abs(wrap_angle(angle - yaw)) for angle, yaw, _ in flown[50:]]
-    assert max(late) < 0.2
-
-
-def test_the_yaw_rate_keeps_a_held_yaw_against_a_turn() -> None:
-    _, decision = step(Memory(yaw=0.5), 0.0, True, own(yaw=0.3), [leader()],
-                       replace(PARAMS, yaw_mode='hold'))
-    assert decision.yaw == 0.5
-    assert decision.yaw_rate == pytest.approx(0.3)  # 1.5 1/s of 0.2 rad, anticlockwise
-    _, decision = step(Memory(yaw=math.pi - 0.1), 0.0, True, own(yaw=0.1 - math.pi), [],
-                       replace(PARAMS, yaw_mode='hold'))
-    assert decision.yaw_rate == pytest.approx(-0.3)  # the short way round
-
-
-def test_searching_turns_at_the_scan_rate_and_idle_at_none() -> None:
-    memory, decision = step(Memory(), 0.0, True, own(), [], PARAMS)
-    ahead = PARAMS.scan_rate * PARAMS.period
-    assert decision.yaw_rate == pytest.approx(PARAMS.scan_rate + 1.5 * ahead)
-    memory, decision = step(memory, 0.0, True, own(), [], PARAMS)  # no time passed
-    assert decision.yaw_rate == pytest.approx(1.5 * ahead)
-    assert step(memory, 0.1, False, own(0.1), [], PARAMS)[1].yaw_rate == 0.0
+    assert memory.altitude is not None and memory.altitude.held == 2.0
 
 
 def fly(ticks: int, params: PlannerParams, memory: Memory, start: int = 1,
@@ -526,14 +393,6 @@ def test_one_that_is_lost_is_kept_clear_of_while_another_is_followed() -> None:
     assert 'separation' in decision.limits
 
 
-def test_a_lost_neighbor_is_not_chased() -> None:
-    memory = tracking(position=(2.7, 0.0, 2.0), velocity=(0.4, 0.0, 0.0))
-    for tick in range(1, 20):
-        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
-    assert (decision.state, decision.limits) == (State.COAST, 'separation')
-    assert commanded(decision)[0] < 0.0  # it may turn back
-
-
 def test_a_command_on_its_way_counts_as_flown() -> None:
     """Approaching at a speed that it may just have, one that brakes already brakes less."""
     near = leader(0.5, (1.5, 0.0, 2.0))
@@ -574,64 +433,53 @@ STAMPS = [0.0, -0.02, -0.1, -0.25, 0.05] * 5 + [-0.31, -0.6, -1.9, -12.0, 0.2, 8
 
 def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Array]:
     """Return a stamp, position and velocity, mostly usable, sometimes of any other kind."""
-    position, velocity = rng.uniform(-2.0, 2.0, 3), rng.uniform(-0.6, 0.6, 3)
-    if rng.random() < 0.1:
-        position[rng.integers(3)] = rng.choice(WILD)
-    if rng.random() < 0.1:
-        velocity[rng.integers(3)] = rng.choice(WILD)
+    position, velocity = rng.uniform(-3.0, 3.0, 3), rng.uniform(-0.6, 0.6, 3)
+    for vector in (position, velocity):
+        if rng.random() < 0.1:
+            vector[rng.integers(3)] = rng.choice(WILD)
     return now + float(rng.choice(STAMPS)), position, velocity
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
-@given(st.integers(0, 2 ** 32), st.sampled_from(ALTITUDE_MODES))
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2 ** 32), st.integers(1, 8), st.sampled_from(ALTITUDE_MODES))
 @pytest.mark.filterwarnings('ignore:overflow')
-def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int,
+def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, count: int,
                                                                   altitude_mode: str) -> None:
+    """Whatever comes, of neighbors of any kind."""
     rng = np.random.default_rng(seed)
-    params = PlannerParams(altitude_mode=altitude_mode)
+    roles = {f'n{k}': Member(str(rng.choice(ROLES)), float(rng.choice([0.0, 0.3, 1.5])))
+             for k in range(count)}
+    params = PlannerParams(altitude_mode=altitude_mode, vehicles=roles if count > 1 else {},
+                           v_max=float(rng.choice([0.5, 2.0])))
     memory, now = Memory(), 100.0
-    for _ in range(30):
+    for _ in range(25):
         now += float(rng.choice([0.1] * 15 + [0.7, 3.0, -0.05, -8.0]))
         engaged = rng.random() < 0.95
         me = own(*draw_state(rng, now)) if rng.random() < 0.8 else None
-        seen = [leader(*draw_state(rng, now), name) for name in 'ab' if rng.random() < 0.4]
-        memory, decision = step(memory, now, engaged, me, seen, params)
-        if not engaged:
-            assert decision.state is State.IDLE
+        around = [leader(*draw_state(rng, now), name, heard=rng.random() < 0.3,
+                         position_covariance=np.eye(3) * float(rng.choice([0.0, 1e-4, math.nan])))
+                  for name in roles if rng.random() < 0.5]
+        memory, decision = step(memory, now, engaged, me, around, params)
+        assert {*decision.edges} <= {name for name, n in memory.neighbors.items()
+                                     if n.who.role != AVOID}
+        assert engaged or decision.state is State.IDLE
         if decision.acceleration is None:
             assert decision.yaw is None
             continue
-        assert engaged
-        assert memory.own is not None
+        assert engaged and memory.own is not None and decision.yaw is not None
         assert -FUTURE_TOLERANCE <= now - memory.own.stamp <= params.odom_timeout
         if decision.state is State.TRACK:
-            assert decision.stamp is not None
-            assert -FUTURE_TOLERANCE <= now - decision.stamp <= params.predict_timeout
+            assert decision.edges and decision.stamp is not None
+            assert -FUTURE_TOLERANCE <= now - decision.stamp <= params.heard_timeout
         elif decision.stamp is not None:  # to keep clear of one that is lost
-            assert decision.state in (State.COAST, State.HOLD)
-            assert 'separation' in decision.limits
-        assert np.all(np.isfinite(decision.acceleration))
+            assert decision.state is State.COAST and 'separation' in decision.limits
+        assert np.all(np.isfinite([*decision.acceleration, decision.yaw]))
         assert np.linalg.norm(decision.acceleration) <= params.a_max
-        speed = float(np.linalg.norm(memory.own.velocity))
         reached = memory.own.velocity + decision.acceleration * params.period
+        speed = float(np.linalg.norm(memory.own.velocity))
         assert np.linalg.norm(reached) <= max(speed, params.v_max)
-        assert decision.yaw is not None
-        assert math.isfinite(decision.yaw)
         assert abs(decision.yaw_rate) <= params.yaw_rate_max
-
-
-def test_equal_inputs_give_equal_decisions_bit_for_bit() -> None:
-    def fly() -> list[bytes]:
-        rng, memory, outputs = np.random.default_rng(7), Memory(), []
-        for tick in range(50):
-            now = 0.1 * tick
-            seen = [leader(now - 0.03, 2.0 + rng.normal(0.0, 0.1, 3), rng.normal(0.0, 0.1, 3))]
-            memory, decision = step(memory, now, True, own(now), seen, PARAMS)
-            outputs.append(commanded(decision).tobytes())
-        return outputs
-
-    assert fly() == fly()
 
 
 def test_noise_carries_a_follower_behind_a_hovering_leader_to_the_middle_of_the_band() -> None:
@@ -654,7 +502,7 @@ def test_noise_carries_a_follower_behind_a_hovering_leader_to_the_middle_of_the_
     ({'a_max': -1.0}, r'^a_max = -1\.0: must be a number in \[0\.1, 20\] m/s\^2$'),
     ({'v_max': math.nan}, r'^v_max = nan: must be a number in \[0\.05, 20\] m/s$'),
     ({'coast_timeout': 0.4},
-     r'^coast_timeout = 0\.4: must be a number in \[predict_timeout, 10\] s, '),
+     r'^coast_timeout = 0\.4: must be at least predict_timeout = 0\.5$'),
     ({'yaw_mode': 'spin'}, r"^yaw_mode = 'spin': must be one of leader, hold$"),
 ])
 def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
@@ -665,17 +513,6 @@ def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
 
 def test_default_law_is_that_of_the_papers_flights() -> None:
     assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
-
-
-def test_odometry_that_jumps_by_a_third_of_a_metre_is_told_and_altitude_starts_anew() -> None:
-    memory = tracking()
-    memory, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 2.35)), [], PARAMS)
-    assert [r.reason for r in decision.rejected] == ['odometry jumped']
-    assert commanded(decision)[2] == pytest.approx(0.0)
-    late = leader(0.05)  # seen before, in the frame that was
-    memory, decision = step(memory, 0.2, True, own(0.2, (0.0, 0.0, 2.35)), [late], PARAMS)
-    assert [r.reason for r in decision.rejected] == ['estimate older than the jump of odometry']
-    assert not memory.neighbors
 
 
 def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clear() -> None:
@@ -713,8 +550,8 @@ def settled(it: Neighbor, velocity: ArrayLike, params: PlannerParams) -> Decisio
     for tick in range(8):
         now = 0.1 * tick
         memory, decision = step(memory, now, True, own(now, velocity=velocity), [
-            replace(it, stamp=now)], params)
-        memory = replace(memory, own=None)  # where it is is no jump
+            it._replace(stamp=now)], params)
+        memory = memory._replace(own=None)  # where it is is no jump
     return decision
 
 

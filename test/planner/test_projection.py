@@ -12,77 +12,120 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Nearest and farthest points, against all points of a fine sample."""
+"""The projection against the search over all candidates, on cases of every kind."""
 
 from __future__ import annotations
 
-from exhaustive_projection import Ball, Bound, discs, Lens, planners, planners_best
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+import cmath
+import math
+
+import exhaustive_projection as reference
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array
+from flock_follower.planner.projection import Discs, lexicographic, optimum, product, Side
 
-SEED = st.integers(0, 2 ** 32)
+CASES = 120  # of each kind of bounds
+DISCS = ('any', 'any', 'guard', 'tangent outside', 'tangent inside', 'same', 'point')
+KINDS = ('any', 'with room', 'one point', 'touching', 'parallel', 'nearly parallel', 'grid',
+         'tangent')
 
-
-def drawn(seed: int, count: int) -> tuple[Lens, list[Bound], Array, Array]:
-    """Return a lens, bounds, a point, and the sampled points of the lens within the bounds."""
-    rng = np.random.default_rng(seed)
-    lens = Lens(Ball(np.zeros(2), 1.0), Ball(rng.normal(size=2), rng.uniform(0.5, 2.0)))
-    bounds = [Bound(rng.normal(size=2), rng.uniform(-1.0, 0.4)) for _ in range(count)]
-    points = rng.uniform(-1.0, 1.0, (20_000, 2))
-    for ball in lens:
-        points = points[np.linalg.norm(points - ball.centre, axis=1) <= ball.radius]
-    for bound in bounds:
-        points = points[points @ bound.normal >= bound.least]
-    return lens, bounds, 2.0 * rng.normal(size=2), points
+Generator = np.random.Generator
 
 
-@settings(max_examples=60)
-@given(SEED, st.integers(0, 4))
-def test_the_nearest_and_the_farthest_point_beat_every_sampled_one(seed: int, count: int
-                                                                   ) -> None:
-    lens, bounds, wanted, points = drawn(seed, count)
-    assume(len(points))
-    near, far = (planners_best(wanted, far, bounds, lens) for far in (False, True))
-    assert near is not None
-    assert far is not None
-    for point in (near, far):
-        assert all(ball.holds(point) for ball in lens)
-        assert all(bound.holds(point) for bound in bounds)
-    assert np.linalg.norm(near - wanted) <= np.linalg.norm(points - wanted, axis=1).min() + 1e-7
-    assert far @ wanted >= (points @ wanted).max() - 1e-7
+def unit(rng: Generator) -> complex:
+    return cmath.rect(1.0, rng.uniform(-math.pi, math.pi))
 
 
-def test_bounds_that_exclude_one_another_have_no_nearest_point() -> None:
-    lens = Lens(Ball(np.zeros(2), 1.0), Ball(np.zeros(2), 1.0))
-    apart = [Bound(np.array([1.0, 0.0]), 0.5), Bound(np.array([-1.0, 0.0]), 0.5)]
-    assert planners_best(np.zeros(2), False, apart, lens) is None
-    assert planners_best(np.ones(2), True, apart, lens) is None
+def normal(rng: Generator) -> complex:
+    return complex(*rng.normal(size=2))
 
 
-@settings(max_examples=60)
-@given(SEED, st.integers(1, 5))
-def test_a_bound_is_met_as_well_as_those_before_it_allow(seed: int, count: int) -> None:
-    lens, _, wanted, _ = drawn(seed, 0)
-    points = drawn(seed, 0)[3]
-    assume(len(points) > 100)
-    rng = np.random.default_rng(seed)
-    bounds = [Bound(rng.normal(size=2), rng.uniform(-0.5, 1.5)) for _ in range(count)]
-    point = planners(wanted, bounds, lens)
-    assert all(ball.holds(point) for ball in lens)
-    for bound in bounds:
-        best = (points @ bound.normal).max()
-        assert bound.normal @ point >= min(bound.least, best) - 1e-6
-        # The next is judged among the points that meet this one as well as the result does.
-        met = min(bound.least, float(bound.normal @ point))
-        points = points[points @ bound.normal >= met - 1e-9]
-        if not len(points):
-            return
+def two_discs(rng: Generator, kind: str) -> Discs:
+    """Return discs of radii as in flight; they may touch from outside or from inside."""
+    radius, other = rng.uniform(0.5, 3.0), rng.uniform(0.5, 6.0)
+    if kind == 'guard':
+        radius, other = 2.5, 5.0
+    elif kind == 'same':
+        other = radius
+    elif kind == 'point':
+        other = 0.0
+    apart = {'guard': rng.uniform(0.0, 5.0), 'tangent outside': radius + other, 'same': 0.0,
+             'tangent inside': abs(radius - other), 'point': rng.uniform(0.0, radius)}.get(
+        kind, rng.uniform(max(abs(radius - other) - 0.2, 0.0), 0.98 * (radius + other)))
+    return Discs(0j, radius, apart * unit(rng), other)
 
 
-def test_of_two_equally_wanted_points_of_a_rim_one_inside_is_taken() -> None:
-    lens = Lens(Ball(np.zeros(2), 1.0), Ball(np.array([1.5, 0.0]), 1.0))
-    assert discs(lens).best(0.75 + 0j) == pytest.approx(0.75 + 0j)
+def bounds(rng: Generator, discs: Discs, kind: str, most: int) -> list[Side]:
+    """Return up to so many bounds; all but 'any' lie specially to the discs or to each other."""
+    inside, found = discs.best(3.0 * normal(rng)), list[Side]()
+    for _ in range(int(rng.integers(0, most + 1))):
+        n = rng.uniform(0.1, 1.0) * unit(rng)
+        if kind == 'grid':
+            n = complex(*rng.integers(-1, 2, 2)) or 1.0 + 0j
+        elif 'parallel' in kind and found and rng.random() < 0.6:
+            n = float(rng.choice([-1.0, -0.3, 0.5, 1.0])) * found[rng.integers(len(found))][0]
+            n += 1e-3 * normal(rng) if kind == 'nearly parallel' else 0.0
+        there, slack, k = product(n, inside), abs(n) * rng.exponential(0.5), rng.integers(2)
+        least = {'with room': there - slack, 'one point': there,
+                 'touching': there - float(rng.random() < 0.5) * slack,
+                 'grid': float(rng.integers(-3, 4)) / 2.0,
+                 'tangent': product(n, discs[2 * k]) + abs(n) * discs[2 * k + 1]}.get(
+            kind, abs(n) * rng.uniform(-2.0, 3.0))
+        found.append((n, least))
+    return found
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_first_bounds_first_is_what_trying_all_candidates_finds(kind: str) -> None:
+    for case in range(CASES):
+        rng = np.random.default_rng([2, KINDS.index(kind), case])
+        discs = two_discs(rng, DISCS[rng.integers(len(DISCS))])
+        sides, wanted = bounds(rng, discs, kind, 7), 3.0 * normal(rng)
+        point = lexicographic(wanted, sides, discs)
+        assert point == pytest.approx(reference.lexicographic(wanted, sides, discs), abs=1e-6)
+        assert reference.holds(point, [], discs), case
+
+
+@pytest.mark.parametrize('far', [False, True])
+def test_the_best_point_or_none_is_what_trying_all_candidates_finds(far: bool) -> None:
+    none = 0
+    for case in range(CASES):
+        rng = np.random.default_rng([2, case])
+        discs = two_discs(rng, 'any')
+        sides, goal = bounds(rng, discs, KINDS[case % 2], 5), 3.0 * normal(rng)
+        point, met = optimum(goal, far, sides, discs)
+        expected = (reference.farthest if far else reference.nearest)(goal, sides, discs)
+        assert (met == len(sides)) == (expected is not None), case
+        assert expected is None or point == pytest.approx(expected, abs=1e-6), case
+        none += expected is None
+    assert 0.1 * CASES < none < 0.5 * CASES
+
+
+def test_bounds_that_exclude_one_another_by_rounding_only_are_all_met() -> None:
+    """Whichever way a comparison falls out, and whatever bound beyond reach comes after them."""
+    for case in range(500):
+        rng = np.random.default_rng([2, case])
+        discs = two_discs(rng, 'any')
+        place, normals = discs.best(normal(rng)), [unit(rng)]
+        for _ in range(int(rng.integers(2, 6))):
+            opposite = rng.random() < 0.6
+            normals.append(-normals[rng.integers(len(normals))] if opposite else unit(rng))
+        excess = rng.choice([0.0, 5e-12, 9e-12, 1e-11, -1e-11, 2e-11, 1e-10, 1e-9, 1e-8],
+                            len(normals))
+        together = int(rng.integers(1, len(normals) + 1))
+        excess[together:together + 1] = 1.0
+        sides = [(n, product(n, place) + float(more)) for n, more in zip(normals, excess)]
+        point = lexicographic(3.0 * normal(rng), sides, discs)
+        assert min(product(n, point) - least for n, least in sides[:together]) > -1e-4, case
+
+
+@pytest.mark.parametrize(('sides', 'expected'), [
+    ([], 0.3), ([(0j, 1.0), (1j, 0.5)], 0.3 + 0.5j),  # without a direction
+    ([(1j, math.inf), (1 + 0j, 0.5)], 2j), ([(1j, -math.inf), (1e-3j, 5e-4)], 0.3 + 0.5j),
+    ([(1j, 1e18), (-1j, 1e18)], 2j)])
+@pytest.mark.filterwarnings('error')
+def test_bounds_without_a_direction_or_without_an_end(sides: list[Side],
+                                                      expected: complex) -> None:
+    point = lexicographic(0.3 + 0j, sides, Discs(0j, 2.0, 1 + 0j, 4.0))
+    assert point == pytest.approx(expected, abs=1e-6)

@@ -16,40 +16,35 @@
 
 from __future__ import annotations
 
+from flown import Follower, seen
 import numpy as np
 import pytest
 
-from flock_follower.planner.inputs import Neighbor, OwnState
-from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import Member, PlannerParams
-from flock_follower.planner.step import Decision, step
+from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams(resume_timeout=12.0, vehicles={
     'leader': Member(), 'behind': Member('follower'), 'ahead': Member('follower')})
 PLACES = {'leader': (2.0, 0.0, 2.0), 'behind': (-1.9, 0.0, 2.0), 'ahead': (2.0, 0.0, 2.0)}
 
 
-def fly(seconds: float, seen: str, heard: str, memory: Memory | None = None
-        ) -> tuple[Memory, list[Decision]]:
+def fly(seconds: float, in_sight: str, heard: str, follower: Follower | None = None
+        ) -> tuple[Follower, list[Decision]]:
     """Hover with those seen and heard around, the nose where it is commanded to be."""
-    memory, decisions = memory or Memory(), []
+    follower, decisions = follower or Follower(PARAMS), []
     for _ in range(round(seconds / 0.1)):
-        now = 0.0 if memory.now is None else memory.now + 0.1
-        yaw = 0.0 if memory.yaw is None else memory.yaw
-        memory, decision = step(
-            memory, now, True, OwnState(now, np.array([0.0, 0.0, 2.0]), np.zeros(3), yaw),
-            [Neighbor(name, now, np.array(PLACES[name]), np.zeros(3),
-                              heard=name in heard.split())
-             for name in (*seen.split(), *heard.split())], PARAMS)
-        decisions.append(decision)
-    return memory, decisions
+        follower.position, follower.velocity = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+        decisions.append(follower.tick(*(
+            seen(follower.now, PLACES[name], name=name, heard=name in heard.split())
+            for name in (*in_sight.split(), *heard.split()))))
+    return follower, decisions
 
 
 def test_it_looks_where_the_leader_was_then_to_both_sides_then_all_round() -> None:
-    memory, _ = fly(1.0, 'leader', 'behind')
-    memory, there = fly(2.0, '', 'behind', memory)
+    follower, _ = fly(1.0, 'leader', 'behind')
+    follower, there = fly(2.0, '', 'behind', follower)
     assert max(abs(d.yaw or 0.0) for d in there) < 0.1
-    memory, round_about = fly(9.0, '', 'behind', memory)
+    follower, round_about = fly(9.0, '', 'behind', follower)
     yaws = np.unwrap([d.yaw for d in round_about])
     assert yaws.max() > 0.7 and yaws.min() < -1.5
     assert all(d.state.value == 'TRACK' for d in there + round_about)
@@ -57,28 +52,28 @@ def test_it_looks_where_the_leader_was_then_to_both_sides_then_all_round() -> No
 
 
 def test_after_resume_timeout_it_turns_to_whom_it_hears_of() -> None:
-    memory, _ = fly(1.0, 'leader', 'behind')
-    memory, decisions = fly(PARAMS.resume_timeout + 8.0, '', 'behind', memory)
+    follower, _ = fly(1.0, 'leader', 'behind')
+    follower, decisions = fly(PARAMS.resume_timeout + 8.0, '', 'behind', follower)
     assert abs(decisions[-1].yaw or 0.0) == pytest.approx(np.pi, abs=0.05)
     assert not any('looks for' in warning for warning in decisions[-1].warnings)
 
 
 def test_one_that_comes_into_view_meanwhile_does_not_end_it() -> None:
-    memory, _ = fly(1.0, 'leader', 'behind')
-    memory, _ = fly(3.0, '', 'behind', memory)
-    memory, _ = fly(1.0, 'behind', '', memory)
-    assert memory.looking
-    memory, decisions = fly(4.0, 'leader', 'behind', memory)
-    assert not memory.looking and abs(decisions[-1].yaw or 0.0) < 0.05
+    follower, _ = fly(1.0, 'leader', 'behind')
+    follower, _ = fly(3.0, '', 'behind', follower)
+    follower, _ = fly(1.0, 'behind', '', follower)
+    assert follower.memory.looking
+    follower, decisions = fly(4.0, 'leader', 'behind', follower)
+    assert not follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 0.05
 
 
-@pytest.mark.parametrize(('seen', 'heard', 'then_seen', 'then_heard'), [
+@pytest.mark.parametrize(('in_sight', 'heard', 'then_seen', 'then_heard'), [
     ('leader behind', '', 'behind', ''),  # another one is in view: it stays with that
     ('leader', 'behind', '', 'leader behind'),  # it is heard of
     ('ahead', 'behind', '', 'behind'),  # whoever talks will be heard of again
     ('', 'leader behind', '', 'behind')])  # never seen: others know better where it was
-def test_it_does_not_look_for(seen: str, heard: str, then_seen: str, then_heard: str) -> None:
-    memory, _ = fly(1.0, seen, heard)
-    memory, decisions = fly(3.0, then_seen, then_heard, memory)
-    assert not memory.looking
+def test_it_does_not_look_for(in_sight: str, heard: str, then_seen: str, then_heard: str) -> None:
+    follower, _ = fly(1.0, in_sight, heard)
+    follower, decisions = fly(3.0, then_seen, then_heard, follower)
+    assert not follower.memory.looking
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)

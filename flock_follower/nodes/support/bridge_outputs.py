@@ -16,14 +16,16 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 import math
 import time
+from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
@@ -45,7 +47,7 @@ class BridgeOutputs:
     """
     Publishes in the publisher thread; the setpoint thread calls ``on_messages`` and ``on_cycle``.
 
-    They decide from the bridge's state and submit finished values.
+    They decide from the bridge's state and submit functions that make a message.
     """
 
     def __init__(self, node: Node, bridge: Bridge, report: BridgeReport,
@@ -81,25 +83,27 @@ class BridgeOutputs:
             elif known := estimate(position, attitude, age):
                 self._send_estimate(known)
         if battery is not None and battery.time == now:
-            self._publisher.submit(lambda: self._publish_battery(battery))
+            self._publish(self._battery, lambda: self._battery_state(battery))
         self._send_arming(now)
 
     def on_cycle(self, now: float) -> None:
-        """Publish the state; log the autopilot's texts, and its mode if that changed."""
+        """Publish the state; log the autopilot's texts, and state and mode if they changed."""
         state, (before, announced) = self._bridge.state(now), self._announced
         if state != before or now - announced >= STATE_PERIOD - 1e-3:
             self._announced = state, now
-            self._publisher.submit(lambda: self._publish_state(state, state != before))
+            self._publish(self._states, lambda: String(data=state))
+        if state != before:
+            self._log(f'state: {state}')
         for text in self._bridge.texts.new(now):
-            self._publisher.submit(partial(self._log, f'autopilot: {text.text}',
-                                      text.severity <= mavlink.MAV_SEVERITY_WARNING))
+            self._log(f'autopilot: {text.text}',
+                      warning=text.severity <= mavlink.MAV_SEVERITY_WARNING)
         status, dialect = self._bridge.telemetry.status, self._bridge.telemetry.dialect
         if status is not None and dialect is not None:
             armed = 'armed' if status.armed else 'disarmed'
             mode = f'autopilot: {dialect.title}, {status.mode}, {armed}'
             if mode != self._mode:
                 self._mode = mode
-                self._publisher.submit(lambda: self._log(mode))
+                self._log(mode)
 
     def _send_arming(self, now: float) -> None:
         """Publish the place of arming by the odometry, if there is any."""
@@ -108,7 +112,7 @@ class BridgeOutputs:
             return
         begun, self._armed = self._armed is False and status.armed, status.armed
         if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
-            self._publisher.submit(lambda: self._publish_arming(place[0]))
+            self._publish(self._armed_at, lambda: _point(place[0]))
 
     def _send_estimate(self, known: AutopilotEstimate) -> None:
         if known.time <= self._last_estimate:
@@ -116,36 +120,28 @@ class BridgeOutputs:
             self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
             return
         self._last_estimate = known.time
-        self._publisher.submit(lambda: self._publish_odometry(known))
+        self._publish(self._odometry, lambda: to_odometry(
+            nanoseconds_to_stamp(self._stamp(known.time)), 'odom', 'base_link',
+            known.position, known.quaternion, known.velocity, known.angular_velocity))
 
-    # The publisher thread.
+    def _publish(self, publisher: Publisher, make: Callable[[], Any]) -> None:
+        """Have the publisher thread make a message and publish it; odometry if subscribed."""
+        def publish() -> None:
+            if self._node.context.ok() and (
+                    publisher is not self._odometry or publisher.get_subscription_count()):
+                publisher.publish(make())
+        self._publisher.submit(publish)
 
     def _log(self, text: str, warning: bool = False) -> None:
-        if warning:
-            self._node.get_logger().warning(text)
-        else:
-            self._node.get_logger().info(text)
+        """Have the publisher thread log a text."""
+        def log() -> None:
+            if warning:
+                self._node.get_logger().warning(text)
+            else:
+                self._node.get_logger().info(text)
+        self._publisher.submit(log)
 
-    def _publish_state(self, state: str, changed: bool) -> None:
-        if self._node.context.ok():
-            self._states.publish(String(data=state))
-        if changed:
-            self._log(f'state: {state}')
-
-    def _publish_arming(self, state: OdometryState) -> None:
-        if self._node.context.ok():
-            message = PointStamped()
-            message.header.stamp = nanoseconds_to_stamp(state.stamp)
-            message.header.frame_id = state.frame
-            set_vector(message.point, state.position)
-            self._armed_at.publish(message)
-
-    def _publish_odometry(self, known: AutopilotEstimate) -> None:
-        if not self._node.context.ok() or not self._odometry.get_subscription_count():
-            return
-        self._odometry.publish(to_odometry(
-            nanoseconds_to_stamp(self._stamp(known.time)), 'odom', 'base_link', known.position,
-            known.quaternion, known.velocity, known.angular_velocity))
+    # The publisher thread.
 
     def _stamp(self, valid: float) -> int:
         """Return the ROS time, ns, of a time on the monotonic clock, s, never in the future."""
@@ -157,9 +153,7 @@ class BridgeOutputs:
                 break
         return max(0, now - max(0, round((after - valid) * 1e9)))
 
-    def _publish_battery(self, battery: Battery) -> None:
-        if not self._node.context.ok():
-            return
+    def _battery_state(self, battery: Battery) -> BatteryState:
         message = BatteryState(
             voltage=battery.voltage, percentage=battery.remaining, present=True,
             # In ROS a current that discharges is negative.
@@ -169,4 +163,12 @@ class BridgeOutputs:
         message.header.stamp = self._node.get_clock().now().to_msg()
         if battery.current > 0.0:
             message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
-        self._battery.publish(message)
+        return message
+
+
+def _point(state: OdometryState) -> PointStamped:
+    message = PointStamped()
+    message.header.stamp = nanoseconds_to_stamp(state.stamp)
+    message.header.frame_id = state.frame
+    set_vector(message.point, state.position)
+    return message

@@ -25,9 +25,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
+from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
@@ -72,7 +71,7 @@ class BridgeReport:
         self._reboots = 0
         self._reported_check: ParameterCheck | None = None
         self._planner_values: dict[str, Any] = {}
-        self._logged: dict[str, tuple[Request, bool]] = {}  # by cause; whether its result is, too
+        self._logged: dict[Request, bool] = {}  # whether its result is logged, too
         self._bytes = (self._start, 0, 0)
         alive, housekeeping = self._while_alive, bridge.housekeeping
         diagnostics.checks += [
@@ -97,17 +96,13 @@ class BridgeReport:
             self._events.append(lambda: shown.rate('stream').tick(now))
         due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
-        if cycle.first is not None:
-            for name, start in (('latency', cycle.first.source_time),
-                                ('tick_latency', cycle.first.time)):
-                self._events.append(partial(self._add_latency, name, now - start))
+        if (first := cycle.first) is not None:
+            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+            self._events.append(lambda: shown.latency('tick_latency').add(now - first.time))
         before = self._last.setpoint.kind if self._last else ''
         if before == COMMAND and cycle.setpoint.kind != COMMAND:
             self._brakes[cycle.setpoint.reason] += 1
         self._last = cycle
-
-    def _add_latency(self, name: str, seconds: float) -> None:
-        self._diagnostics.latency(name).add(seconds)
 
     def fault(self, where: str, error: Exception) -> None:
         """Record an exception."""
@@ -239,7 +234,7 @@ class BridgeReport:
     def _log_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
         check, values = self._bridge.housekeeping.parameters, self._diagnostics.values
-        result = None if check is None else check.result
+        result = check.result()
         if result is None:
             return
         values['parameters'] = (
@@ -260,29 +255,24 @@ class BridgeReport:
     def _log_own_requests(self) -> None:
         """Log what the bridge itself has requested, and the result."""
         log = self._node.get_logger()
-        for cause, request, why in (
-                ('blind', self._bridge.blind_landing, 'no velocity can be believed'),
-                ('handover', self._bridge.handover, self._bridge.end.why)):
-            if request is None:
-                continue
-            known, logged = self._logged.get(cause, (None, False))
-            if request is not known:
+        own = ((self._bridge.blind_landing, 'no velocity can be believed'),
+               (self._bridge.handover, self._bridge.end.why))
+        before, self._logged = self._logged, {
+            request: request.outcome is not None for request, _ in own if request is not None}
+        for request, why in own:
+            if request is not None and request not in before:
                 log.error(f'the bridge requests {request.goal.name}: {why}')
-                logged = False
-            if request.outcome is not None and not logged:
+            if request is not None and request.outcome is not None and not before.get(request):
                 tell = log.warning if request.outcome.success else log.error
                 tell(request.outcome.message)
-            self._logged[cause] = request, request.outcome is not None
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
-        status, values = self._bridge.status(now), self._diagnostics.values
-        values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
+        values = self._diagnostics.values
+        values[REFUSED] = self._bridge.refusal(now) if self._bridge.alive(now) else ''
         values.pop(NOT_READY, None)
-        if status is not None and not status.armed and self._bridge.housekeeping.has_reasons(now):
-            against = self._bridge.texts.unready(now, status.mode)
-            values[NOT_READY] = against and estimator_health.explained(
-                against, self._bridge.telemetry.estimator, now)
+        if (against := self._bridge.unready(now)) is not None:
+            values[NOT_READY] = against
 
     # Problems; '' or None if there is none.
 
@@ -353,8 +343,8 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} takes none')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard and not takeoff.explains_mode(
-            bridge.requests.newest, bridge.telemetry, now)
+        unserved = status is not None and status.offboard and not (
+            bridge.requests.takeoff_explains_mode(now))
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
@@ -370,9 +360,9 @@ class BridgeReport:
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        permission = self._bridge.gate.permission
-        if permission.reason.startswith(TWO_COMMAND):
-            return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
+        reason = self._bridge.gate.permission.reason
+        if reason.startswith(TWO_COMMAND):
+            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 

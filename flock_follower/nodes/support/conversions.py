@@ -32,7 +32,7 @@ def message_class(msgtype: str) -> Any:
     """
     Return the Python class of a message type such as 'nav_msgs/msg/Odometry'.
 
-    :raises ValueError: where the name is malformed or its package is not installed.
+    :raises ValueError: if the name is malformed or its package is not installed.
     """
     package, _, name = msgtype.partition('/msg/')
     try:

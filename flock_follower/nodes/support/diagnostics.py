@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-What a node tells about itself: rates, latencies, and a counter per reason of rejection.
+The diagnostics of a node: rates, latencies, and a counter per reason of rejection.
 
-Published at 1 Hz on ``/diagnostics`` (REP-107) by a steady timer, so that a node whose clock
-or inputs have stopped still says so.
+Published at 1 Hz on ``/diagnostics`` (REP-107) by a steady timer, so that a node reports even if
+its clock or its inputs have stopped.
 """
 
 from __future__ import annotations
@@ -38,17 +38,18 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
+NONE_SENDING = 'none sending'
 UNNAMED = '(no name yet)'  # a publisher that is seen before its node is
 Problem = tuple[bytes, str]
 
 
 def internal_error(error: Exception, where: str = '') -> str:
-    """Return how an exception nobody foresaw is told: its kind, and its words."""
+    """Return the text of an unexpected exception: its type and message."""
     return f'internal error{where and f" {where}"}: {type(error).__name__}: {error}'
 
 
 def rivals(node: Node, topic: str, doing: str, level: bytes = ERROR) -> Problem | None:
-    """Return a problem where several nodes publish on a topic on which only one may."""
+    """Return a problem if several nodes publish on a topic that only one may publish."""
     names = publishers(node, topic)
     doing = doing.format(node.resolve_topic_name(topic))
     return (level, f'{len(names)} publishers {doing}: {listed(names)}; only one may'
@@ -56,20 +57,20 @@ def rivals(node: Node, topic: str, doing: str, level: bytes = ERROR) -> Problem 
 
 
 def publishers(node: Node, topic: str) -> list[str]:
-    """Return the full name of the node of each publisher, one killed up to 20 s ago, too."""
+    """Return the full name of the node of each publisher, also if killed up to 20 s ago."""
     return [UNNAMED if 'UNKNOWN' in end.node_name else
             f'{end.node_namespace.rstrip("/")}/{end.node_name}'
             for end in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
 
 
 def listed(names: list[str]) -> str:
-    """Return names for people, each once."""
+    """Return names as text, each once."""
     return ', '.join(f'{name} ({count} times)' if count > 1 else name
                      for name, count in sorted(Counter(names).items()))
 
 
 class Rate:
-    """The rate of events over the last few seconds, and how many there were in all."""
+    """The rate of events over the last few seconds, and their number."""
 
     def __init__(self, window: float = 5.0) -> None:
         self._window = window
@@ -110,7 +111,7 @@ class Latency:
 
 
 class Input:
-    """One subscribed topic, watched: when nothing comes, it can say why."""
+    """One subscribed topic; it finds the reason for a silence."""
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile,
                  timeout: float, required: bool, of: str = '') -> None:
@@ -123,9 +124,11 @@ class Input:
         self._since = time.monotonic()
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
+        self.heartbeat: Input | None = None
+        """Another topic of the same publisher: while it comes, silence here is no fault."""
 
     def arrived(self) -> None:
-        """Record that a message came."""
+        """Record the arrival of a message."""
         self._since = time.monotonic()
         self.rate.tick(self._since)
 
@@ -134,7 +137,11 @@ class Input:
         silent = now - self._since
         if not self._required or silent <= self._timeout:
             return None
-        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {self._reason()}'
+        reason = self._reason()
+        if reason.endswith(NONE_SENDING) and self.heartbeat and (
+                now - self.heartbeat._since <= self._timeout):
+            return None
+        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {reason}'
 
     def _reason(self) -> str:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -147,7 +154,7 @@ class Input:
             verdict, why = qos_check_compatible(publisher.qos_profile, self._qos)
             if verdict == QoSCompatibility.ERROR:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
-        return f'{len(publishers)} publisher(s), none sending'
+        return f'{len(publishers)} publisher(s), {NONE_SENDING}'
 
 
 class Diagnostics:
@@ -167,6 +174,7 @@ class Diagnostics:
         self.rates: dict[str, Rate] = {}
         self.latencies: dict[str, Latency] = {}
         self.checks: list[Callable[[float], Problem | None]] = []
+        self.inputs: dict[str, Input] = {}
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -179,6 +187,7 @@ class Diagnostics:
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
         watched = Input(self._node, topic, type_name, qos, timeout, required, of)
         self.checks.append(watched.problem)
+        self.inputs[topic] = watched
         self.rates[f'{topic}_hz'] = watched.rate
         return watched
 
@@ -196,7 +205,7 @@ class Diagnostics:
         self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
 
     def internal_error(self, where: str, error: Exception) -> None:
-        """Count an exception nobody foresaw; show and log what it was and where it came from."""
+        """Count an unexpected exception; show and log it with its place."""
         reason = f'internal error {where}'
         message = internal_error(error, where)
         if places := traceback.extract_tb(error.__traceback__):
@@ -223,18 +232,15 @@ class Diagnostics:
 
     def problems(self, now: float) -> list[Problem]:
         """Return every current problem, the worst first."""
-        found = [problem for problem in (self._ask(check, now) for check in self.checks)
-                 if problem is not None]
+        found = []
+        for check in self.checks:
+            try:
+                found.append(check(now))
+            except Exception as error:
+                self.internal_error(f'in check {getattr(check, "__name__", check)}', error)
         found += [(ERROR, message) for last, message in self._internal.values()
                   if now - last < ERROR_SHOWN]
-        return sorted(found, key=lambda problem: problem[0], reverse=True)
-
-    def _ask(self, check: Callable[[float], Problem | None], now: float) -> Problem | None:
-        try:
-            return check(now)
-        except Exception as error:
-            self.internal_error(f'in check {getattr(check, "__name__", check)}', error)
-            return None
+        return sorted(filter(None, found), key=lambda problem: problem[0], reverse=True)
 
     def publish(self) -> None:
         """Publish the status now (called at 1 Hz)."""
@@ -246,11 +252,11 @@ class Diagnostics:
             name=self._node.get_fully_qualified_name().lstrip('/'),
             level=problems[0][0] if problems else OK,
             message='; '.join(message for _, message in problems) or 'running')
-        values: dict[str, Any] = dict(self.values)
-        values.update({name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()})
+        values = {**self.values,
+                  **{name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}}
         for name, latency in self.latencies.items():
-            values.update(latency.values(name))
-        values.update({f'rejected: {reason}': n for reason, n in self.counters.items()})
+            values |= latency.values(name)
+        values |= {f'rejected: {reason}': n for reason, n in self.counters.items()}
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
@@ -258,5 +264,5 @@ class Diagnostics:
 
 
 def _without_details(message: str) -> str:
-    """Return what of a problem's message stays the same while it lasts."""
+    """Return the part of a problem's message that stays the same while it lasts."""
     return message.split(':')[0].rstrip('0123456789. s')

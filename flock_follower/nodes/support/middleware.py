@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How a process that must not wait talks to the other nodes: over UDP, not shared memory."""
+"""The transport of Fast DDS for a process that must not wait: UDP, not shared memory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from typing import Final
 
 from flock_follower.resources import resource
 
-#: Of Fast DDS where no profile says otherwise, bytes.
+#: The shared memory of Fast DDS without a profile, bytes.
 DEFAULT_SEGMENT: Final = 512 * 1024
 HERE: Final = 'this computer'
 PEERS: Final = 'named peers'
@@ -34,7 +34,7 @@ _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _OWN_PROFILE = 'config/fastdds.xml'
 _UDP_PROFILE = 'config/fastdds_udp.xml'
-#: With a receive buffer for images: where ROS is kept to this computer, and where it is not.
+#: With a receive buffer for images: for ROS on this computer alone, and otherwise.
 _UDP_IMAGES_PROFILE = 'config/fastdds_udp_images.xml'
 _IMAGES_PROFILE = 'config/fastdds_images.xml'
 IMAGES_BUFFER: Final = 4 * 1024 * 1024
@@ -44,10 +44,10 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     """
     Have Fast DDS use UDP alone; call it before ``rclpy.init`` with ``os.environ``.
 
-    When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that one,
-    now and then for 333 ms, where it was killed for 1 s; who publishes meanwhile waits, with the
-    GIL: the whole process stands still (eProsima/Fast-DDS issue 6535). Other middleware, and
-    settings of the user's own, are left as they are; ``shares_memory`` tells what came of it.
+    When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that
+    process, sometimes for 333 ms, for 1 s if it was killed. A publisher waits meanwhile and holds
+    the GIL: the whole process stops (eProsima/Fast-DDS issue 6535). Other middleware, and the
+    user's own settings, are left as they are; ``shares_memory`` shows the result.
 
     :param environment: changed in place.
     """
@@ -70,9 +70,9 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
 
 def reach(environment: Mapping[str, str]) -> str:
     """
-    Return how far a node that is started with it is found: HERE, PEERS or NETWORK.
+    Return how far a node started with an environment is found: HERE, PEERS or NETWORK.
 
-    Peers are more than those it names: who names this computer finds the node, too.
+    A computer that names this one as its peer finds the node, too.
     """
     get = environment.get
     if get('RMW_IMPLEMENTATION', _FAST_DDS).startswith('rmw_fastrtps') and (
@@ -85,9 +85,9 @@ def reach(environment: Mapping[str, str]) -> str:
 
 def avoid_shared_memory_for_images(environment: MutableMapping[str, str], most: int) -> bool:
     """
-    Do as ``avoid_shared_memory``, with room for images, and return whether there can be that.
+    Do as ``avoid_shared_memory``, with a buffer for images; return whether the kernel allows it.
 
-    Without it an image of 300 kB rarely arrives whole: then nothing is changed.
+    Otherwise nothing is changed: without the buffer an image of 300 kB rarely arrives whole.
 
     :param most: the largest receive buffer that the kernel allows, bytes.
     """
@@ -122,8 +122,8 @@ def segment_size(environment: Mapping[str, str]) -> int:
         profile = Path(environment[_PROFILE]).read_text(encoding='utf-8')
     except (KeyError, OSError, UnicodeDecodeError):
         return DEFAULT_SEGMENT
-    told = re.search(r'<segment_size>\s*(\d+)\s*<', profile)
-    return int(told[1]) if told else DEFAULT_SEGMENT
+    size = re.search(r'<segment_size>\s*(\d+)\s*<', profile)
+    return int(size[1]) if size else DEFAULT_SEGMENT
 
 
 def _is_own(profile: str) -> bool:

@@ -25,7 +25,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import math
-from types import MappingProxyType
+from pathlib import Path
+from types import MappingProxyType, ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -41,10 +42,10 @@ from flock_follower.parameters.files import shared, unheeded
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
-    OF_EVERY_NODE,
+    refuse_unknown,
     Spec,
-    unknown_parameter,
 )
+from flock_follower.resources import resource
 
 T = TypeVar('T')
 
@@ -71,7 +72,7 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
 def refuse_in_flight(start: Mapping[str, Any], now: Mapping[str, Any],
                      changes: Mapping[str, Any], flying: bool) -> None:
     """
-    Refuse changes that would loosen a flight's limits.
+    Refuse changes that would loosen the limits of a flight.
 
     ``a_max`` and ``v_max`` never exceed their values at the start, and are only lowered while
     flying. ``guard`` is not switched off while flying.
@@ -95,9 +96,9 @@ class Parameters(Generic[T]):
     """
     The declared parameters of a node and the object built from them.
 
-    ``values`` is the dictionary of the current values, ``current`` what ``build`` made of it.
+    ``values`` is the dictionary of the current values, ``current`` the result of ``build``.
     ``build`` raises ValueError for values that do not fit together (d0 above d1); the change is
-    then refused with that reason and nothing is altered.
+    then refused with that reason.
 
     :param shared: values of the section ``follower`` in parameter files; the overrides of the
         node's own win.
@@ -112,7 +113,7 @@ class Parameters(Generic[T]):
         specs = expanded(specs, given)
         self._specs = {spec.name: spec for spec in specs}
         self._build = build
-        self._refuse_unknown(node)
+        refuse_unknown(node.get_parameters_by_prefix(''), self._specs, node.get_name())
         self.values: dict[str, Any] = check_values(specs, given)
         self.current: T = build(self.values)
         self._start = dict(self.values)
@@ -124,26 +125,18 @@ class Parameters(Generic[T]):
                 spec.name, self.values[spec.name], descriptor(spec), ignore_override=True)
         node.add_post_set_parameters_callback(self._apply)
 
-    def _refuse_unknown(self, node: Node) -> None:
-        # rclpy ignores overrides nobody declares: a mistyped a_max would silently do nothing.
-        ours = set(self._specs)
-        for name in sorted(node.get_parameters_by_prefix('')):
-            if name in ours or name in OF_EVERY_NODE or name.startswith('qos_overrides.'):
-                continue
-            raise ValueError(unknown_parameter(name, ours, node.get_name()))
-
     def check(self, parameters: Sequence[Parameter]) -> list[Parameter]:
         """
         Return the parameters converted to their declared types.
 
-        :raises ValueError: where one is invalid, or they do not fit together.
+        :raises ValueError: if one is invalid, or they do not fit together.
         """
         checked = []
         changes: dict[str, Any] = {}
         for parameter in parameters:
             spec = self._specs.get(parameter.name)
             if spec is None or not spec.live:
-                checked.append(parameter)  # rclpy refuses it in its own words
+                checked.append(parameter)  # rclpy refuses it
                 continue
             changes[spec.name] = spec.check(parameter.value)
             checked.append(Parameter(spec.name, value=changes[spec.name]))
@@ -164,8 +157,8 @@ class ValidatedNode(Node):
     """
     A node whose parameters pass a :class:`Parameters` table before rclpy sees them.
 
-    ``parameter_files`` are those of the command line; ``runtime.run`` sets them. rclpy takes what
-    is for the node from them, and says nothing where that is nothing.
+    ``parameter_files`` are those of the command line; ``runtime.run`` sets them. rclpy is silent
+    if none of their sections is for the node.
     """
 
     parameter_files: ClassVar[Sequence[str]] = ()
@@ -203,3 +196,36 @@ class ValidatedNode(Node):
     def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
         """Set one by one; see :meth:`set_parameters_atomically`."""
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
+
+
+_HOW = """\
+Usage: {name} [--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE]
+  -p NAME:=VALUE      sets a parameter; more of them, each with its own -p
+  --params-file FILE  sets those of a YAML file, such as {file}
+  -r FROM:=TO         connects a topic to another name; -r __ns:=/drone1 puts all in a namespace
+
+Parameters, of which `ros2 param set` changes those marked * in flight; see {page}:"""
+
+
+def usage(module: ModuleType) -> str:
+    """Return the text of a node's ``--help``: its module holds the description and ``SPECS``."""
+    specs: Sequence[Spec] = getattr(module, 'SPECS', ())
+    how = _HOW.format(name=Path(module.__file__ or '').stem.removesuffix('_node'),
+                      page=_path_shown('config/PARAMETERS.md'),
+                      file=_path_shown('config/follower.yaml'))
+    rows = (f'  {spec.name:<26}{"*" if spec.live else " "} {spec.meaning}; '
+            f'{spec.constraint}; default {_default_shown(spec)}' for spec in specs)
+    return '\n'.join([(module.__doc__ or '').strip().replace('``', ''), '', how, *rows])
+
+
+def _default_shown(spec: Spec) -> str:
+    if spec.default in ('', ['']):
+        return 'empty'
+    return str(spec.default).lower() if isinstance(spec.default, bool) else str(spec.default)
+
+
+def _path_shown(name: str) -> str:
+    try:
+        return str(resource(name))
+    except OSError:
+        return name

@@ -25,7 +25,7 @@ from nav_msgs.msg import Odometry
 from flock_follower.messages import OdometryState
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.nodes.support.static_child import BASE, StaticChild
+from flock_follower.nodes.support.transforms import BASE, StaticChild
 from flock_follower.odometry.derivation import NONE
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.spec import filled

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What every node shares: start, guarded callbacks, spin, and a shutdown without traceback."""
+"""The base class of all nodes; their start, guarded callbacks, spin, and clean shutdown."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ import contextlib
 import functools
 import gc
 import inspect
+import itertools
 import math
 import os
 import stat
@@ -31,6 +32,7 @@ from typing import Any, TypeVar
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -45,31 +47,53 @@ from rclpy.timer import Timer
 from rclpy.waitable import Waitable
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
-from flock_follower.nodes.support import usage
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
-from flock_follower.nodes.support.node_parameters import ValidatedNode
-from flock_follower.nodes.support.waiting import Waiting
+from flock_follower.nodes.support.node_parameters import usage, ValidatedNode
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
-#: What reads a type from its bytes faster than rclpy; its result has the same fields.
+#: Functions that read a type from its bytes faster than rclpy; the results have the same fields.
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
-#: Bytes of the largest small message. To build the Python objects of one of 17 MB takes 13 s, in
-#: which no other thread of the process runs.
+#: Bytes of the largest small message. rclpy takes 13 s to deserialise one of 17 MB, and no other
+#: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
-EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
+EVENTS_TIME = 0.02  # s of each second in which QoS events are served
 READING_TIME = 0.01  # s within which two clocks are read
-LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
+LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
+
+
+class Waiting(CallbackGroup):
+    """
+    Holds subscriptions that an executor serves only while ``awaited`` returns True.
+
+    Otherwise their messages wait until a node takes them. The result of ``awaited`` may change in
+    the executor's thread only: the executor asks each time before it waits.
+    """
+
+    def __init__(self, awaited: Callable[[], bool] = lambda: False) -> None:
+        super().__init__()
+        self._awaited = awaited
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether messages are awaited."""
+        return self._awaited()
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return True: only the executor's own thread executes."""
+        return True
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
 
 
 class FlockNode(ValidatedNode):
     """
     A node with validated parameters, diagnostics, and callbacks that cannot kill it.
 
-    Whatever a callback of a subscription, a timer or a service raises counts in /diagnostics as an
-    internal error, is logged at most once per 5 s, and the node lives on. That holds for those
-    that rclpy makes for itself, too: ``/clock`` and the services of the parameters.
+    An exception of a callback of a subscription, a timer or a service counts in /diagnostics as
+    an internal error and is logged at most once per 5 s; the node lives on. That holds for the
+    callbacks of rclpy itself, too: ``/clock`` and the services of the parameters.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
@@ -81,10 +105,10 @@ class FlockNode(ValidatedNode):
 
     def add_waitable(self, waitable: Waitable) -> None:
         """
-        Add what an executor waits for, as rclpy does; QoS events once a second.
+        Add an entity that the executor waits for, as rclpy does; QoS events once a second.
 
-        Each topic, in or out, has two such events, which seldom come: of an incompatible node. To
-        wait for all of them took a third of the time of every wait.
+        Each topic, in or out, has two such events, of incompatible nodes, which are rare. To wait
+        for all of them took a third of the time of every wait.
         """
         if isinstance(waitable, EventHandler):
             waitable.callback_group = self._events
@@ -101,12 +125,12 @@ class FlockNode(ValidatedNode):
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
-        A ValueError is a bad message and counts under its topic; anything else counts as an
-        internal error with its place. A ``required`` topic that stays silent for longer than
+        A ValueError is an invalid message and counts under its topic; any other exception counts
+        as an internal error with its place. A ``required`` topic that is silent for longer than
         ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
-        says there whose topic it is. ``informed``: the callback gets the message and what rclpy
-        tells of how it came, as one pair. A message of more than ``largest`` bytes is refused
-        before it is deserialised, and counted; None: any size is taken.
+        qualifies its name there. ``informed``: the callback gets the message and rclpy's message
+        info as one pair. A message of more than ``largest`` bytes is refused before it is
+        deserialised, and counted; None: any size is taken.
         """
         take = self._watched(
             msg_type, topic, (lambda message, info: callback((message, info))) if informed
@@ -124,11 +148,11 @@ class FlockNode(ValidatedNode):
         """
         Subscribe, as :meth:`subscribe`; messages wait until the function returned takes them.
 
-        ``callback`` gets each message and when it arrived, ns of this node's clock. An executor
-        wakes for every message otherwise: at 200 Hz that was 19 % of a core, 4 % so. While
-        ``awaited`` returns True the executor wakes for them all the same, and takes them. Where
-        ``use_sim_time`` is set they are taken as they come: nobody knows how fast that time goes,
-        and so not when, by it, a message arrived.
+        ``callback`` gets each message and its time of arrival, ns of this node's clock. At 200 Hz
+        an executor that wakes for every message takes 19 % of a core, polling 4 %. While
+        ``awaited`` returns True the executor wakes for messages and takes them. With
+        ``use_sim_time`` it always does: the rate of that time is unknown, and so is the time of
+        arrival of a message that has waited.
         """
         if self.get_parameter('use_sim_time').value:
             self.subscribe(
@@ -140,7 +164,7 @@ class FlockNode(ValidatedNode):
         def taken(message: Any, info: Any) -> None:
             now = time.time_ns()
             age = now - (info['received_timestamp'] or now)
-            # A clock that was set meanwhile says nothing of a message's age.
+            # Bounded: the clock may have been set meanwhile.
             arrival = self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT)
             callback(message, arrival)
 
@@ -159,7 +183,7 @@ class FlockNode(ValidatedNode):
     def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
                  qos: QoSProfile, timeout: float, required: bool, of: str, *,
                  largest: int | None) -> Callable[[Any, Any], None]:
-        """Return what takes a message, as bytes if its size is bounded, and how it came."""
+        """Return a function of a message, as bytes if its size is bounded, and its info."""
         watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
                                          of=of)
         read = READERS.get(msg_type, functools.partial(_deserialize, msg_type))
@@ -195,9 +219,9 @@ class FlockNode(ValidatedNode):
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
                      *args: Any, **kwargs: Any) -> Timer:
         """
-        Create a timer as rclpy does, guarded: of time that no setting of the clock stops.
+        Create a timer as rclpy does, guarded, on steady time: setting the clock stops none.
 
-        With ``use_sim_time`` it is of that time, unless ``clock`` is given.
+        With ``use_sim_time`` it runs on that time, unless ``clock`` is given.
         """
         if kwargs.get('clock') is None and not self.get_parameter('use_sim_time').value:
             kwargs['clock'] = Clock(clock_type=ClockType.STEADY_TIME)
@@ -210,8 +234,8 @@ class FlockNode(ValidatedNode):
         """
         Serve as rclpy does, guarded.
 
-        A request whose callback raises, or returns no response, is answered all the same: where
-        the type has them, with ``success`` false and the error in ``message``.
+        A request whose callback raises, or returns no response, is answered with ``success``
+        false and the error in ``message``, if the type has these fields.
         """
         def answer(error: Exception) -> Any:
             self._caught(f'in service {srv_name}', error)
@@ -237,7 +261,7 @@ class FlockNode(ValidatedNode):
 
     def _caught(self, where: str, error: Exception) -> None:
         if not self.context.ok():
-            raise error  # a shutdown under way makes rclpy raise from wherever it happens to be
+            raise error  # during a shutdown rclpy raises from any place
         self.diagnostics.internal_error(where, error)
 
 
@@ -251,9 +275,9 @@ def _deserialize(msg_type: Any, data: bytes) -> Any:
 def _guarded(callback: Callable[..., Any], caught: Callable[[Exception], Any],
              result: type | None = None) -> Callable[..., Any]:
     """
-    Return a callback that never raises: what ``caught`` makes of an exception is its result.
+    Return a callback that never raises; the result of ``caught`` replaces an exception.
 
-    :param result: what the callback has to return an instance of; None: anything.
+    :param result: the type that the callback must return; None: any.
     """
     def checked(returned: Any) -> Any:
         if result is not None and not isinstance(returned, result):
@@ -289,7 +313,7 @@ def spin(node: Node) -> None:
     except ExternalShutdownException:
         pass
     except Exception:
-        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        # During a shutdown rclpy raises from any place.
         if node.context.ok():
             raise
     finally:
@@ -306,10 +330,13 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     With ``--help`` among ``args``, None being those of the process, it prints that and ends.
     """
     arguments = sys.argv if args is None else args
-    if usage.asked_for(arguments):
-        print(usage.usage(sys.modules[factory.__module__]))
+    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
+    if '-h' in own or '--help' in own:
+        print(usage(sys.modules[factory.__module__]))
         return 0
-    if stray := usage.misplaced(arguments):
+    # ROS ignores such an argument: the parameter that it sets would keep its default.
+    if stray := next((argument for argument in own
+                      if argument.startswith('-') or ':=' in argument), ''):
         print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
               file=sys.stderr)
         return 1
@@ -330,13 +357,13 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
                 return 0  # it failed because it was interrupted
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
-        # Objects made so far stay for ever: garbage collection scanning them is a pause in flight.
+        # The objects made so far stay: to scan them for garbage would be a pause in flight.
         gc.freeze()
         code = spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        # During a shutdown rclpy raises from any place.
         if rclpy.ok():
             raise
     finally:
@@ -350,10 +377,10 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
 
 def never_block_output() -> None:
     """
-    Make writes to stdout and stderr give up where nobody reads, instead of waiting.
+    Make writes to stdout and stderr fail instead of waiting for a reader.
 
-    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise hold the process up at
-    its next log line, with everything in it. Lines are lost then; files are left as they are.
+    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise stop the process at its
+    next log line. Lines are lost then. Files are left as they are.
     """
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):

@@ -1,0 +1,330 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+A flight on the desk through the real nodes: starting them, requests, and the end of the flight.
+
+``demo`` starts the nodes beside a replay, ``fly`` beside the simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import contextlib
+from itertools import pairwise
+from pathlib import Path
+import re
+import subprocess
+import sys
+import time
+from typing import NamedTuple, TypeVar
+
+from flock_desk.runs.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    SchedulingDelay,
+)
+from flock_desk.runs.summary import spacing
+from flock_desk.scenarios.scenario import Scenario
+from flock_follower.mavlink.transport import open_transport
+
+RECORDED = ['neighbors:nav_msgs/msg/Odometry',
+            '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
+COMMANDS = 'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory'
+SIH_TRUTH = 'udpin:127.0.0.1:19410'  # where PX4's SIH sends the truth
+ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
+START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
+READY_TIMEOUT = 90.0  # s for an external estimator, without which the autopilot does not arm
+#: s of take-off requests until it is armed again: longer than the bridge waits for the climb.
+TAKEOFF_TIMEOUT = 20.0
+LAND_TIMEOUT = 5.0  # s of requests for a landing after something failed
+LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
+MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
+#: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
+GPS_DISAGREEMENT = 1.2
+PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
+COUNTED = 1.2  # s in which every node publishes its counters once more
+T = TypeVar('T')
+
+
+class External(NamedTuple):
+    """Links to an autopilot that runs already, as ``mavlink.transport`` takes them."""
+
+    connection: str
+    truth: str
+    forward_odometry: bool
+    leader_truth: str = ''
+    """That of a second one; '': the scenario's own leader."""
+
+
+def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
+    """
+    Return the links to an autopilot, ``udp:`` meaning ``udpin:``; without a truth the usual one.
+
+    :raises ValueError: for a URL that is invalid. :raises OSError: if it cannot be opened.
+    """
+    autopilot, truth, leader = (
+        re.sub('^udp:', 'udpin:', url) for url in (autopilot, truth, leader))
+    if not truth:
+        tcp = re.fullmatch(r'(tcp:.*:)(\d+)', autopilot)
+        truth = f'{tcp[1]}{int(tcp[2]) + 2}' if tcp else SIH_TRUTH
+    with contextlib.ExitStack() as opened:  # all at once: none may have the port of another
+        for url in filter(None, (autopilot, truth, leader)):
+            opened.callback(open_transport(url).close)
+    return External(autopilot, truth, forward_odometry, leader)
+
+
+def namespaces(followers: int) -> list[str]:
+    """Return the namespace of each, '' for one alone; the folder of its logs has that name."""
+    return [''] if followers == 1 else [f'follower_{i}' for i in range(1, followers + 1)]
+
+
+def own(values: Mapping[str, T], namespace: str) -> dict[str, T]:
+    """Return the values of a follower's processes by the names of its nodes."""
+    prefix = f'{namespace}/' if namespace else ''
+    return {name.removeprefix(prefix): value for name, value in values.items()
+            if name.startswith(prefix)}
+
+
+def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
+        external: External | None = None, followers: int = 1
+        ) -> tuple[dict[str, float], dict[str, int | None]]:
+    """
+    Fly a scenario through all nodes, leaving logs and records in ``out``.
+
+    :param name: of the scenario, as the simulator shall load it.
+    :param external: the autopilot that flies the follower; None: the embedded one.
+    :param followers: how many fly in a column; the logs of each are in ``namespaces``.
+    :returns: each process's CPU time as a share of the flight, and its exit code, None for one
+        that had to be killed.
+    :raises RuntimeError: if a process ends early or a service refuses, with the reason.
+    :raises TooBusyError: if the machine is too busy.
+    """
+    fleet = namespaces(followers)
+    with Processes(private_environment(), out) as processes:
+        domain = processes.environment['ROS_DOMAIN_ID']
+        print(f'{scenario.name}: {scenario.summary}\nto listen: ROS_DOMAIN_ID={domain} '
+              'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ros2 topic list', flush=True)
+        for i, namespace in enumerate(fleet):
+            parameters = parameters_of_nodes(
+                scenario, name, seed + i, duration, out / namespace, external,
+                fleet[i - 1] if i else '', i + 1)
+            start(processes, parameters, [*RECORDED, *([COMMANDS] if external else [])],
+                  namespace, show=i == 0)
+        try:
+            for namespace in reversed(fleet):  # the first one flies off when it is engaged
+                prefix = f'/{namespace}/' if namespace else ''
+                if external:
+                    take_off(processes)
+                else:
+                    call(processes, f'{prefix}mavlink_bridge/arm')
+                call(processes, f'{prefix}mavlink_bridge/offboard')
+                call(processes, f'{prefix}planner/engage')
+            cores = watch(processes, duration, external is not None)
+            early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
+            if early:
+                print(f'\nthe bridge has ended the flight: {early}', flush=True)
+                come_down(processes)
+            elif external:
+                call(processes, 'planner/engage', ('false',))
+                call(processes, 'mavlink_bridge/offboard', ('false',))
+                call(processes, 'mavlink_bridge/land', ())
+        except BaseException:
+            if 'takeoff' in processes.children:
+                come_down(processes)
+            raise
+        if external:
+            await_disarmed(processes)
+        time.sleep(COUNTED)
+        if any(simulator.returncode for simulator in all_of(processes, 'simulator').values()):
+            raise RuntimeError('the simulator failed')
+        exit_codes = processes.stop_all()
+        for recorder, code in exit_codes.items():
+            if code == 1 and recorder.endswith('recorder'):
+                raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
+        return cores, exit_codes
+
+
+def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorded: Sequence[str],
+          namespace: str = '', show: bool = False) -> None:
+    """
+    Start the nodes of one follower, and their recorder, which writes the folder ``record``.
+
+    :param parameters: of each node, as ``NAME:=VALUE``.
+    :param show: whether the live line of its simulator is shown.
+    """
+    print(f'starting {", ".join(parameters)}{" of " if namespace else ""}{namespace}', flush=True)
+    prefix = f'{namespace}/' if namespace else ''
+    folder = processes.log_folder / namespace
+    folder.mkdir(exist_ok=True)
+    renamed = ['-r', f'__ns:=/{namespace}'] if namespace else []
+    processes.start(f'{prefix}recorder', 'flock_desk.recorder_node', [
+        str(folder / 'record'), *recorded, *(['--ros-args', *renamed] if renamed else [])])
+    for node, values in parameters.items():
+        simulates = node == 'simulator'
+        processes.start(
+            f'{prefix}{node}',
+            'flock_desk.simulator_node' if simulates else f'flock_follower.nodes.{node}',
+            ['--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
+            show=show and simulates)
+
+
+def all_of(processes: Processes, node: str) -> dict[str, subprocess.Popen[bytes]]:
+    """Return the processes of a node, of every follower."""
+    return {name: child for name, child in processes.children.items()
+            if name.rpartition('/')[2] == node}
+
+
+def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
+                        external: External | None, ahead: str = '',
+                        system: int = 1) -> dict[str, list[str]]:
+    """
+    Return the parameters of each node that flies.
+
+    :param ahead: the namespace of the follower that is its leader; '': the scenario's leader.
+    :param system: MAVLink system id of an embedded autopilot.
+    """
+    flight = scenario.flight
+    limits = [f'a_max:={flight.a_max}', f'v_max:={flight.v_max}']
+    # Scenarios judge the planner in open space.
+    envelope = ['height_max:=100.0', 'radius_max:=1000.0']
+    if external is None:
+        port = free_udp_port()
+        bridge = [f'connection:=udpin:127.0.0.1:{port}', f'target_system:={system}']
+        vehicle = [f'connection:=127.0.0.1:{port}', f'target_system:={system}']
+        if ahead:
+            vehicle += [f'leader_topic:=/{ahead}/truth/motion',
+                        f'leader_offset:=[{spacing(scenario)},0.0,0.0]']
+    else:
+        forward = str(external.forward_odometry).lower()
+        bridge = [f'connection:={external.connection}', f'forward_odometry:={forward}',
+                  f'global_origin:={ORIGIN}' if external.forward_odometry
+                  else f'velocity_disagreement:={GPS_DISAGREEMENT}']
+        vehicle = ['vehicle:=external', f'truth_connection:={external.truth}',
+                   f'require_truth:={forward}']
+        if external.leader_truth:
+            vehicle.append(f'leader_truth_connection:={external.leader_truth}')
+    return {
+        'relative_pose': [],
+        'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
+                    f'altitude_min:={flight.altitude_min}'],
+        'mavlink_bridge': [*limits, *envelope, *bridge],
+        'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
+                      f'log:={out / "flight.npz"}'],
+    }
+
+
+def take_off(processes: Processes) -> None:
+    """
+    Arm and take off.
+
+    The estimator may take a minute to be ready. ArduPilot arms before that, refuses the take-off,
+    and disarms again after a while: so both are requested until they succeed.
+
+    :raises RuntimeError: if they have not by then, with the last reason.
+    """
+    deadline = time.monotonic() + READY_TIMEOUT
+    while True:
+        call(processes, 'mavlink_bridge/arm', timeout=max(deadline - time.monotonic(), 1.0))
+        try:
+            call(processes, 'mavlink_bridge/takeoff', (), TAKEOFF_TIMEOUT)
+            return
+        except RuntimeError as error:
+            if 'already in the air' in str(error):  # its answer to an earlier one was lost
+                return
+            if time.monotonic() > deadline or processes.children['simulator'].poll() is not None:
+                raise
+
+
+def watch(processes: Processes, duration: float, external: bool) -> dict[str, float]:
+    """
+    Wait for the end of the scenario, and return how many cores each process used.
+
+    The simulator of an embedded vehicle ends with the scenario. That of an external one ends when
+    the vehicle is disarmed, which is not waited for here; the scenario has also ended if the
+    bridge reports so.
+
+    :raises RuntimeError: if the simulator does not keep up, or something ends early.
+    :raises TooBusyError: if the machine is too busy.
+    """
+    simulators, delay = all_of(processes, 'simulator').values(), SchedulingDelay()
+    begin = now = time.monotonic()
+    used = before = processes.cpu()
+    while None in (codes := [simulator.poll() for simulator in simulators]) and not any(codes):
+        now = time.monotonic()
+        if external and (now > begin + duration + MARGIN
+                         or ended_by_bridge(processes.log('mavlink_bridge'))):
+            break
+        if now > begin + duration + PATIENCE:
+            raise RuntimeError('the simulator does not keep up with the clock')
+        for name, recorder in all_of(processes, 'recorder').items():
+            if recorder.poll() is not None:
+                raise RuntimeError(f'the recorder ended early: {processes.last_line(name)}')
+        used = {**used, **processes.cpu()}
+        delay.check(now)
+        time.sleep(0.2)
+    else:
+        if external and not any(codes) and not ended_by_bridge(processes.log('mavlink_bridge')):
+            raise RuntimeError('the simulator ended early')
+    return {name: (used[name] - before[name]) / (now - begin) for name in before if now > begin}
+
+
+def ended_by_bridge(log: str) -> str:
+    """
+    Return the first ``mavlink_bridge/state`` after ACTIVE, or '' while it is ACTIVE.
+
+    :param log: the bridge's output. NO_AUTOPILOT ends nothing: the link may come back.
+    """
+    states = [state for state in re.findall(r'\]: state: (.+)', log)
+              if not state.startswith('NO_AUTOPILOT')]
+    return next((state for before, state in pairwise(states)
+                 if before.startswith('ACTIVE') and not state.startswith('ACTIVE')), '')
+
+
+def await_disarmed(processes: Processes) -> None:
+    """
+    Wait for the simulator to see the vehicle disarmed.
+
+    :raises RuntimeError: if it does not come down.
+    """
+    deadline = time.monotonic() + LANDING_TIMEOUT
+    while processes.children['simulator'].poll() is None:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f'it has not landed and disarmed within {LANDING_TIMEOUT:g} s')
+        time.sleep(0.2)
+
+
+def come_down(processes: Processes) -> None:
+    """Request a landing after something failed, whether it succeeds or not."""
+    with contextlib.suppress(RuntimeError, KeyboardInterrupt):
+        answer = processes.ask('mavlink_bridge/land', LAND_TIMEOUT, value=())
+        print(f'\n{answer}', flush=True)
+
+
+def call(processes: Processes, service: str, value: Sequence[str] = ('true',),
+         timeout: float = START_TIMEOUT) -> None:
+    """
+    Call a service.
+
+    :param value: see ``Processes.ask``.
+    :raises RuntimeError: if it goes on refusing, or the simulator has ended, with the reason.
+    """
+    simulators = list(all_of(processes, 'simulator').values())
+    answer = processes.ask(service, timeout, lambda: (
+        'the simulator ended early' if any(s.poll() is not None for s in simulators) else ''),
+        value)
+    # On a terminal in place of the simulator's live line, which it draws anew below.
+    print(f'\r{answer}\x1b[K' if sys.stdout.isatty() else answer, flush=True)

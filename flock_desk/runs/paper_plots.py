@@ -1,0 +1,364 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The figures for a paper: simulated flocks, a panel for each model; flights of ``fly``.
+
+They are one column wide, told apart in grey too, without a title, which is the caption's, and
+every font is legible at that width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+import numpy as np
+
+from flock_desk.flocks.agents import Simulation
+from flock_desk.runs.plots import with_gaps
+from flock_desk.runs.record import LiveRecord
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array
+
+WIDTH = 3.33  # in: a column of the paper's two
+# Okabe and Ito's palette, for the colour-blind, and a dash for each where there is no colour.
+COLOURS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
+INK, PALE = '#333333', '#BBBBBB'
+KINDS = ('png', 'svg', 'pdf')
+#: No names by chance and no dates: the same run gives the same bytes.
+_METADATA = {'png': {'Software': None}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
+_STYLE = {
+    'font.size': 7.5, 'axes.titlesize': 7.5, 'axes.labelsize': 7.5, 'legend.fontsize': 7.5,
+    'xtick.labelsize': 7, 'ytick.labelsize': 7, 'axes.titlelocation': 'left',
+    'axes.titlepad': 4, 'axes.labelpad': 2.5, 'axes.linewidth': 0.6, 'lines.linewidth': 1.2,
+    'axes.grid': True, 'axes.axisbelow': True, 'axes.spines.top': False,
+    'axes.spines.right': False, 'xtick.major.width': 0.6, 'ytick.major.width': 0.6,
+    'xtick.major.size': 2.5, 'ytick.major.size': 2.5, 'grid.linewidth': 0.4, 'grid.alpha': 0.35,
+    'legend.frameon': False, 'legend.handlelength': 2.4, 'legend.borderaxespad': 0.0,
+    'svg.hashsalt': 'flock_follower', 'path.simplify_threshold': 0.05,
+    'pdf.fonttype': 42}  # whole outlines of its letters, as publishers ask for
+
+Handle = Line2D | Patch
+Runs = Mapping[str, Simulation]
+Draw = Callable[[Axes, Simulation], None]
+#: in, of the arrow of 1 m/s: on the page, as the scale of the ground is another in each panel.
+_ARROW = 0.3
+_SIDE = 0.8  # in, the room of a panel beside the arrows
+_TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'butt', 'zorder': 1.8}
+_TIME = 'time [s]'
+
+
+def styled() -> AbstractContextManager[None]:
+    """Return the context to make a figure in; nothing of a user's matplotlibrc counts there."""
+    return style.context(['default', _STYLE])
+
+
+def save(figure: Figure, path: Path) -> str:
+    """Write a figure in every kind, beside each other, and return the names in one."""
+    with styled():
+        for kind in KINDS:
+            figure.savefig(path.with_suffix(f'.{kind}'), dpi=300, metadata=_METADATA[kind])
+    return f'{path.name}.' + '/.'.join(KINDS)
+
+
+def draw_bounds(axis: Axes, params: FlockingParams) -> None:
+    """Draw the edges of the band, as distances, m."""
+    for bound in np.sqrt([params.d0, params.d1]):
+        axis.axhline(bound, color=INK, linestyle='--', linewidth=0.9, zorder=1.5)
+
+
+def bounds_handle(label: str) -> Handle:
+    """Return the edges of the band, for a legend."""
+    return Line2D([], [], color=INK, linestyle='--', linewidth=0.9, label=label)
+
+
+def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
+    """Return the paths of each model's agents up to a time, s, from start to end."""
+    def draw(axis: Axes, run: Simulation) -> None:
+        shown = run.time <= end + 1e-9
+        x = run.positions[shown]
+        for n, line in ((0, ':'), (-1, '-')):
+            loop = np.append(np.arange(x.shape[1]), 0)
+            axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=line, zorder=1)
+        for i, (colour, dash) in enumerate(COLOURS[:x.shape[1]]):
+            axis.plot(*x[:, i].T, color=colour, linestyle=dash)
+            axis.plot(*x[0, i], 'o', color='white', markeredgecolor=colour, markersize=4,
+                      zorder=5)
+            axis.plot(*x[-1, i], 'o', color=colour, markersize=4)
+        velocities = run.velocities[0]
+        arrows = axis.quiver(
+            *x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS], units='inches',
+            width=0.022, scale_units='inches', scale=1.0 / _ARROW, headwidth=4.2, headlength=4.5,
+            headaxislength=4.0, zorder=6)
+        reach = _ARROW / _SIDE * np.ptp(x, axis=(0, 1)).max()  # m, of the arrow of 1 m/s
+        axis.update_datalim(x[0] + reach * velocities)
+        axis.margins(0.12)
+        axis.set_aspect('equal', adjustable='datalim')
+        if run is first:  # beside the legend
+            axis.quiverkey(arrows, 1.42, -0.07, 0.5, 'initial velocity,\n0.5 m/s', labelpos='E',
+                           color=INK, labelsep=0.08)
+
+    first = next(iter(runs.values()))
+    with styled():
+        handles: list[Handle] = _agent_handles(names)
+        handles += [
+            Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
+                   markersize=4, label='start'),
+            Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
+                   label=f'after {end:g} s'),
+            Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
+        return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
+                       share=False)
+
+
+def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
+    """Return each agent's speed over time, up to a time, s."""
+    top = 1.05 * max(np.linalg.norm(run.velocities, axis=2).max() for run in runs.values())
+
+    def draw(axis: Axes, run: Simulation) -> None:
+        for i, (colour, dash) in enumerate(COLOURS[:run.positions.shape[1]]):
+            axis.plot(run.time, np.linalg.norm(run.velocities[:, i], axis=1), color=colour,
+                      linestyle=dash)
+        axis.set(xlim=(0.0, end), ylim=(0.0, top))
+
+    with styled():
+        return _panels(runs, draw, _agent_handles(names), _TIME, 'speed [m/s]', note)
+
+
+def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '') -> Figure:
+    """Return the distances between agents up to a time, s, within limits, m, and the bounds."""
+    def draw(axis: Axes, run: Simulation) -> None:
+        m = run.metrics
+        if run.positions.shape[1] > 2:
+            last = int(np.searchsorted(m.time, end))
+            few = slice(0, last + 1, max(1, last // 500))  # of an area a file keeps every point
+            axis.fill_between(m.time[few], np.sqrt(m.min_r2[few]), np.sqrt(m.max_r2[few]),
+                              color=COLOURS[0][0], alpha=0.35, linewidth=0)
+        axis.plot(m.time, m.mean_distance, color=COLOURS[0][0], linewidth=1.1)
+        draw_bounds(axis, run.params)
+        axis.set(xlim=(0.0, end), ylim=limits)
+        at_end, top = np.interp(end, m.time, m.mean_distance), limits[1]
+        if at_end > top:
+            leaves = m.time[np.argmax(m.mean_distance > top)]
+            axis.annotate(f'{at_end:.1f} m\nat {end:g} s', (leaves, top), (6, -3), fontsize=7,
+                          textcoords='offset points', va='top', color=COLOURS[0][0])
+
+    with styled():
+        several = next(iter(runs.values())).positions.shape[1] > 2
+        label = 'mean of the pairs' if several else 'between the two'
+        handles: list[Handle] = [Line2D([], [], color=COLOURS[0][0], label=label)]
+        if several:
+            handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
+                                 label='least to greatest'))
+        handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
+        return _panels(runs, draw, handles, _TIME, 'distance [m]', note)
+
+
+def agreement(runs: Runs, end: float) -> Figure:
+    """
+    Return W of the first run, the law's, and how the velocities of all runs come to agree.
+
+    A dot is where their disagreement has fallen below 1 % of the first for good.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
+        above, below = figure.subplots(2, 1, sharex=True)
+        law = next(iter(runs.values())).metrics
+        shown = law.time <= end
+        above.plot(law.time[shown], law.lyapunov[shown], color=INK)
+        last = np.flatnonzero(shown)[-1]
+        for n, place, side in ((0, (7, -2), 'left'), (last, (-3, 5), 'right')):
+            above.annotate(f'{law.lyapunov[n]:.4f} at {law.time[n]:g} s',
+                           (law.time[n], law.lyapunov[n]), place, fontsize=7, ha=side,
+                           textcoords='offset points')
+        above.set(ylabel='$W$ of the law [m/s]')
+        for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
+            m = run.metrics
+            below.semilogy(m.time, m.disagreement / m.disagreement[0], color=colour,
+                           linestyle=dash, label=name)
+            below.plot(m.time_to_agree(), 0.01, 'o', color=colour, markersize=4)
+        below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
+        below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
+                       ha='right')
+        below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel=_TIME, xlim=(0.0, end),
+                  ylim=(1e-5, 4.0))
+        figure.align_ylabels([above, below])
+        figure.legend(*below.get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                      columnspacing=1.2, handlelength=1.9)
+        return figure
+
+
+def flock(run: Simulation) -> Figure:
+    """Return the paths, distances and agreement of a larger flock, in 2-D or 3-D."""
+    with styled():
+        figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
+        grid = figure.add_gridspec(3, 1, height_ratios=(2.2, 1.0, 1.0))
+        solid = run.positions.shape[2] == 3
+        paths = figure.add_subplot(grid[0], projection='3d' if solid else None)
+        _draw_paths(paths, run)
+        below, agreeing = figure.add_subplot(grid[1]), figure.add_subplot(grid[2])
+        m = run.metrics
+        on_graph = run.graph is not None
+        if on_graph or np.sqrt(m.max_r2.max()) < 2.0 * np.sqrt(run.params.d1):
+            below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
+                       label='longest edge' if on_graph else 'greatest')
+        below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
+        draw_bounds(below, run.params)
+        below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]))
+        below.set_ylim(bottom=0.0)
+        agreeing.plot(m.time, m.order, color=INK, label='order parameter')
+        agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
+                      linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
+        agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]))
+        agreeing.set_ylim(bottom=0.0)
+        for axis in figure.axes:  # above the axis, where no data can be
+            axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
+        figure.align_ylabels([below, agreeing])
+        return figure
+
+
+def _draw_paths(axis: Axes, run: Simulation) -> None:
+    x = run.positions
+    # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
+    x = x - x.mean(axis=1, keepdims=True)
+    if run.graph is not None and len(run.graph.edges) <= 2000:
+        for i, j in run.graph.edges:
+            axis.plot(*x[-1, [i, j]].T, color=PALE, linewidth=0.5, zorder=1)
+    for i in range(min(x.shape[1], 200)):
+        axis.plot(*x[:, i].T, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, zorder=2)
+    axis.plot(*x[-1].T, 'o', color=INK, markersize=2.5, linestyle='', zorder=3)
+    none = np.empty((x.shape[2], 0))
+    axis.plot(*none, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, label='paths')
+    axis.plot(*none, 'o', color=INK, markersize=2.5, label=f'after {run.time[-1]:g} s')
+    if run.graph is not None:
+        axis.plot(*none, color=PALE, linewidth=0.5, label='edges')
+    axis.set(xlabel='x from the mean [m]', ylabel='y from the mean [m]')
+    axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    if isinstance(axis, Axes3D):
+        axis.set_aspect('equal')
+        axis.set_box_aspect(np.ptp(np.reshape(axis.get_w_lims(), (3, 2)), axis=1), zoom=0.88)
+        axis.tick_params(pad=-2)
+        axis.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')  # there is no room for more
+        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+            side.labelpad = -5.0
+    else:
+        axis.set_aspect('equal', adjustable='datalim')
+
+
+def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
+            y_label: str, note: str, height: float = 4.3, share: bool = True) -> Figure:
+    """Return a panel for each of five runs, the legend in the second place, a note below."""
+    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
+    axes = figure.subplots(3, 2, sharex=share, sharey=share)
+    for letter, axis, (name, run) in zip('abcde', axes.flat[[0, 2, 3, 4, 5]], runs.items()):
+        axis.set_title(f'({letter}) {name}'.replace(', ', ',\n'))
+        draw(axis, run)
+    for axis in axes[2]:
+        axis.set_xlabel(x_label)
+        axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
+    for axis in axes[:, 0]:
+        axis.set_ylabel(y_label)
+    key = axes[0, 1]
+    key.set_axis_off()
+    # It may not make the panels below narrower.
+    key.legend(handles=handles, loc='upper left', handlelength=1.9).set_in_layout(False)
+    if note:
+        figure.supxlabel(note, fontsize=7, x=0.01, ha='left')
+    return figure
+
+
+def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
+    return [Line2D([], [], color=colour, linestyle=dash, label=name)
+            for name, (colour, dash) in zip(names, COLOURS)]
+
+
+def positions(flight: LiveRecord) -> Figure:
+    """
+    Return x and y of leader and follower over time, m in odom.
+
+    As in the paper they are what the follower knew: its own odometry, and where it saw the leader.
+    The true ones, in a frame without drift, are beneath.
+    """
+    table = _table(flight)
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
+        axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
+        for axis, name in zip(axes, 'xy'):
+            for who, (colour, dash), known in (('leader', COLOURS[0], f'neighbor_{name}'),
+                                               ('follower', COLOURS[1], f'own_{name}')):
+                axis.plot(table['time'], table[f'{who}_{name}'], color=colour, **_TRUTH)
+                axis.plot(table['time'], table[known], color=colour, linestyle=dash)
+            axis.set_ylabel(f'{name} [m]')
+        axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
+        figure.align_ylabels(axes)
+        handles: list[Handle] = [
+            Line2D([], [], color=colour, linestyle=dash, label=who)
+            for who, (colour, dash) in (('leader', COLOURS[0]), ('follower', COLOURS[1]))]
+        figure.legend(handles=[*handles, _truth_handle('true positions')],
+                      loc='outside upper center', ncols=3)
+        return figure
+
+
+def distance(flight: LiveRecord) -> Figure:
+    """Return the distance over time, m, as the follower knew it and as it was, in the band."""
+    table, law = _table(flight), flight.params.law
+    with styled():
+        figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
+        axis: Axes = figure.subplots()
+        for begin, end in flight.blind:
+            axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
+        axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
+        axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
+        draw_bounds(axis, law)
+        top = max(1.12 * np.sqrt(law.d1), 1.05 * _greatest(table))
+        axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
+                 ylim=(0.0, top))
+        handles: list[Handle] = [
+            Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
+            _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
+        if flight.blind:
+            handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
+        figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
+                      columnspacing=1.2, handlelength=1.8)
+        return figure
+
+
+def _table(flight: LiveRecord) -> Mapping[str, Array]:
+    """Return the columns drawn; NaN where images are missing, and so no line."""
+    true = {f'{who}_{name}': column
+            for who, places in (('leader', flight.leader), ('follower', flight.follower))
+            for name, column in zip('xy', places.T)}
+    return with_gaps({**flight.table, **true})
+
+
+def _greatest(table: Mapping[str, Array]) -> float:
+    apart = np.concatenate([table['distance'], table['true_distance']])
+    return float(np.max(apart[np.isfinite(apart)], initial=0.0))
+
+
+def _truth_handle(label: str) -> Handle:
+    return Line2D([], [], color=INK, linewidth=_TRUTH['linewidth'], alpha=_TRUTH['alpha'],
+                  label=label)

@@ -1,0 +1,195 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The computer, and what our nodes and the autopilot report on ``/diagnostics``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import fcntl
+from pathlib import Path
+import time
+from typing import Final
+
+import numpy as np
+
+from flock_follower.checks.findings import (
+    ERROR,
+    error,
+    Finding,
+    judged,
+    ok,
+    unmeasured,
+    WARNING,
+    warning,
+)
+from flock_follower.checks.observations import Observations, OURS
+from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name
+
+#: Share of the processors that is idle: below the first a warning, below the second an error.
+IDLE = 0.25
+NONE_IDLE = 0.05
+#: MB free in /dev/shm.
+ROOM = 32.0
+#: Segments of killed processes from which on there is a warning: 180 raised the latency of the
+#: demonstration from image to setpoint, 95 %, from 90 ms to 239 ms.
+DEAD_SEGMENTS = 20
+#: A younger segment may be one whose process is about to lock it, s.
+YOUNG = 10.0
+#: Share of the images sent that arrive, below which images are lost.
+COMING = 0.8
+#: Share of the images that relative_pose processes, below which there is a warning.
+PROCESSED = 0.7
+#: Least number of images to judge that.
+FEW = 10
+#: Keys of the bridge's diagnostics.
+PARAMETER: Final = 'parameter '
+NOT_READY: Final = 'not ready to arm'
+REFUSED: Final = 'offboard would be refused'
+#: The action to take for a status of a node, by words of it.
+ADVICE: Final[Mapping[str, str]] = {
+    'cannot keep up': 'fly behind a slower leader, or raise v_max',
+    'not aligned': 'let the autopilot fuse this odometry (forward_odometry:=true)',
+    'no autopilot': 'check cable, connection and baud rate; is the autopilot on?',
+    'autopilot lost': 'check cable and power of the autopilot',
+    'no publisher': 'start what publishes it, or connect its name (above)',
+    'none sending': 'look at the log of what publishes it',
+    'not in sight': 'hold the leader before the camera',
+    'QoS mismatch': 'change the QoS of the publisher',
+    'another clock': 'set use_sim_time alike everywhere',
+    'use_sim_time': 'set use_sim_time alike everywhere',
+    'axes of odom': 'set odom_child_rpy, see odom up above and docs/sensors.md',
+    'velocity of odom': 'set odom_twist_frame:=auto',
+    'internal error': 'a mistake in this package: report it, with the log',
+    'no image processed': 'see images, calibration and odometry above'}
+
+
+def check_machine(seen: Observations) -> Iterator[Finding]:
+    """Check the computer, and whether perception keeps up."""
+    if not seen.live:
+        return
+    machine = seen.machine
+    if machine.idle is not None:
+        yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
+                     f'{machine.idle:.0%} of {machine.processors} cores left',
+                     f'{IDLE:.0%} or more left',
+                     'end what need not run (rviz, recordings), or ask less of the odometry')
+    if machine.shares_memory:
+        yield from _shared_memory(seen)
+    images, frames = seen.topic(seen.image_name), seen.topic('neighbors/frames')
+    if len(images.arrivals) >= FEW and frames.publishers:
+        share = frames.rate / images.rate
+        yield judged(
+            not frames.arrivals, share < PROCESSED, 'images processed',
+            f'{min(share, 1.0):.0%} of the images' if frames.arrivals else 'none',
+            f'{PROCESSED:.0%} or more',
+            'less to do for the processor, or a lower frame rate' if frames.arrivals else
+            'see images, calibration and odometry; its log says what it drops')
+
+
+def _shared_memory(seen: Observations) -> Iterator[Finding]:
+    machine = seen.machine
+    what = 'shared memory'
+    if machine.shared_memory_free is not None and machine.shared_memory_free < ROOM:
+        yield error(what, f'{machine.shared_memory_free:.0f} MB free in /dev/shm',
+                    f'{ROOM:.0f} MB', 'delete /dev/shm/fastrtps_* of processes that are gone; '
+                    'in a container, --shm-size')
+    if machine.dead_segments >= DEAD_SEGMENTS:
+        yield warning(what, f'{machine.dead_segments} segments of processes that were killed',
+                      'none: they slow every node', 'fastdds shm clean')
+    largest = max((picture.bytes for picture in seen.pictures), default=0)
+    if not largest:
+        return
+    images, infos = seen.topic(seen.image_name).rate, seen.topic('camera_info').rate
+    large = largest > machine.segment
+    lost = large and seen.image_name != COMPRESSED_IMAGES and images < COMING * infos
+    yield judged(lost, large, what, f'images of {largest / 1024:.0f} kB'
+                 f'{f", {1.0 - images / infos:.0%} are lost" if lost else ""}',
+                 f'images fit into {machine.segment // 1024} kB',
+                 'export FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml for every node')
+
+
+def dead_segments(folder: Path = Path('/dev/shm')) -> list[Path]:
+    """
+    Return the lock files of Fast DDS's segments in shared memory whose processes were killed.
+
+    A process locks the file ``NAME_el`` beside each of its segments, and removes both at its end.
+    """
+    dead = []
+    for path in folder.glob('fastrtps_*_el'):
+        with contextlib.suppress(OSError), open(path, 'rb') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if time.time() - path.stat().st_mtime > YOUNG:
+                dead.append(path)
+    return dead
+
+
+def idle_share(before: str, after: str) -> float | None:
+    """Return the share of the processors that was idle between two readings of /proc/stat."""
+    first, second = (np.array(text.splitlines()[0].split()[1:9], dtype=float)
+                     for text in (before, after))
+    spent = second - first
+    total = float(spent.sum())
+    return float(spent[3] + spent[4]) / total if total > 0.0 else None
+
+
+def check_diagnostics(seen: Observations) -> Iterator[Finding]:
+    """Report the status of our nodes and of the autopilot."""
+    for node in OURS:
+        full = full_name(node, seen.namespace)
+        told = seen.told.get(full.lstrip('/'))
+        if told is None:
+            if full in seen.nodes:
+                yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
+            continue
+        advice = next((advice for words, advice in ADVICE.items() if words in told.message),
+                      "see the node's log")
+        found = [judged(told.level > 1, told.level == 1, f'{node} says', told.message, 'running',
+                        advice)]
+        if node == 'mavlink_bridge':
+            found += _autopilot(told.values)
+        # Faults at the time of a recording do not prevent its use.
+        yield from (finding if seen.live or finding.level != ERROR else
+                    finding._replace(level=WARNING) for finding in found)
+
+
+def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
+    """Report the state of the autopilot, by the values of the bridge's diagnostics."""
+    what = 'autopilot'
+    if values.get('link') != 'alive':
+        yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
+                    'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
+        return
+    yield ok(what, f'{values.get("autopilot") or "heard"}, {values.get("mode") or "no mode"}, '
+             f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
+    differing = [key for key in values if key.startswith(PARAMETER)]
+    wanted = 'as config/ recommends'
+    for key in differing:
+        value, _, why = values[key].partition(': ')
+        yield warning('autopilot parameter', f'{key.removeprefix(PARAMETER)} {value}', wanted,
+                      f'set it in the ground station, or know why not. {why}'.strip())
+    summary = values.get('parameters', '')
+    if not summary or not differing:
+        yield judged(False, not summary, 'autopilot parameters', summary or 'not compared yet',
+                     wanted, 'wait some seconds and check again')
+    wanted = 'nothing speaks against it'
+    for what, key, advice in (
+            ('ready to arm', NOT_READY, 'these are its own words: settle them, then check again'),
+            ('ready for offboard', REFUSED, 'settle that: the bridge would refuse offboard')):
+        if key in values:
+            yield judged(bool(values[key]), False, what,
+                         f'no: {values[key]}' if values[key] else wanted, wanted, advice)
+        elif key == NOT_READY and values.get('armed') != 'True':
+            yield unmeasured(what, 'the autopilot has not reported it yet', wanted)

@@ -1,0 +1,446 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One follower as one object: events in, each with its time; estimates, commands and setpoints out.
+
+Perception, planner and setpoint control are the same three objects that the nodes drive, each in
+a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated
+one in ``flights``. Computing takes no time, neither does passing messages on: an estimate reaches
+the planner at the moment its image, or the odometry that image waited for, came; a command
+reaches the control at the tick.
+
+The planner ticks every ``period``, and when images cease; the control sends every
+1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
+reach the planner just before its tick, and own messages are sent then. Events of the
+same nanosecond happen in this order: an image that has waited in vain for odometry, the planner's
+tick, the control's cycle, the event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+import math
+from typing import Any
+
+from flock_follower.flock.exchange import Sharing
+from flock_follower.geometry import Array, yaw_from_quaternion
+from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import Event
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
+from flock_follower.messages import (
+    ACCELERATION,
+    Command,
+    from_acceleration,
+    from_odometry,
+    from_trajectory,
+    Make,
+    NANOSECONDS,
+    ODOMETRY,
+    OdometryState,
+    RangeState,
+    stamp_age,
+    STATE,
+    to_nanoseconds,
+    TRAJECTORY,
+    trajectory,
+    with_acceleration,
+)
+from flock_follower.perception.neighbor_motion import Estimate
+from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
+from flock_follower.perception.range_tracking import Ranged
+from flock_follower.perception.tracker import Sighting
+from flock_follower.planner.inputs import OwnState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.step import Decision
+
+
+@dataclass
+class ImageOutcome:
+    """
+    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
+
+    ``sighting`` is None if the image was never processed; ``camera`` is the name of its
+    camera, '' if there is only one.
+    """
+
+    stamp: int
+    sighting: Sighting | None = None
+    decoding: float = 0.0
+    perception: float = 0.0
+    camera: str = ''
+
+
+@dataclass
+class Tick:
+    """One tick of the planner, at a time in ns, with the own state it acted on."""
+
+    time: int
+    decision: Decision
+    own: OwnState | None
+    cpu: float
+
+
+@dataclass
+class ControlCycle:
+    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
+
+    time: int
+    setpoint: Setpoint
+    cpu: float
+
+
+class Listener:
+    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        """Take a message that a node would publish, at a time in ns."""
+
+    def odometry(self, state: OdometryState) -> None:
+        """Take the own state."""
+
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+
+    def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
+
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        """Take messages to other followers, at a time in ns."""
+
+    def rejected(self, reason: str, detail: str) -> None:
+        """Take the reason why something was dropped."""
+
+
+#: In a silence longer than this everything has long come to rest, ns: it is skipped.
+LONGEST_SILENCE = 10 * NANOSECONDS
+
+
+class Follower:
+    """
+    Perception, planner and setpoint control on one clock; every time is in ns.
+
+    :param planner: gathers inputs and takes one step per tick, with ``params``.
+    :param control: what may go out, and what it is; None while the bridge is dead.
+    :param listener: receives all outcomes.
+    :param make: returns an empty message of a type; None if no messages are wanted.
+    :param perceiver: None if neighbors come from elsewhere.
+    :param stream_rate: of setpoints, Hz.
+    :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
+    :param camera_rpy: how the camera is mounted, rad, as the planner knows it; of several, each
+        by its name.
+    :param sharing: messages to and from other followers; None without them.
+    :param autopilot_velocity: whether odometry replaces the autopilot's own estimate, too.
+    :param cpu_time: a clock of CPU time, s; only the reported times depend on it.
+    """
+
+    def __init__(self, planner: PlannerLoop, params: PlannerParams, control: Gate,
+                 listener: Listener, make: Make | None = None, *,
+                 perceiver: Perceiver | None = None, stream_rate: float = 20.0,
+                 cycle_phase: float = 0.0, autopilot_velocity: bool = False,
+                 sharing: Sharing | None = None,
+                 camera_rpy: Sequence[float] | Mapping[str, Sequence[float]] = (0.0, 0.0, 0.0),
+                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+        self.planner, self.params, self.perceiver = planner, params, perceiver
+        self.sharing = sharing
+        self.control: Gate | None = control
+        self._source = AUTOPILOT if autopilot_velocity else ODOM
+        self._rpy = camera_rpy if isinstance(camera_rpy, Mapping) else {'': camera_rpy}
+        self._listener, self._make, self._cpu_time = listener, make, cpu_time
+        self._period = to_nanoseconds(params.period)
+        self._cycle = to_nanoseconds(1.0 / stream_rate)
+        self._phase = to_nanoseconds(cycle_phase)
+        self._longest_blink = to_nanoseconds(params.perception_timeout)
+        self._silence: int | None = None
+        self._start: int | None = None
+        self._now = self._next_tick = self._next_cycle = 0
+        self._odom_frame = 'odom'
+        self._gate_odometry: OdometryState | None = None
+        self._gate_received = 0
+        self._state: State | None = None
+        self._bridge_state = ''
+        self._bridge_told = 0
+
+    # Events.
+
+    def engage(self, time: int, wanted: bool) -> None:
+        """Take a call of ``planner/engage``."""
+        self.advance(time)
+        self.planner.engage(wanted)
+
+    def permit(self, time: int, event: Event) -> None:
+        """Take a request to the bridge, or its result; see ``permission``."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.permit(event)
+            self._tell_bridge_state()
+
+    def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
+        """Take the status of the vehicle."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.see(status, self._seconds(), airborne)
+            self._tell_bridge_state()
+
+    def estimate(self, time: int, velocity: Array) -> None:
+        """Take the autopilot's own velocity (3,), m/s, ENU."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
+
+    def height(self, time: int, altitude: float, height: float) -> None:
+        """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
+        self.advance(time)
+        if self.control is not None:
+            gate = self.control
+            gate.update_height(altitude, self._seconds())
+            if not gate.heights.referenced:
+                gate.heights.refer(height, self._seconds())
+
+    def bridge_died(self, time: int) -> None:
+        """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
+        self.advance(time)
+        self._bridge_told, self.control = self._now, None
+
+    def bridge_started(self, time: int, control: Gate) -> None:
+        """Let a new bridge start, which knows nothing of the one before."""
+        self.advance(time)
+        self.control = control
+        self._tell_bridge_state()
+
+    def odometry(self, time: int, state: OdometryState) -> None:
+        """Take the own state."""
+        self.advance(time)
+        self._listener.odometry(state)
+        if self.perceiver is not None and self.perceiver.take_odometry(state):
+            self._listener.rejected(*JUMPED)
+        self.planner.take_odometry(state, time)
+        if self.sharing is not None:
+            self.sharing.take_own(state)
+        self._gate_odometry, self._gate_received = state, time
+        self._odom_frame = state.frame
+        self._process_due()
+
+    def camera_info(self, time: int, message: Any, camera: str = '') -> None:
+        """
+        Take a CameraInfo of a camera, by its name if there are several.
+
+        :raises ValueError: if it is unusable.
+        """
+        self.advance(time)
+        if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
+            self.planner.take_camera_info(message, self._rpy[camera], camera)
+        self._process_due()
+
+    def image(self, time: int, message: Any, stamp: int, camera: str = '') -> None:
+        """Take an Image or CompressedImage of a stamp, ns."""
+        self.advance(time)
+        if self.perceiver is not None and (
+                dropped := self.perceiver.take_image(message, stamp, self._seconds(), camera)):
+            self._listener.rejected(LAGGING, '')
+            self._listener.image(ImageOutcome(dropped.stamp_ns, camera=dropped.camera))
+        self._process_due()
+
+    def range(self, time: int, measured: RangeState) -> None:
+        """Take a range to a neighbour."""
+        self.advance(time)
+        if self.perceiver is not None:
+            if (rejection := self.perceiver.take_range(measured)) is not None:
+                self._listener.rejected(*rejection)
+            self._use_ranges(self.perceiver)
+
+    def neighbor(self, time: int, state: OdometryState) -> None:
+        """Take a neighbour's state."""
+        self.advance(time)
+        if self.sharing is not None:
+            self.sharing.take_seen(state)
+        self._take_neighbor(state)
+
+    def _take_neighbor(self, state: OdometryState, heard: bool = False) -> None:
+        try:
+            self.planner.take_neighbor(state, heard)
+        except ValueError as error:
+            self._listener.rejected('invalid neighbors', str(error))
+
+    def frame(self, time: int, stamp: int) -> None:
+        """Take the stamp of a processed image, ns, with a neighbor in it or not."""
+        self.advance(time)
+        self._see_frame(stamp)
+
+    def word(self, time: int, state: OdometryState) -> None:
+        """Take a message of another vehicle; see ``sharing``."""
+        self.advance(time)
+        if self.sharing is not None:
+            self.sharing.take_word(state, time)
+
+    def advance(self, time: int) -> None:
+        """Let everything happen that is due up to a time."""
+        if self._start is None:
+            self._now = self._start = time
+            self._next_tick = time + self._period
+            self._next_cycle = time + (self._phase or self._cycle)
+        if time - self._now > LONGEST_SILENCE:
+            self._run_until(self._now + LONGEST_SILENCE)
+            self._next_tick = _on_grid(self._next_tick, self._period, time)
+            self._next_cycle = _on_grid(self._next_cycle, self._cycle, time)
+        self._run_until(time)
+        self._now = max(self._now, time)
+
+    def finish(self) -> None:
+        """Process the images that still wait, without odometry: no more will come."""
+        while (waited := self._waited()) is not None:
+            self._now = max(self._now, waited)
+            self._process_due()
+
+    # What is due.
+
+    def _seconds(self, time: int | None = None) -> float:
+        """Return seconds from the first event to a time, or now: near zero, floats are exact."""
+        return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
+
+    def _waited(self) -> int | None:
+        """Return when the oldest image has waited in vain for odometry, None without one."""
+        overdue = None if self.perceiver is None else self.perceiver.overdue
+        # Rounded up: by then the image has waited long enough in seconds, too.
+        return None if overdue is None else (
+            (self._start or 0) + math.ceil(overdue * NANOSECONDS) + 1)
+
+    def _run_until(self, time: int) -> None:
+        while True:
+            times = [self._waited(), self._silence, self._next_tick, self._next_cycle]
+            next_time = min(each for each in times if each is not None)
+            if next_time > time:
+                return
+            self._now = max(self._now, next_time)
+            if next_time == times[0]:
+                self._process_due()
+            elif next_time == times[1]:
+                self._silence = None
+                self._tick()
+            elif next_time == self._next_tick:
+                self._next_tick += self._period
+                self._tick()
+            else:
+                self._next_cycle += self._cycle
+                if self.control is not None:
+                    self._send(self.control)
+
+    def _process_due(self) -> None:
+        perceiver = self.perceiver
+        if perceiver is None:
+            return
+        while (seen := perceiver.process(self._seconds(), self._cpu_time)) is not None:
+            image, sighting = seen.image, seen.sighting
+            for rejection in sighting.rejections:
+                self._listener.rejected(*rejection)
+            for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
+                self._tell(perceiver, image.stamp_ns, name, estimate)
+            if seen.usable:
+                self._see_frame(image.stamp_ns)
+            self._listener.image(ImageOutcome(
+                image.stamp_ns, sighting, seen.decoding, seen.perception, image.camera))
+        self._use_ranges(perceiver)
+
+    def _use_ranges(self, perceiver: Perceiver) -> None:
+        for outcome in perceiver.tracker.ranged():
+            if isinstance(outcome, Ranged):
+                self._tell(perceiver, outcome.stamp, outcome.name, outcome.estimate)
+            else:
+                self._listener.rejected(*outcome)
+
+    def _tell(self, perceiver: Perceiver, stamp: int, name: str, estimate: Estimate) -> None:
+        assert self._make is not None, 'perception gives messages'
+        message, accelerating = perceiver.messages(self._make, stamp, name, estimate)
+        self._listener.publish('neighbors', ODOMETRY, self._now, message)
+        self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
+        self.neighbor(self._now, with_acceleration(
+            from_odometry(message), from_acceleration(accelerating)))
+
+    def _see_frame(self, stamp: int) -> None:
+        if self.planner.take_frame(self._now, stamp):
+            self._silence = self._now + self._longest_blink
+
+    def _tick(self) -> None:
+        if self.sharing is not None:
+            for state in self.sharing.neighbors(self._now):
+                self._take_neighbor(state, heard=True)
+            if words := self.sharing.words(self._now):
+                self._listener.words(self._now, words)
+            for event in self.sharing.told():
+                self._listener.rejected(*event)
+        start = self._cpu_time()
+        bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_told) * 1e-9
+        decision, command = self.planner.tick(self._now, self.params, bridge_age)
+        cpu = self._cpu_time() - start
+        for rejection in decision.rejected:
+            self._listener.rejected(*rejection)
+        if decision.state is not self._state:
+            self._state = decision.state
+            if self._make is not None:
+                message = self._make(STATE)
+                message.data = decision.state.value
+                self._listener.publish('planner/state', STATE, self._now, message)
+        if command is not None:
+            if self._make is not None:  # the gate takes the command from the message
+                message = trajectory(self._make, command)
+                self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
+                command = from_trajectory(message, self._odom_frame)
+            if self.control is not None:
+                age, source_age = command.ages(self._now)
+                if refused := self.control.take_command(
+                        command, age, self._seconds(), source_age):
+                    self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
+        self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
+
+    def _send(self, control: Gate) -> None:
+        start = self._cpu_time()
+        state, self._gate_odometry = self._gate_odometry, None
+        if state is not None:  # the newest since the last cycle: no other counts
+            received = self._seconds(self._gate_received)
+            age = stamp_age(state.stamp, self._gate_received)
+            if refused := control.update_velocity(self._source, state.velocity, age, received):
+                self._listener.rejected(f'odom {refused}', '')
+            else:
+                time = received - max(age, 0.0)
+                control.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
+                control.update_position(self._source, state.position, time)
+        setpoint, _ = control.decide(self._seconds())
+        cpu = self._cpu_time() - start
+        if setpoint.kind != NONE and self._make is not None:
+            yaw = math.nan if setpoint.yaw is None else setpoint.yaw
+            self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
+                self._make, Command(setpoint.acceleration, yaw, frame=self._odom_frame,
+                                    stamp=self._now)))
+        self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
+
+    def _tell_bridge_state(self) -> None:
+        """Pass a new announcement of the bridge to the planner."""
+        assert self.control is not None
+        text = self.control.permission.announced()
+        if text != self._bridge_state:
+            self._bridge_state = text
+            self.planner.take_bridge_state(text, 0.0)
+
+
+def _on_grid(first: int, step: int, time: int) -> int:
+    """Return the first of first, first + step, ... at or after a time."""
+    return first + max(0, -((first - time) // step)) * step
