@@ -317,6 +317,8 @@ class Tracker:
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate that is not believed."""
         name, camera = measurement.name, look.camera
+        if not self._hypotheses[name].candidates:
+            return False
         place = look.views[camera.delays[name]].T_smooth_camera @ measurement.T_camera_body
         return self._hypotheses[name].whose(
             self._schedule.time(name, camera, look.stamp + camera.delays[name]),
