@@ -35,9 +35,7 @@ import yaml
 from flock_desk.camera.leader import board, Face, marker_print, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import render_in_one_thread, Renderer, Sensor
-from flock_desk.marker import snippet
-from flock_desk.runs.marker_panel import layout, SIZES
-from flock_desk.runs.marker_panel import snippet as panel_snippet
+from flock_desk.runs.marker_pages import entry, layout, panel_entry, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -167,8 +165,8 @@ def main() -> None:
     """Print what is seen."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
     render_in_one_thread()
-    carried = {'0.16 m': parse(yaml.safe_load(snippet(DICTIONARY, [0], 0.16))),
-               'panel': parse(yaml.safe_load(panel_snippet(layout(DICTIONARY, [0, 1], SIZES))))}
+    carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),
+               'panel': parse(yaml.safe_load(panel_entry(layout(DICTIONARY, [0, 1], SIZES))))}
     renderers = {name: Renderer(CAMERA, Sensor(), printed(config.neighbors[0].markers))
                  for name, config in carried.items()}
     print('hovering: share of images, RMS of the distance, its mean error, NEES of the place')

@@ -307,7 +307,6 @@ class Flight:
         return {method: self._figures(method) for method in self.methods}
 
     def _figures(self, method: str) -> Figures:
-        self.errors[method].finish()
         table = self.errors[method].table('leader')
         recall = float(np.isfinite(table['distance']).mean())
         # The truth of the last images may come after the end of a short run.

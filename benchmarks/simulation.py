@@ -31,10 +31,9 @@ import time
 import numpy as np
 
 from flock_desk.flocks import graph as flock_graph
-from flock_desk.flocks import vicsek
 from flock_desk.flocks.agents import NEAREST
-from flock_desk.flocks.all_pairs import accelerations
-from flock_desk.flocks.neighbor_search import nearest, pairs_within
+from flock_desk.flocks.graph import nearest, pairs_within
+from flock_desk.flocks.models import accelerations, velocities_after
 from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
 from flock_follower.geometry import Array
 
@@ -105,7 +104,7 @@ def neighbor_steps(x: Array, v: Array) -> dict[str, Callable[[], object]]:
             x, v, FLIGHT_PARAMS, nearest(x, NEAREST)),
         'neighbour graph': lambda: flock_graph.accelerations(
             x, v, FLIGHT_PARAMS, graph, near=pairs_within(x, distance)),
-        'Vicsek': lambda: vicsek.velocities_after(x, v, _RADIUS)}
+        'Vicsek': lambda: velocities_after(x, v, _RADIUS)}
 
 
 def beside_sisyphe(n: int, repeats: int) -> None:
@@ -127,7 +126,7 @@ def beside_sisyphe(n: int, repeats: int) -> None:
                        block_sparse_reduction=sparse, number_of_cells=1024)
         next(model)  # the first step compiles
         theirs.append(min(timed(next, model) for _ in range(repeats)))
-    ours = min(timed(vicsek.velocities_after, x, unit, _RADIUS) for _ in range(repeats))
+    ours = min(timed(velocities_after, x, unit, _RADIUS) for _ in range(repeats))
     print(f"\none step of Vicsek's model, {n} agents, radius {_RADIUS} m, float64\n"
           f'  here, k-d tree           {1e3 * ours:8.1f} ms\n'
           f'  SiSyPHE, all pairs       {1e3 * theirs[0]:8.1f} ms  ({theirs[0] / ours:.1f} times)\n'

@@ -54,7 +54,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_desk.program import PROGRAMS
-from flock_desk.runs.desk_flight import processes_cpu
 from flock_desk.runs.processes import free_udp_port, private_environment, Processes
 from flock_follower.messages import from_trajectory
 
@@ -162,10 +161,10 @@ def memory(pid: int) -> float:
 def measure(processes: Processes, duration: float) -> dict[str, dict[str, float]]:
     """Return what each process used while it flew: percent of a core, and MB."""
     began = time.monotonic()
-    seen = [(began, processes_cpu(processes))]
+    seen = [(began, processes.cpu())]
     while seen[-1][0] < began + duration:
         time.sleep(max(0.0, min(seen[-1][0] + WINDOW, began + duration) - time.monotonic()))
-        seen.append((time.monotonic(), processes_cpu(processes)))
+        seen.append((time.monotonic(), processes.cpu()))
         ended = [name for name, child in processes.children.items()
                  if name in seen[0][1] and child.poll() is not None]
         if ended:

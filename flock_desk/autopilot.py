@@ -42,7 +42,7 @@ from flock_follower.ranges import Range
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the embedded autopilot until it is told to stop; return the exit code."""
+    """Run the embedded autopilot until SIGINT, SIGTERM or its end; return the exit code."""
     options = parser().parse_args(args)
     try:
         address = loopback_address(options.connect)
@@ -101,10 +101,10 @@ class Stepped(Protocol):
     """Bytes in, bytes out; times are s on the monotonic clock."""
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
-        """Take bytes that have arrived, and return what goes out at once."""
+        """Take bytes that have arrived, and return the immediate answers."""
 
     def step(self, now: float) -> list[bytes]:
-        """Move on to a time, and return what goes out."""
+        """Fly on to a time, and return the messages that are due."""
 
 
 class Endpoint:
@@ -198,12 +198,12 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument('--deny-arming', default='', metavar='REASON',
                         help='refuse arming with this reason')
     parser.add_argument('--param-file', default='', metavar='FILE',
-                        help='set what a file says, such as config/px4.params, but '
-                             'what it has for forwarded odometry')
+                        help='set the parameters of a file such as config/px4.params, but '
+                             'those for forwarded odometry')
     parser.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
                         help='set a parameter of the autopilot; may be repeated')
     parser.add_argument('--signing-key-file', default='', metavar='FILE',
-                        help='sign what is sent, and hear only what is signed')
+                        help='sign messages, and accept only signed ones')
     parser.add_argument('--duration', type=_number(0.0, 1e9), default=math.inf, metavar='S',
                         help='stop after this long, s (never)')
     parser.add_argument('--log', default='', metavar='FILE.npz',

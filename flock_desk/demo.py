@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 import shutil
 import sys
@@ -32,18 +33,18 @@ import time
 
 import numpy as np
 
-from flock_desk.runs.demo_record import chapters, read, summarize
-from flock_desk.runs.judge import FigureBound, judge
+from flock_desk.runs.console import guarded
+from flock_desk.runs.flight import COMMANDS, COUNTED, RECORDED, start
+from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     SchedulingDelay,
-    TOO_BUSY_EXIT_CODE,
-    TooBusyError,
 )
-from flock_desk.runs.report import announce, write_report
-from flock_desk.runs.summary import write_summary
+from flock_desk.runs.record import FlightRecord, read_replayed
+from flock_desk.runs.report import announce, Chapter, report
+from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
@@ -55,10 +56,7 @@ from flock_follower.resources import resource
 # faster than the 0.5 m/s of a first flight.
 PARAMS = PlannerParams(FlockingParams(beta=0.25, d0=1.0, d1=8.0), a_max=2.5, v_max=2.0)
 PLAYED = ['/image_raw/compressed', '/camera_info', '/odom']
-RECORDED = ['neighbors:nav_msgs/msg/Odometry', 'planner/state:std_msgs/msg/String',
-            'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory',
-            '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
-NODES = ('relative_pose', 'planner', 'mavlink_bridge')
+STATE = 'planner/state:std_msgs/msg/String'
 TITLE = 'flock_follower: a recorded bag, flown by an embedded autopilot'
 INTRODUCTION = (
     'The bag is replayed through the nodes, and an embedded autopilot flies what they command. '
@@ -90,30 +88,29 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog='demo', description='Replay a bag into an autopilot.')
     parser.add_argument('--output', type=Path, default=Path('build/demo'),
                         help='folder for report and logs (%(default)s)')
-    options = parser.parse_args(args)
-    shutil.rmtree(options.output, ignore_errors=True)
-    pages = [options.output / 'report.html', options.output / 'report.png']
-    try:
-        bag = resource('bags/sample')
-        exit_codes = fly(bag, options.output)
-        flight = read(bag, options.output / 'record', options.output / 'autopilot.npz', PARAMS)
-        summary = summarize(flight, exit_codes)
-        judgements = judge(BOUNDS, summary)
-        write_summary(summary, options.output / 'summary.json')
-        write_report(pages[0], TITLE, INTRODUCTION, summary, judgements,
-                     lambda: chapters(flight, TITLE, pages[1]))
-    except TooBusyError as error:
-        print(f'\ntoo busy: {error}', file=sys.stderr)
-        return TOO_BUSY_EXIT_CODE
-    except (OSError, RuntimeError, ValueError) as error:
-        print(f'error: {error}\nthe logs of every process are in {options.output}',
-              file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('interrupted', file=sys.stderr)
-        return 130
+    out: Path = parser.parse_args(args).output
+    return guarded(partial(_demonstrate, out), hint=f'\nthe logs of every process are in {out}')
+
+
+def _demonstrate(out: Path) -> int:
+    shutil.rmtree(out, ignore_errors=True)
+    bag = resource('bags/sample')
+    exit_codes = fly(bag, out)
+    flight = read_replayed(bag, out, PARAMS)
+    summary = replay_figures(flight, exit_codes)
+    picture = out / 'report.png'
+    judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS,
+                        partial(_pictures, flight, picture))
     print()
-    return announce(summary, judgements, [p for p in pages if p.exists()], options.output)
+    return announce(summary, judgements, [
+        page for page in (out / 'report.html', picture) if page.exists()], out)
+
+
+def _pictures(flight: FlightRecord, picture: Path) -> Sequence[Chapter]:
+    from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
+    plotted = PlottedFlight.of(flight)
+    picture.write_bytes(flight_picture(plotted, TITLE))
+    return chapters(plotted)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:
@@ -121,31 +118,25 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
     Replay the bag through all nodes, leaving logs and records in ``out``.
 
     :returns: the exit code of each process; None for one that had to be killed.
-    :raises RuntimeError: where a process ends early or a service refuses.
+    :raises RuntimeError: if a process ends early or a service refuses.
     """
-    start = first_odometry(bag)
+    begin = first_odometry(bag)
     port = free_udp_port()
-    limits = ['-p', f'a_max:={PARAMS.a_max}', '-p', f'v_max:={PARAMS.v_max}']
-    arguments = {
-        'relative_pose': ['-p', 'image_transport:=compressed'],
-        'planner': [*limits, '-p', f'd0:={PARAMS.law.d0}', '-p', f'd1:={PARAMS.law.d1}'],
-        # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: its
-        # speed is the autopilot's to know.
-        'mavlink_bridge': [*limits, '-p', f'connection:=udpin:127.0.0.1:{port}',
-                           '-p', 'velocity_source:=autopilot', '-p', 'yaw_disagreement:=3.2'],
-    }
+    common = ['use_sim_time:=true', f'a_max:={PARAMS.a_max}', f'v_max:={PARAMS.v_max}']
+    parameters = {
+        'relative_pose': ['use_sim_time:=true', 'image_transport:=compressed'],
+        'planner': [*common, f'd0:={PARAMS.law.d0}', f'd1:={PARAMS.law.d1}'],
+        # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: only
+        # the autopilot knows its velocity.
+        'mavlink_bridge': [*common, f'connection:=udpin:127.0.0.1:{port}',
+                           'velocity_source:=autopilot', 'yaw_disagreement:=3.2']}
     with Processes(private_environment(), out) as processes:
-        print('starting autopilot, ' + ', '.join(NODES))
         processes.start('autopilot', 'flock_desk.autopilot', [
-            '--connect', f'127.0.0.1:{port}', '--altitude', f'{start.position[2]:.2f}',
-            '--yaw', f'{np.degrees(yaw_from_quaternion(start.quaternion)):.1f}',
+            '--connect', f'127.0.0.1:{port}', '--altitude', f'{begin.position[2]:.2f}',
+            '--yaw', f'{np.degrees(yaw_from_quaternion(begin.quaternion)):.1f}',
             '--param-file', str(resource('config/px4.params')),
             '--log', str(out / 'autopilot.npz')])
-        for node in NODES:
-            processes.start(node, f'flock_follower.nodes.{node}',
-                            ['--ros-args', '-p', 'use_sim_time:=true', *arguments[node]])
-        processes.start('recorder', 'flock_desk.recorder_node',
-                        [str(out / 'record'), *RECORDED])
+        start(processes, parameters, [*RECORDED, COMMANDS, STATE])
         processes.wait_for_log('recorder', 'recording')
         processes.ask('mavlink_bridge/offboard')
         processes.ask('planner/engage')
@@ -158,7 +149,7 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
             time.sleep(0.5)
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')
-        time.sleep(1.2)  # every node says once per second what it has counted
+        time.sleep(COUNTED)
         return processes.stop_all()
 
 

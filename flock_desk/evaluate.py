@@ -39,21 +39,20 @@ report``), 2 for a bag, file or option that is wrong: the greatest of all bags.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
 import cv2
-import numpy as np
 
 from flock_desk.runs.cluster import mapped
+from flock_desk.runs.console import explained, guarded
 from flock_desk.runs.evaluation import evaluate, Evaluation
-from flock_desk.runs.evaluation_summary import summarize
-from flock_desk.runs.judge import check_names, judge, Judgement, load_bounds
-from flock_desk.runs.report import announce, Chapter, Illustration, write_report
-from flock_desk.runs.summary import write_summary
-from flock_follower.bags.bag import BagError
+from flock_desk.runs.judge import check_names, Judgement, load_bounds
+from flock_desk.runs.report import announce, Chapter, report
+from flock_desk.runs.summary import evaluation_figures
 from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
 from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
@@ -95,26 +94,32 @@ def main(args: Sequence[str] | None = None) -> int:
             for key in ('bag', 'config', 'expect', 'output'):
                 if (path := getattr(one, key)) is not None:
                     setattr(one, key, path.expanduser().absolute())
+    return guarded(partial(_evaluate_all, each, options.scheduler), refused=2)
+
+
+def _evaluate_all(each: Sequence[argparse.Namespace], scheduler: str) -> int:
+    """Evaluate bags, here or on a cluster, print the outcomes and return the exit code."""
     code = 0
-    try:
-        for one, told in zip(each, mapped(options.scheduler, evaluated, each)
-                             if options.scheduler else map(evaluated, each)):
-            if len(names) > 1:
-                print(f'\n{one.bag}')
-            code = max(code, _tell(told, one))
-    except (OSError, RuntimeError) as error:
-        return _refuse(error)
-    except KeyboardInterrupt:
-        print('interrupted', file=sys.stderr)
-        return 130
+    for options, outcome in zip(each, mapped(scheduler, evaluated, each) if scheduler
+                                else map(evaluated, each)):
+        if len(each) > 1:
+            print(f'\n{options.bag}')
+        if outcome.refused:
+            print(f'error: {outcome.refused}', file=sys.stderr)
+            code = 2
+            continue
+        for line in (*(finding.line for finding in outcome.findings),
+                     *(f'warning: {warning}' for warning in outcome.warnings)):
+            print(line, file=sys.stderr)
+        code = max(code, int(options.check == 'fail' and not ready(outcome.findings)), announce(
+            outcome.summary, outcome.judgements, [options.output / 'report.html']))
     return code
 
 
 class BagOutcome(NamedTuple):
-    """What came of one bag."""
+    """The outcome of one bag; ``refused`` is the reason why there is none, or ''."""
 
-    refused: str
-    """Why nothing did, or ''."""
+    refused: str = ''
     findings: Sequence[Finding] = ()
     """Errors and warnings of ``check``."""
     warnings: Sequence[str] = ()
@@ -123,43 +128,17 @@ class BagOutcome(NamedTuple):
 
 
 def evaluated(options: argparse.Namespace) -> BagOutcome:
-    """Evaluate one bag, write its files, and return what there is to say."""
-    cv2.setNumThreads(1)  # what is measured is to be the cost on one core
+    """Evaluate one bag, write its files, and return the outcome."""
+    cv2.setNumThreads(1)  # the cost measured is that of one core
     try:
-        evaluation, summary, judgements = run(options)
-    except (BagError, ValueError) as error:
-        return BagOutcome(str(error))
-    except OSError as error:
-        return BagOutcome(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
-    warnings = []
-    if evaluation.incomplete:
-        warnings.append(f'{options.bag} is incomplete: {evaluation.incomplete}')
-    warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
-                 for stranger in sorted(evaluation.errors.strangers)]
-    warnings += too_fast(summary, evaluation.flight.planner_params.v_max)
-    return BagOutcome('', _amiss(evaluation), warnings, summary, judgements)
+        return run(options)
+    except (OSError, ValueError) as error:
+        return BagOutcome(explained(error))
 
 
-def _amiss(evaluation: Evaluation) -> list[Finding]:
-    """Return what the rules of ``check`` found amiss, errors first; an incomplete bag is said."""
-    return [finding for level in (ERROR, WARNING) for finding in evaluation.findings
-            if finding.level == level and finding.what != 'bag']
-
-
-def _tell(told: BagOutcome, options: argparse.Namespace) -> int:
-    """Print what came of a bag, and return the exit code."""
-    if told.refused:
-        return _refuse(told.refused)
-    for line in (*(finding.line for finding in told.findings),
-                 *(f'warning: {warning}' for warning in told.warnings)):
-        print(line, file=sys.stderr)
-    code = announce(told.summary, told.judgements, [options.output / 'report.html'])
-    return max(code, int(options.check == 'fail' and not ready(told.findings)))
-
-
-def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Judgement]]:
+def run(options: argparse.Namespace) -> BagOutcome:
     """
-    Evaluate and write the files; return the evaluation, its summary and the judgement.
+    Evaluate one bag and write its files.
 
     :raises ValueError: for a bag, parameter or bound that is wrong.
     :raises OSError: for a file that cannot be read or written.
@@ -172,56 +151,39 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     evaluation = evaluate(
         options.bag, values, options.output / 'result.mcap', options.namespace, remaps,
         options.check != 'skip')
-    summary = summarize(evaluation)
+    summary = evaluation_figures(evaluation)
     check_names(bounds, summary)
-    judgements = judge(bounds, summary)
-    write_summary(summary, options.output / 'summary.json')
+    # Errors first; that the bag is incomplete is a warning of its own.
+    findings = [finding for level in (ERROR, WARNING) for finding in evaluation.findings
+                if finding.level == level and finding.what != 'bag']
+    fast = too_fast(summary, evaluation.flight.planner_params.v_max)
     flown_with = ', with the parameters flown' if flown else ''
-    write_report(
-        options.output / 'report.html', f'Evaluation of {evaluation.bag}',
+    judgements = report(
+        options.output, f'Evaluation of {evaluation.bag}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
-        'setpoints.', summary, judgements, lambda: _chapters(evaluation),
-        warnings=[*(finding.line for finding in _amiss(evaluation)),
-                  *too_fast(summary, evaluation.flight.planner_params.v_max)])
-    return evaluation, summary, judgements
+        'setpoints.', summary, bounds, partial(_pictures, evaluation),
+        warnings=[*(finding.line for finding in findings), *fast])
+    warnings = [f'the truth of {stranger!r} is not used: no neighbor has that name'
+                for stranger in sorted(evaluation.errors.strangers)]
+    if evaluation.incomplete:
+        warnings.insert(0, f'{options.bag} is incomplete: {evaluation.incomplete}')
+    return BagOutcome('', findings, [*warnings, *fast], summary, judgements)
+
+
+def _pictures(evaluation: Evaluation) -> Sequence[Chapter]:
+    from flock_desk.runs.plots import evaluation_chapters
+    return evaluation_chapters(evaluation)
 
 
 def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
-    """Return what there is to say of a bag whose follower was faster than allowed, if it was."""
+    """Return the warning of a bag whose follower was faster than allowed, if it was."""
     share = summary['faster_than_v_max_share']
     if not share:
         return []
     return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
             f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
             'brake; set v_max (--config) to what was flown']
-
-
-def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
-    from flock_desk.runs import plots
-    ticks, setpoints = evaluation.ticks, evaluation.setpoints
-    # The follower of the bag does not fly the setpoints.
-    speed = plots.Curve('follower in the bag', plots.FOLLOWER, ticks[:, 0], ticks[:, 3])
-    tables = {name: evaluation.errors.table(name) for name in evaluation.names}
-    for name, table in tables.items():
-        paths = [
-            plots.Curve(f'{name}, estimated', plots.LEADER, table['neighbor_x'],
-                        table['neighbor_y']),
-            plots.Curve('follower, in its odometry', plots.FOLLOWER, table['own_x'],
-                        table['own_y'])]
-        yield from plots.chapters(plots.PlottedFlight(
-            name=name, duration=evaluation.duration, table=table,
-            params=evaluation.flight.planner_params, paths=paths, speeds=[speed],
-            setpoint_times=setpoints[:, 0], setpoints=setpoints[:, 1:4],
-            commanded=setpoints[:, 4] == 1.0, states=evaluation.states), truth=evaluation.truth)
-    yield Chapter('Stages', '', [Illustration(plots.stage_picture(
-        tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
-        evaluation.duration), 'stages and CPU time')])
-
-
-def _refuse(problem: Any) -> int:
-    print(f'error: {problem}', file=sys.stderr)
-    return 2
 
 
 if __name__ == '__main__':

@@ -20,8 +20,8 @@ a table of what they show, for the law and the models it is compared with; and t
 from what ``fly`` has recorded of the same scenarios. With ``--agents N`` one larger flock. Each is
 as wide as a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
 
-A scenario that nobody has flown yet is told in a line that says how to; the exit code stays 0.
-Where there is a flight that cannot be read it is 1, after all else has been drawn.
+For a scenario that has not been flown yet a line says how to fly it; the exit code stays 0. If a
+flight cannot be read it is 1, after all else has been drawn.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 import csv
+from functools import partial
 from pathlib import Path
 import sys
 
@@ -38,9 +39,8 @@ from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.starts import random_start
-from flock_desk.runs.flight_folder import last_flight
-from flock_desk.runs.progress import Progress
-from flock_desk.runs.report import aligned
+from flock_desk.runs.console import aligned, guarded, Progress
+from flock_desk.runs.record import last_flight, read_flown
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.bag import BagError, failures
 
@@ -61,26 +61,20 @@ Row = tuple[str, ...]
 
 def main(args: Sequence[str] | None = None) -> int:
     """Draw the figures and return the exit code."""
-    options = _parser().parse_args(args)
-    told: list[str] = []
+    return guarded(partial(_draw, _parser().parse_args(args)))
+
+
+def _draw(options: argparse.Namespace) -> int:
+    notes: list[str] = []
     faults: list[str] = []
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        if options.agents is not None:
-            written = one_flock(options)
-        else:
-            written = redraw(options.out)
-            flown, told, faults = redraw_flights(options.out, options.flights)
-            written += flown
-    except (ImportError, OSError, RuntimeError, ValueError) as error:
-        _end_bar()
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        _end_bar()
-        print('interrupted', file=sys.stderr)
-        return 130
-    print('\n'.join(['', *told, f'written to {options.out}: {", ".join(written)}']))
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.agents is not None:
+        written = one_flock(options)
+    else:
+        written = redraw(options.out)
+        flown, notes, faults = redraw_flights(options.out, options.flights)
+        written += flown
+    print('\n'.join(['', *notes, f'written to {options.out}: {", ".join(written)}']))
     for fault in faults:
         print(f'error: {fault}', file=sys.stderr)
     return 1 if faults else 0
@@ -88,9 +82,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def redraw(out: Path) -> list[str]:
     """Write the paper's simulations and ``results.csv``, print the table, return the names."""
-    from flock_desk.runs import flock_plots as plots
-    from flock_desk.runs.figure_style import save
-    progress = Progress(2 * len(MODELS) + 7, sys.stderr)
+    from flock_desk.runs import paper_plots as plots
+    progress = Progress(2 * len(MODELS) + 7)
     leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
     runs: dict[str, dict[Model, Simulation]] = {}
     for scenario, start, lead, duration in (
@@ -119,7 +112,7 @@ def redraw(out: Path) -> list[str]:
     written = []
     for name, draw in figures.items():
         progress.start(f'drawing {name}')
-        written.append(save(draw(), out / name))
+        written.append(plots.save(draw(), out / name))
     progress.finish()
     rows = [row(scenario, MODELS[model], run)
             for scenario, by_model in runs.items() for model, run in by_model.items()]
@@ -130,46 +123,43 @@ def redraw(out: Path) -> list[str]:
 
 def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list[str]]:
     """
-    Write the paper's flights, and return the names, what to tell of each, and what went wrong.
+    Write the paper's flights, and return the names, a note on each, and the errors.
 
-    :param flights: the folder where ``fly`` leaves them.
-    :raises OSError: where a figure cannot be written.
+    :param flights: the folder of the flights of ``fly``.
+    :raises OSError: if a figure cannot be written.
     """
-    from flock_desk.runs import flight_plots as plots
-    from flock_desk.runs.figure_style import save
-    from flock_desk.runs.fly_record import read
-    written, told, faults = [], [], []
+    from flock_desk.runs import paper_plots as plots
+    written, notes, faults = [], [], []
     for name in FLIGHTS:
         folder = last_flight(flights, name)
         if folder is None:
-            told.append(f'{name}: not drawn, there is no flight of it in {flights}: '
+            notes.append(f'{name}: not drawn, there is no flight of it in {flights}: '
                         f'make fly SCENARIO={name}')
             continue
         try:
             with failures(folder / 'flight.npz', 'cannot be read'):
-                flight = read(load(name), folder)
+                flight = read_flown(load(name), folder)
         except BagError as error:
             faults.append(f'{name}: not drawn: {error}')
             continue
-        written += [save(plots.positions(flight), out / f'{name}_positions'),
-                    save(plots.distance(flight), out / f'{name}_distance')]
+        written += [plots.save(draw(flight), out / f'{name}_{draw.__name__}')
+                    for draw in (plots.positions, plots.distance)]
         apart = flight.distance[np.isfinite(flight.distance)]
-        told.append(f'{name}: {flight.duration:.3g} s in {folder}, {apart.min():.2f} to '
+        notes.append(f'{name}: {flight.duration:.3g} s in {folder}, {apart.min():.2f} to '
                     f'{apart.max():.2f} m apart, '
                     f'{100.0 * flight.time_in_band_share:.1f} % of the time in the band'
                     f'{", flown by an autopilot elsewhere" if flight.external else ""}')
-    return written, told, faults
+    return written, notes, faults
 
 
 def one_flock(options: argparse.Namespace) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of what it wrote."""
-    from flock_desk.runs import flock_plots as plots
-    from flock_desk.runs.figure_style import save
+    from flock_desk.runs import paper_plots as plots
     params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
     usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
     neighbors: Neighbors = options.neighbors or usual
     start = random_start(options.agents, options.dim, params, options.seed)
-    progress = Progress(2, sys.stderr)
+    progress = Progress(2)
     progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
     run = simulate(
         start.positions, start.velocities, params, duration=options.duration,
@@ -181,7 +171,7 @@ def one_flock(options: argparse.Namespace) -> list[str]:
     name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
             f'seed{options.seed}')
     progress.start(f'drawing {name}')
-    written = save(plots.flock(run), options.out / name)
+    written = plots.save(plots.flock(run), options.out / name)
     progress.finish()
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')
@@ -219,12 +209,6 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
         writer.writerows(rows)
 
 
-def _end_bar() -> None:
-    """Leave the line of the progress bar."""
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
-
-
 def _text(value: float, digits: int) -> str:
     """Return a number as text; empty where there is none, and never a negative zero."""
     zero = '0.' + '0' * digits
@@ -236,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='figures', description='Redraw the figures of the paper, or one larger flock.')
     parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
     parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
-                        help='where fly has left its flights; %(default)s')
+                        help='folder of the flights of fly; %(default)s')
     flock = parser.add_argument_group('one larger flock')
     flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
     flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')

@@ -25,6 +25,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import groupby
 import json
 import multiprocessing
 import os
@@ -46,8 +48,7 @@ from flock_desk.closed_loop.flight_metrics import (
     summary,
 )
 from flock_desk.runs.cluster import mapped
-from flock_desk.runs.progress import Progress
-from flock_desk.runs.report import aligned
+from flock_desk.runs.console import aligned, guarded, Progress
 from flock_desk.scenarios.key_tables import markdown
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
@@ -81,11 +82,11 @@ FLOCK_COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
                  'edges': ('edges', 'each', 1.0, 2),
                  'neighbors_in_sight': ('seen', 'each', 1.0, 2),
                  'rms_acceleration_m_s2': ('accel.', 'm/s2', 1.0, 2)}
-#: What the columns mean that their titles cannot tell.
-COLUMNS_TOLD = """
+#: The meaning of the columns.
+COLUMN_NOTES = """
 kept band: share of runs that never left it. In band, in sight, guard (acts): share of time.
 Near, far (from the leader), fastest, unseen (for how long): the worst of all runs."""
-FLOCKS_TOLD = """
+FLOCK_NOTES = """
 in band: along the edges, to those that it follows. Nearest pair: any two vehicles."""
 Results = dict[str, dict[str, dict[str, float]]]
 
@@ -110,39 +111,36 @@ class Flown(NamedTuple):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
+    parser = _parser()
+    options = parser.parse_args(args)
     try:
-        parser = _parser()
-        options = parser.parse_args(args)
-        if options.keys:
-            print(markdown())
-            return 0
-        try:
-            _COUNTS.check('--runs', options.runs)
-            _COUNTS.check('--jobs', options.jobs)
-            _SEEDS.check('--seed', options.seed)
-        except ValueError as error:
-            parser.error(str(error))
-        scenarios = chosen(options.scenario)
-        if options.flock:
-            changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
-            scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
-        options.output.mkdir(parents=True, exist_ok=True)
-        results, cpu, exits = fly_all(scenarios, options.runs, options.jobs, options.seed,
-                                      options.scheduler)
-        path = options.output / 'flights.json'
-        with whole_file(path) as file:
-            file.write((json.dumps(results, indent=2) + '\n').encode())
-    except (OSError, RuntimeError, ScenarioError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('\ninterrupted', file=sys.stderr)
-        return 130
+        _COUNTS.check('--runs', options.runs)
+        _COUNTS.check('--jobs', options.jobs)
+        _SEEDS.check('--seed', options.seed)
+    except ValueError as error:
+        parser.error(str(error))
+    if options.keys:
+        print(markdown())
+        return 0
+    return guarded(partial(_campaign, options))
+
+
+def _campaign(options: argparse.Namespace) -> int:
+    scenarios = chosen(options.scenario)
+    if options.flock:
+        changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
+        scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
+    options.output.mkdir(parents=True, exist_ok=True)
+    results, cpu, exits = fly_all(scenarios, options.runs, options.jobs, options.seed,
+                                  options.scheduler)
+    path = options.output / 'flights.json'
+    with whole_file(path) as file:
+        file.write((json.dumps(results, indent=2) + '\n').encode())
     print(table(results))
-    print(COLUMNS_TOLD)
+    print(COLUMN_NOTES)
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
     if flocks:
-        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCKS_TOLD}\n')
+        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCK_NOTES}\n')
         print('CPU time of a tick of each follower, mean and p99, ms')
     for name in flocks:
         mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
@@ -186,16 +184,16 @@ def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
              for mode in MODES for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
-    progress = Progress(len(scenarios), sys.stderr)
-    share = len(scenarios) / len(tasks)
+    progress = Progress(len(scenarios))
     flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
-    for number, task in enumerate(tasks, start=1):
-        if task.scenario.name != progress.name:
-            progress.start(task.scenario.name)
-        parts.setdefault((progress.name, task.mode), []).append(next(flown))
-        progress.share(number * share - progress.done)
+    for name, group in groupby(tasks, lambda task: task.scenario.name):
+        progress.start(name)
+        of_scenario = list(group)
+        for number, task in enumerate(of_scenario, start=1):
+            parts.setdefault((name, task.mode), []).append(next(flown))
+            progress.share(number / len(of_scenario))
     progress.finish()
-    list(flown)  # lets it end
+    list(flown)  # ends the generator
     return ({s.name: {mode: summary(joined([part.runs for part in parts[s.name, mode]]))
                       for mode in MODES} for s in scenarios},
             {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])

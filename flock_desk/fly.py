@@ -37,26 +37,19 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from flock_desk.runs.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH, within
-from flock_desk.runs.flight_folder import clear, locked, PICTURE, set_aside
-from flock_desk.runs.fly_bounds import bounds, summarize, Usage
-from flock_desk.runs.fly_column import column_bounds, column_chapters, summarize_column
-from flock_desk.runs.fly_record import chapters, LiveRecord, picture, read
-from flock_desk.runs.judge import FigureBound, judge, Judgement
-from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
-from flock_desk.runs.report import announce, write_report
-from flock_desk.runs.summary import write_summary
+from flock_desk.runs.console import guarded
+from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH
+from flock_desk.runs.judge import FigureBound, Judgement, nearest, scenario_bounds
+from flock_desk.runs.record import clear, LiveRecord, locked, PICTURE, read_flown, set_aside
+from flock_desk.runs.report import announce, Chapter, report
+from flock_desk.runs.summary import column_figures, scenario_figures
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
-from flock_desk.scenarios.scenario_file import (
-    load_for_real_time,
-    names,
-    ScenarioError,
-)
+from flock_desk.scenarios.scenario_file import load_for_real_time, names
 from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
-BUSY = 0.02  # of the images, not rendered in time: then the flight tells more of the machine
+BUSY = 0.02  # of the images, not rendered in time: the machine was too slow
 
 
 def _options(args: Sequence[str] | None) -> argparse.Namespace:
@@ -105,83 +98,72 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, and return the exit code."""
     options = _options(args)
-    try:
-        scenario = load_for_real_time(options.scenario)
-        duration = min(options.duration or scenario.duration, scenario.duration)
-        if options.duration > duration:
-            print(f'{scenario.name} lasts {duration:g} s: it is flown for so long, not for '
-                  f'--duration = {options.duration:g} s', flush=True)
-        external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
-                              options.leader_truth) if options.autopilot else None)
-        with locked(options.output):
-            set_aside(options.output)
-            for namespace in ('', *namespaces(options.followers)):
-                clear(options.output / namespace)
-            usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
-                                    options.output, external, options.followers)
-            summary, judgements, reports = told(
-                scenario, options.output, options.followers, usage, exit_codes)
-    except ScenarioError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    except TooBusyError as error:
-        print(f'\ntoo busy: {error}', file=sys.stderr)
-        return TOO_BUSY_EXIT_CODE
-    except (OSError, RuntimeError, ValueError) as error:
-        what = (f'{error.filename}: {error.strerror}'
-                if isinstance(error, OSError) and error.filename else error)
-        print(f'error: {what}; the logs of every process are in {options.output}',
-              file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('interrupted', file=sys.stderr)
-        return 130
-    print()
-    for each in ([summary] if options.followers == 1 else [
-            summary[namespace] for namespace in namespaces(options.followers)]):
-        for warning in cautions(each):
-            print(f'warning: {warning}', file=sys.stderr)
-    return announce(summary, judgements, reports, options.output)
+    return guarded(partial(_fly, options),
+                   hint=f'; the logs of every process are in {options.output}')
 
 
-def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
-         exit_codes: dict[str, int | None]
-         ) -> tuple[dict[str, Any], list[Judgement], list[Path]]:
-    """Write summaries and reports; return the summary of all, what became of bounds, and pages."""
+def _fly(options: argparse.Namespace) -> int:
+    scenario = load_for_real_time(options.scenario)
+    duration = min(options.duration or scenario.duration, scenario.duration)
+    if options.duration > duration:
+        print(f'{scenario.name} lasts {duration:g} s: it is flown for so long, not for '
+              f'--duration = {options.duration:g} s', flush=True)
+    external = (links(options.autopilot, options.truth, options.forward_odometry,
+                      options.leader_truth) if options.autopilot else None)
+    with locked(options.output):
+        set_aside(options.output)
+        for namespace in ('', *namespaces(options.followers)):
+            clear(options.output / namespace)
+        cores, exit_codes = fly(scenario, options.scenario, options.seed, duration,
+                                options.output, external, options.followers)
+        return conclude(scenario, options.output, options.followers, cores, exit_codes)
+
+
+def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, float],
+             exit_codes: Mapping[str, int | None]) -> int:
+    """Write summaries and reports, print the figures, and return the exit code."""
     flights: dict[str, LiveRecord] = {}
-    summaries, reports = {}, []
+    summaries: dict[str, dict[str, Any]] = {}
     limits: list[FigureBound] = []
+    judgements: list[Judgement] = []
     for namespace in namespaces(followers):
         folder, title = out / namespace, ' '.join(filter(None, [scenario.name, namespace]))
-        flight = flights[namespace] = read(scenario, folder, namespace)
-        mine = within(namespace)
-        summary = summaries[namespace] = summarize(flight, usage.of(mine), {
-            name.removeprefix(mine): code for name, code in exit_codes.items()
-            if name.startswith(mine)})
-        wanted = bounds(flight, summary)
-        judgements = judge(wanted, summary)
-        write_summary(summary, folder / 'summary.json')
-        reports.append(folder / 'report.html')
-        write_report(reports[-1], f'flock_follower on the desk: {title}', scenario.summary,
-                     summary, judgements, partial(chapters, flight), warnings=cautions(summary))
-        with whole_file(folder / PICTURE) as file:
-            file.write(picture(flight))
-        limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in wanted]
-    if followers == 1:
-        return summary, judgements, reports
-    column = summarize_column(scenario, flights)
-    summary = {**column, **summaries}
-    judgements = judge([*column_bounds(scenario), *limits], summary)
-    write_summary(summary, out / 'summary.json')
-    reports.append(out / 'report.html')
-    write_report(reports[-1], f'flock_follower on the desk: {scenario.name}, a column of '
-                 f'{followers}', scenario.summary, column, judgements,
-                 lambda: column_chapters(scenario, flights))
-    return summary, judgements, reports
+        flight = flights[namespace] = read_flown(scenario, folder, namespace)
+        summary = summaries[namespace] = scenario_figures(
+            flight, own(cores, namespace), own(exit_codes, namespace))
+        bounds = scenario_bounds(flight, summary)
+        limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in bounds]
+        judgements = report(
+            folder, f'flock_follower on the desk: {title}', scenario.summary, summary, bounds,
+            partial(_pictures, folder, flight), warnings=cautions(summary))
+    print()
+    for warning in (warning for each in summaries.values() for warning in cautions(each)):
+        print(f'warning: {warning}', file=sys.stderr)
+    pages = [out / namespace / 'report.html' for namespace in flights]
+    if followers > 1:
+        summary = column_figures(scenario, flights)
+        judgements = report(
+            out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
+            scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
+            partial(_column_pictures, scenario, flights), parts=summaries)
+        summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
+    return announce(summary, judgements, pages, out)
+
+
+def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
+    from flock_desk.runs.plots import portrait, scenario_chapters
+    with whole_file(folder / PICTURE) as file:
+        file.write(portrait(flight))
+    return scenario_chapters(flight)
+
+
+def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> Sequence[Chapter]:
+    from flock_desk.runs.plots import column_chapters
+    return column_chapters(scenario, flights)
 
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:
-    """Return what to know before reading the figures: a busy machine, a flight cut short."""
+    """Return the warnings: a busy machine, a flight cut short."""
     told = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
     if skipped > BUSY:

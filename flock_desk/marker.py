@@ -28,78 +28,61 @@ from pathlib import Path
 import sys
 from typing import NoReturn
 
-from flock_desk.runs import marker_panel
-from flock_desk.runs.drawing import Drawing, pdf
-from flock_desk.runs.marker_pages import choose_page, draw, largest_on_a4, PAGES
+from flock_desk.runs.console import guarded
+from flock_desk.runs.marker_pages import (
+    choose_page,
+    draw,
+    entry,
+    largest_on_a4,
+    layout,
+    PAGES,
+    panel_entry,
+    pdf,
+    SIZES,
+)
 from flock_follower.perception.markers import dictionary_size, SIDE_LENGTHS
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Write the file and return the exit code."""
-    try:
-        options = _parser().parse_args(args)
-        page, entries = _write(options)
-    except (OSError, ValueError) as error:
-        print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
-        return 2
-    print(f'{options.output}: page {page}', file=sys.stderr)
-    print(entries)
-    return 0
+    return guarded(lambda: _write(_parser().parse_args(args)), refused=2)
 
 
-def _write(options: argparse.Namespace) -> tuple[str, str]:
-    """Write the file and return its page's name and size, and the neighbours file."""
+def _write(options: argparse.Namespace) -> int:
+    """Write the file and print the neighbours file."""
     if options.panel:
-        options.size = options.size or [*marker_panel.SIZES]
+        options.size = options.size or [*SIZES]
         options.id = options.id or [*range(len(options.size))]
-    missing = [f'--{name}' for name in ('id', 'size') if not getattr(options, name)]
-    if missing:
+    ids, sizes, dictionary = options.id, options.size, options.dictionary
+    if missing := [f'--{name}' for name in ('id', 'size') if not getattr(options, name)]:
         raise ValueError(f'the following arguments are required: {", ".join(missing)}')
-    for size in options.size:
+    for size in sizes:
         SIDE_LENGTHS.check('size', size)
     if options.output.suffix.lower() != '.pdf':
         raise ValueError(f'output = {options.output}: must end in .pdf')
-    if len(set(options.id)) < len(options.id):
-        raise ValueError(f'id = {options.id}: must name each marker once')
-    page, drawings, entries, hint = (_panel if options.panel else _single)(options)
-    ids, sizes = (', '.join(f'{n:g}' for n in given) for given in (options.id, options.size))
-    options.output.write_bytes(pdf(drawings, f'{options.dictionary} {ids}, {sizes} m'))
-    return f'{page}, {drawings[0].width:g} x {drawings[0].height:g} mm{hint}', entries
-
-
-def _single(options: argparse.Namespace) -> tuple[str, list[Drawing], str, str]:
-    """Return the page, a drawing of each marker, the neighbours file, and a hint."""
-    if len(options.size) > 1:
-        raise ValueError(f'size = {options.size}: several are for --panel')
-    (size,) = options.size
-    page = choose_page(options.page, options.dictionary, size)
-    drawings = [draw(options.dictionary, marker_id, size, page) for marker_id in options.id]
-    hint = '' if page == 'A4' else f'; A4 holds up to {largest_on_a4(options.dictionary)} m'
-    return page, drawings, snippet(options.dictionary, options.id, size), hint
-
-
-def _panel(options: argparse.Namespace) -> tuple[str, list[Drawing], str, str]:
-    """Return the same of a panel."""
-    panel = marker_panel.layout(options.dictionary, options.id, options.size)
-    page = marker_panel.choose_page(options.page, panel)
-    return page, [marker_panel.draw(panel, page)], marker_panel.snippet(panel), ''
-
-
-def snippet(dictionary: str, ids: Sequence[int], side_length: float) -> str:
-    """Return the neighbours file for these markers, each on a neighbour's tail."""
-    entries = [f"""\
-  - name: {'leader' if len(ids) == 1 else f'drone{marker_id}'}
-    marker_id: {marker_id}
-    side_length: {side_length:g}  # m; measure the print
-    position: [-0.20, 0.0, 0.0]  # m, the marker's centre on the body: forward, left, up
-    rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
-               for marker_id in ids]
-    return '\n'.join([f'dictionary: {dictionary}', 'neighbors:', *entries])
+    if len(set(ids)) < len(ids):
+        raise ValueError(f'id = {ids}: must name each marker once')
+    if options.panel and (len(ids) != len(sizes) or len(ids) < 2):
+        raise ValueError(f'size = {sizes}: a panel takes one for each of at least two ids, {ids}')
+    if not options.panel and len(sizes) > 1:
+        raise ValueError(f'size = {sizes}: several are for --panel')
+    prints = [layout(dictionary, ids, sizes)] if options.panel else [
+        layout(dictionary, [marker_id], sizes) for marker_id in ids]
+    page = choose_page(options.page, prints[0])
+    pages = [draw(each, page) for each in prints]
+    title_ids, title_sizes = (', '.join(f'{n:g}' for n in given) for given in (ids, sizes))
+    options.output.write_bytes(pdf(pages, f'{dictionary} {title_ids}, {title_sizes} m'))
+    hint = '' if options.panel or page == 'A4' else (
+        f'; A4 holds up to {largest_on_a4(dictionary)} m')
+    print(f'{options.output}: page {page}, {pages[0].width:g} x {pages[0].height:g} mm{hint}',
+          file=sys.stderr)
+    print(panel_entry(prints[0]) if options.panel else entry(dictionary, ids, sizes[0]))
+    return 0
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Leave the telling to main: one line, without the usage."""
+        """Raise the error: one line, without the usage."""
         raise ValueError(message)
 
 

@@ -34,7 +34,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.runs.progress import Progress
+from flock_desk.runs.console import guarded, Progress
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
@@ -204,12 +204,11 @@ class Recording:
         yield from odom
 
 
-def write(variant: Variant, seed: int, out: Path, jobs: int, show: TextIO) -> None:
+def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     """
     Write a bag, in place of an older one there, rendering in processes of its own.
 
     :param jobs: number of processes; they change nothing but the time it takes.
-    :param show: where progress is printed.
     :raises BagError: where something other than a bag is in the way, or cannot be written.
     """
     if out.exists() and not (out / 'metadata.yaml').is_file():
@@ -221,7 +220,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int, show: TextIO) -> No
         pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'),
                                    _start_worker, (variant, seed))
         try:
-            images = _counted(pool.map(_rendered, range(count)), count, out.name, show)
+            images = _counted(pool.map(_rendered, range(count)), count, out.name)
             with BagWriter(Path(scratch) / out.name) as bag:
                 for message in recording.messages(images):
                     bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
@@ -245,10 +244,9 @@ def _rendered(k: int) -> BagMessage:
     return _worker['recording'].image(k)
 
 
-def _counted(images: Iterable[BagMessage], count: int, name: str,
-             show: TextIO) -> Iterator[BagMessage]:
+def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
     """Yield the images, showing how many have been."""
-    progress = Progress(1, show)
+    progress = Progress(1)
     progress.start(f'{name}, {count} images')
     for done, image in enumerate(images, start=1):
         yield image
@@ -300,17 +298,13 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     if options.jobs < 1:
         parser.error(f'--jobs = {options.jobs}: must be at least 1')
-    names = list(VARIANTS) if 'all' in options.variant else options.variant
-    try:
-        for name in names:
+
+    def render() -> int:
+        for name in VARIANTS if 'all' in options.variant else options.variant:
             folder = options.out or repository / ('bags' if name == 'sample' else 'build/bags')
-            write(VARIANTS[name], options.seed, folder / name, options.jobs, sys.stderr)
-    except (BagError, OSError, ValueError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    return 0
+            write(VARIANTS[name], options.seed, folder / name, options.jobs)
+        return 0
+    return guarded(render)
 
 
 if __name__ == '__main__':

@@ -21,14 +21,12 @@ autopilot, which a ``mavlink_bridge`` on this machine talks to. It hovers, as th
 until ``planner/state`` says that it is engaged and it is in offboard mode; then the scenario
 begins, and the node ends with it.
 
-With ``vehicle:=external`` the follower is flown by an autopilot that runs elsewhere, a simulator
-most likely, and ``truth_connection`` tells where it is. The leader appears where the scenario has
-it as soon as ``mavlink_bridge/state`` is ACTIVE. The scenario ends early where that is ACTIVE no
-more; the node ends when, after the scenario, the vehicle is disarmed. With
-``leader_truth_connection`` the leader is another such vehicle, and is seen where it truly is.
-
-With ``leader_topic`` the leader is the vehicle of another simulator node, so followers fly in a
-column; the node ends with that one.
+With ``vehicle:=external`` the follower is flown by an external autopilot, usually a simulator, and
+``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
+``mavlink_bridge/state`` is ACTIVE. The scenario ends early where that is ACTIVE no more; the node
+ends when, after the scenario, the vehicle is disarmed. With ``leader_truth_connection`` the leader
+is another such vehicle, and is seen where it truly is. With ``leader_topic`` the leader is the
+vehicle of another simulator node, so followers fly in a column; the node ends with that one.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ from flock_desk.closed_loop.real_time_flight import (
 )
 from flock_desk.closed_loop.real_time_log import RealTimeLog
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.vehicles_elsewhere import VehiclesElsewhere
+from flock_desk.external.external_vehicles import ExternalVehicles
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
@@ -71,51 +69,51 @@ from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
 LATE = 0.5  # s behind the clock from which on /diagnostics complains
-#: A vehicle flown elsewhere is known up to this much later, ns.
+#: Poses of an external vehicle arrive up to this much later, ns.
 POSES_LATE_NS = 40_000_000
-#: Messages taken at each look: a vehicle elsewhere tells of itself as often as that is.
+#: Messages taken in each service period: the vehicle ahead sends at 50 Hz, too.
 MESSAGES = 3
 
 SPECS = [
     Spec('scenario', 'indoor',
-         'what is flown: the name of a file in config/scenarios, or the path of a .yaml file'),
+         'name of a file in config/scenarios, or the path of a .yaml file'),
     Spec('seed', 0, 'of everything that chance decides', SEEDS),
-    Spec('duration', 0.0, 'how long to fly; 0: as long as the scenario says', DURATIONS),
+    Spec('duration', 0.0, 'flight time; 0: that of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
     Spec('vehicle', 'embedded',
-         'who flies the follower: the embedded autopilot, or one elsewhere',
+         'autopilot of the follower: the embedded one, or an external one',
          ('embedded', 'external')),
     Spec('truth_connection', 'udpin:127.0.0.1:19410',
-         "where an external autopilot tells its vehicle's place, a link apart from the bridge's: "
+         "link on which an external autopilot reports its vehicle's place, not the bridge's: "
          "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the "
          "default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
     Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
     Spec('require_truth', False,
-         'refuse the estimate of an external autopilot that tells no ground truth: set it where '
-         'odom is forwarded to it'),
+         'refuse the estimate of an external autopilot that sends no ground truth: set it if odom '
+         'is forwarded to it'),
     Spec('leader_truth_connection', '',
-         'where the autopilot of a second vehicle tells its place, with vehicle = external: the '
-         "leader is seen there; none: the leader is the scenario's. PX4's second SIH: "
+         'link on which the autopilot of a second vehicle, the leader, reports its place, with '
+         "vehicle = external; none: the leader is the scenario's. PX4's second SIH: "
          "udpin:127.0.0.1:19411, ArduPilot's second SITL: tcp:127.0.0.1:5772"),
     Spec('leader_target_system', 2, 'MAVLink system id of that autopilot', IDS),
     Spec('leader_topic', '',
-         'where another simulator tells the true motion of its vehicle (nav_msgs/Odometry, its '
-         'truth/motion), with vehicle = embedded: the leader is seen there; none: the leader is '
-         "the scenario's"),
+         'topic on which another simulator publishes the true motion of its vehicle, the leader '
+         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded; none: the leader is the '
+         "scenario's"),
     Spec('leader_offset', [1.5, 0.0, 0.0],
-         'where the odom frame of that vehicle begins in ours',
+         'origin of the odom frame of that vehicle in the own one',
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
          'end with exit code 3 in flight if the machine is too busy for what its parent started'),
-    Spec('log', '', 'file for what really happened, .npz; none: no log'),
+    Spec('log', '', '.npz file for the true flight; none: no log'),
 ]
 
 
 class Simulator(FlockNode):
     """
-    Steps a flight as time goes by, and publishes what the sensors see.
+    Steps a flight in real time, and publishes the output of the sensors.
 
-    :raises ValueError: a bad parameter, a scenario that cannot be flown, or no vehicle elsewhere.
+    :raises ValueError: a bad parameter, a scenario that cannot be flown, or no external vehicle.
     :raises OSError: where the socket cannot be made.
     """
 
@@ -139,7 +137,7 @@ class Simulator(FlockNode):
         self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
                                          self.diagnostics.rate('image_raw'))
         self._vehicle: EmbeddedVehicle | ExternalVehicle
-        self._end: Endpoint | VehiclesElsewhere
+        self._end: Endpoint | ExternalVehicles
         leader: ExternalLeader | None = None
         if self._external is None:
             self.diagnostics.checks.append(self._lateness_problem)
@@ -151,7 +149,7 @@ class Simulator(FlockNode):
                                  self._vehicle.autopilot)
         else:
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
-            self.diagnostics.checks += [self._pose_problem, self._pace_problem]
+            self.diagnostics.checks.append(self._external_problem)
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
@@ -160,17 +158,17 @@ class Simulator(FlockNode):
         if self._values['leader_topic']:
             self._ahead = VehicleAhead(self, self._values['leader_topic'])
             leader = self._ahead.leader(self._epoch_ns, self._values['leader_offset'])
-        elsewhere = self._external is not None or leader is not None
+        external = self._external is not None or leader is not None
         self._flight = RealTimeFlight(
             scenario, seed, self._vehicle, camera,
-            LATEST_NS + POSES_LATE_NS if elsewhere else LATEST_NS, leader)
+            LATEST_NS + POSES_LATE_NS if external else LATEST_NS, leader)
         self._log = RealTimeLog(self._vehicle.log, self._epoch_ns, self._start)
         if self.context.ok():  # else interrupted meanwhile
             self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
                                    'mode and planner/engage')
 
-    def _links(self) -> VehiclesElsewhere | None:
-        """Return the links to vehicles flown elsewhere; None where none is."""
+    def _links(self) -> ExternalVehicles | None:
+        """Return the links to external vehicles; None if there is none."""
         leader = self._values['leader_truth_connection']
         topic = self._values['leader_topic']
         if self._values['vehicle'] == 'embedded':
@@ -180,19 +178,19 @@ class Simulator(FlockNode):
             return None
         if topic:
             raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
-                             "'embedded'; that of an external one is told by MAVLink")
-        return VehiclesElsewhere(
+                             "'embedded'; that of an external one comes by MAVLink")
+        return ExternalVehicles(
             ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
             ExternalAutopilot(leader, self._values['leader_target_system'],
                               'leader_truth_connection') if leader else None)
 
-    def _found(self, external: VehiclesElsewhere,
+    def _found(self, external: ExternalVehicles,
                altitude: float) -> tuple[ExternalVehicle, ExternalLeader | None]:
         """Wait for the vehicles; time zero is that of the follower's newest pose."""
         external.find(self._values['require_truth'], self.context.ok)
         self._start = external.start_ns * 1e-9
         for name, source in external.sources.items():
-            self.get_logger().info(f'the {name} is where {source} says')
+            self.get_logger().info(f'the place of the {name} comes from {source}')
         if external.follower.motion.estimated:
             self.get_logger().warning(
                 "no ground truth comes: images and odometry follow the autopilot's own estimate; "
@@ -222,7 +220,7 @@ class Simulator(FlockNode):
                     next_service = now + SERVICE_PERIOD
                     for _ in range(1 if self._ahead is None else MESSAGES):
                         executor.spin_once(timeout_sec=0.0)
-                    self._tell(now)
+                    self._show(now)
                     if self._delay is not None and self._flight.began_ns is not None:
                         self._delay.check(now)
                     if self._external is not None and (gone := self._external.gone(now)):
@@ -247,7 +245,7 @@ class Simulator(FlockNode):
         return 0
 
     def _finished(self) -> bool:
-        """Return whether the scenario is flown, and a vehicle flown elsewhere has landed."""
+        """Return whether the scenario is flown, and an external vehicle has landed."""
         if self._ahead is not None:
             left = self._ahead.left(self._epoch_ns + self._flight.time_ns)
             if left is not None and self._flight.began_ns is not None:
@@ -262,7 +260,7 @@ class Simulator(FlockNode):
         return self._start + (self._flight.time_ns + STEP_NS) * 1e-9
 
     def _wait(self, next_service: float) -> None:
-        """Take what comes from the autopilot until something is to be done."""
+        """Receive from the autopilot until the next step, image or service is due."""
         wake = min(self._end.wake(self._step_due()), next_service,
                    self._start + self._outputs.next_image)
         self._end.receive(wake - time.monotonic())
@@ -303,13 +301,10 @@ class Simulator(FlockNode):
                 not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
-    def _pose_problem(self, now: float) -> Problem | None:
+    def _external_problem(self, now: float) -> Problem | None:
         assert self._external is not None
-        stalled = self._external.stalled(now, self._flight.time_ns)
-        return (ERROR, stalled) if stalled else None
-
-    def _pace_problem(self, now: float) -> Problem | None:
-        assert self._external is not None
+        if stalled := self._external.stalled(now, self._flight.time_ns):
+            return ERROR, stalled
         slow = self._external.slow(now)
         return (WARN, slow) if slow else None
 
@@ -319,8 +314,8 @@ class Simulator(FlockNode):
             return None
         return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
 
-    def _tell(self, now: float) -> None:
-        """Keep the live line, and what /diagnostics shows, up to date."""
+    def _show(self, now: float) -> None:
+        """Update the live line and the values of /diagnostics."""
         flight = self._flight
         self.diagnostics.values.update({
             'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',

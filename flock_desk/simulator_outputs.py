@@ -58,7 +58,7 @@ class SimulatorOutputs:
             PointStamped, 'mavlink_bridge/armed_at', LATCHED)
         self._true_leader = node.create_publisher(Odometry, 'truth/neighbors', 10)
         self._motion = node.create_publisher(Odometry, 'truth/motion', 10)
-        self._motion_told = 0
+        self._motion_sent = 0
 
     def armed_below(self) -> None:
         """Tell that the vehicle was armed on the ground, at the height 0 of the odometry."""
@@ -68,9 +68,9 @@ class SimulatorOutputs:
 
     def motion(self, stamp_ns: int, true: Motion) -> None:
         """Publish the vehicle's true motion at 50 Hz, where another simulator wants it."""
-        if stamp_ns - self._motion_told >= MOTION_PERIOD_NS and (
+        if stamp_ns - self._motion_sent >= MOTION_PERIOD_NS and (
                 self._motion.get_subscription_count()):
-            self._motion_told = stamp_ns
+            self._motion_sent = stamp_ns
             self._motion.publish(_message(stamp_ns, BODY_FRAME, true))
 
     def odometry(self, stamp_ns: int, estimate: Motion) -> None:

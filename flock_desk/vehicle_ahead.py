@@ -24,7 +24,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 
 from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.external.told_motion import ExternalMotion, Motion
+from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_follower.geometry import normalize_quaternion
 from flock_follower.messages import from_odometry
 from flock_follower.nodes.support.runtime import FlockNode
@@ -33,14 +33,14 @@ SILENT_NS = 500_000_000
 
 
 class VehicleAhead:
-    """Hears on a topic where the vehicle truly is, see ``SimulatorOutputs.motion``."""
+    """Receives the true motion of the vehicle on a topic, see ``SimulatorOutputs.motion``."""
 
     def __init__(self, node: FlockNode, topic: str) -> None:
         self._motion = ExternalMotion()
         node.subscribe(Odometry, topic, self._take, QoSProfile(depth=10))
 
     def left(self, now_ns: int) -> int | None:
-        """Return when it was heard of last, ns, where it was and is no more; else None."""
+        """Return the time of its last motion, ns, if it is silent since then; else None."""
         newest = self._motion.newest
         return newest if newest is not None and now_ns - newest > SILENT_NS else None
 

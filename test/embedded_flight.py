@@ -27,6 +27,11 @@ PX4_MODES = {'POSCTL': (3, 0), 'AUTO.TAKEOFF': (4, 2), 'AUTO.LOITER': (4, 3), 'A
              'OFFBOARD': (6, 0)}
 ARDUCOPTER_MODES = {'STABILIZE': (0, 0), 'GUIDED': (4, 0), 'LOITER': (5, 0),
                     'LAND': (9, 0), 'BRAKE': (17, 0)}
+#: Parameters of flight by external vision, without GPS.
+BLIND = {
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
+    'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
+        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 
 
 def setpoint(east=0.0, north=0.0, up=0.0, *, mask=MASK_YAW, yaw=0.0, frame=1, position_up=0.0,
@@ -49,6 +54,15 @@ def odometry(position, velocity=(0.0, 0.0, 0.0), *, yaw=0.0, frame=mavlink.MAV_F
         round(time * 1e6), frame, child, y, x, -z,
         (math.cos(half), 0.0, 0.0, math.sin(half)), forward, -left, -up, 0.0, 0.0, 0.0,
         covariance, covariance, reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO, 100)
+
+
+def seen(flight, error=(0.0, 0.0, 0.0), yaw_error=0.0, **options):
+    """Return a function for ODOMETRY of the flight's truth, and an error."""
+    def message():
+        velocity = flight.vehicle.rotation.T @ flight.vehicle.velocity
+        return odometry(flight.vehicle.position + error, velocity,
+                        yaw=flight.vehicle.yaw + yaw_error, **options)
+    return message
 
 
 class SteppedAutopilot:

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Images of a simulated flight: surfaces, rays through the lens, exposure and noise."""
+"""Images of a simulated flight: the leader, the lens, surroundings, exposure and noise."""

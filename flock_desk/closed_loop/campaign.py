@@ -18,16 +18,16 @@ Flights in lock step: leader, air, vehicle and sensors around the real followers
 No clock, no rendering, no messages: what is flown is ``follower.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
 STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
-whose noise has the covariance they are told; a marker is seen where it is in the field of view and
-not too oblique, with nobody in between.
+whose noise has the covariance given with them; a marker is seen if it is in the field of view and
+not too oblique, with no vehicle in between.
 
 ============  ========  =======================================================
 what          rate, Hz  remark
 ============  ========  =======================================================
 vehicle, air  120       first the vehicle moves, then everything looks
-odometry      60        arrives ``latency`` later; words arrive, too
+odometry      60        arrives ``latency`` later; messages arrive, too
 images        30        estimates arrive ``latency`` later
-planner       10        engaged at ENGAGED, where no operation says otherwise
+planner       10        engaged at ENGAGED, unless an operation does it
 control       20        the vehicle obeys ``delay`` later, with its lags
 ============  ========  =======================================================
 """
@@ -41,7 +41,7 @@ import math
 from flock_desk.closed_loop.flights_log import Flights, FlightsLog
 from flock_desk.closed_loop.simulated_follower import SimulatedFollower
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
@@ -62,7 +62,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.
     :param progress: called with the share that is done, now and then.
-    :param cpu_time: a clock of CPU time, s, for what is told of that; nothing else depends on it.
+    :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     """
     world = World(scenario, runs, noise or _noise(scenario))
     followers = _followers(scenario, runs, guard, world, cpu_time)
@@ -78,14 +78,14 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
-            for row, word in radio.arrived(now):
-                followers[row].hear(now, word)
+            for row, message in radio.arrived(now):
+                followers[row].receive(now, message)
         if k % PLANNER_STEPS == 0:
             for row, (follower, (looked, seen)) in enumerate(zip(
                     followers, world.lookout.arrived(now))):
                 follower.plan(now, looked, seen)
-                radio.send(now, row, follower.spoken)
-                follower.spoken = []
+                radio.send(now, row, follower.outbox)
+                follower.outbox = []
             if now >= ENGAGED - 1e-9:
                 log.tick(now, followers)
             if progress is not None and k % (20 * PLANNER_STEPS) == 0:
@@ -114,7 +114,7 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
     """Return the follower of every row."""
     flock = scenario.company
     aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
-    # What the planner keeps in view is ahead; who looks to all sides need not care.
+    # The planner keeps neighbours in the view ahead, unless cameras look to all sides.
     ahead = 'front' in flock.cameras and not flock.all_round
     view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []

@@ -227,7 +227,7 @@ def _strayed(positions: Array, flights: Flights) -> Any:
     """Return which followers (m,) nobody leads to from the leader; positions (m + 1, 3), m."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
-    near &= np.append(True, _kept(flights))  # who fails leads nobody
+    near &= np.append(True, _kept(flights))  # a failed follower leads no other
     reached = np.arange(len(positions)) == 0
     for _ in positions:
         reached = reached | near[:, reached].any(axis=1)

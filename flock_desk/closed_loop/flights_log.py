@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-What simulated flights did, from engaging on: every planner tick, and the extremes between ticks.
+Records simulated flights from engaging on: every planner tick, and the extremes between ticks.
 
-Every follower is a row, see ``world``. What a lone one follows is the leader. In a flock it is
-whom its planner says: its edges; as long as that has said none, whom it begins behind.
+Every follower is a row, see ``world``. A lone one follows the leader. In a flock each follows the
+edges of its planner; before the first of them, the vehicle that it begins behind.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import numpy as np
 
 from flock_desk.closed_loop.simulated_follower import SimulatedFollower
 from flock_desk.closed_loop.world import World
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import places
-from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
 from flock_follower.planner.modes import State
@@ -42,7 +42,7 @@ STATES = tuple(State)
 @dataclass(frozen=True)
 class Flights:
     """
-    What n rows of a scenario did, from engaging on, every planner tick (k of them).
+    The motion of n rows of a scenario, from engaging on, at every planner tick (k of them).
 
     Everything is true, not estimated; vectors are ENU. A row is a follower: see ``world``.
     """
@@ -51,7 +51,7 @@ class Flights:
     times: Array
     """(k,), s."""
     leader: Array
-    """(n, k, 3), of whom each follows, the nearest of them, m."""
+    """(n, k, 3), the nearest vehicle that each follows, m."""
     follower: Array
     """(n, k, 3), m."""
     leader_velocity: Array
@@ -59,11 +59,11 @@ class Flights:
     velocity: Array
     """(n, k, 3), m/s."""
     nearest: Array
-    """(n, k), least distance to anyone up to the next tick, m."""
+    """(n, k), least distance to any vehicle up to the next tick, m."""
     farthest: Array
-    """(n, k), greatest distance to any whom it follows up to the next tick, m."""
+    """(n, k), greatest distance to a vehicle that it follows, up to the next tick, m."""
     outside: Array
-    """(n, k), time out of the band up to the next tick, mean over whom it follows, s."""
+    """(n, k), time out of the band up to the next tick, mean over those that it follows, s."""
     command: Array
     """(n, k, 3), commanded acceleration, m/s^2; NaN where there was none."""
     state: Any
@@ -71,13 +71,13 @@ class Flights:
     guarded: Any
     """(n, k), whether the guard altered the command."""
     seen: Any
-    """(n, k), whether an image since the last tick showed any whom it follows."""
+    """(n, k), whether an image since the last tick showed one that it follows."""
     in_sight: Any
-    """(n, k), whether the newest image would, were nobody blinded."""
+    """(n, k), the same of the newest image, outages and missed detections left out."""
     obeying: Any
     """(n, k), whether the vehicle flies setpoints."""
     unasked: Array
-    """(n, k), setpoints that have left without anybody having called offboard."""
+    """(n, k), setpoints sent without an offboard call."""
     shown: Any = None
     """(n, k), how many of the others images since the last tick showed."""
     edges: Any = None
@@ -114,12 +114,12 @@ class FlightsLog:
         self._farthest = np.maximum(self._farthest, farthest)
         out = edges & ((distance ** 2 <= band.d0) | (distance ** 2 >= band.d1))
         many = edges.sum(axis=1)
-        # Who has nobody left to follow is out of the band.
+        # A follower without a vehicle to follow is out of the band.
         share = np.where(many > 0, out.sum(axis=1) / np.maximum(many, 1), 1.0)
         self._outside = self._outside + STEP * share
 
     def _along(self, distance: Array) -> tuple[Array, Any]:
-        """Return the greatest distance (n,), and the edges (n, m), to those who are there."""
+        """Return the greatest distance (n,), and the edges (n, m), to those present."""
         edges = self._edges & np.isfinite(distance)
         return np.where(edges, distance, 0.0).max(axis=1), edges
 

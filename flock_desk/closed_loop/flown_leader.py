@@ -13,10 +13,9 @@
 # limitations under the License.
 
 """
-The leader of a real-time flight: on the scenario's course, or flown by an autopilot elsewhere.
+The leader of a real-time flight: on the scenario's course, or flown by an external autopilot.
 
-A flight asks where it is at times that are integer nanoseconds since the flight's start, and s of
-the scenario, see ``scenario_run``.
+Times are integer nanoseconds since the flight's start, and s of the scenario (``scenario_run``).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from flock_desk.closed_loop.scenario_run import ScenarioRun
-from flock_desk.external.told_motion import ExternalMotion, LONGEST_GAP
+from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP
 from flock_desk.sensors.vio import Odometry
 from flock_follower.geometry import (
     Array,
@@ -38,10 +37,10 @@ from flock_follower.geometry import (
 
 class ScenarioLeader:
     """
-    A leader that flies as the scenario says; its pose and motion are None until there is one.
+    A leader on the scenario's course; pose and motion are None before it appears.
 
-    :param in_place: whether the follower starts where the scenario has it; else the scenario is
-        moved to its place, height and heading as soon as it is in offboard mode.
+    :param in_place: whether the follower starts at the scenario's place; else the scenario is
+        moved to its place, height and heading once it is in offboard mode.
     """
 
     def __init__(self, scenario: ScenarioRun, in_place: bool) -> None:
@@ -81,7 +80,7 @@ class ScenarioLeader:
 
 class ExternalLeader:
     """
-    A leader that an autopilot elsewhere flies: it is where that says.
+    A leader that an external autopilot flies and reports.
 
     :param motion: with the same ``origin`` as the follower's.
     :param start_ns: time zero of the flight on the clock of ``motion``.
@@ -92,16 +91,16 @@ class ExternalLeader:
         self._motion, self._start_ns, self._origin = motion, start_ns, origin
 
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Do nothing: whoever flies it does."""
+        """Do nothing: it flies by itself."""
 
     def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return the pose that was told; of a moment that is to come yet, the newest one."""
+        """Return the reported pose; of a future moment, the newest one."""
         leader = self.motion(time_ns, time)
         return None if leader is None else Transform(
             quaternion_to_matrix(leader.quaternion), leader.position)
 
     def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the motion that was told, likewise; None once its poses stall."""
+        """Return the reported motion, likewise; None once its poses stall."""
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > LONGEST_GAP:
             return None
@@ -111,7 +110,7 @@ class ExternalLeader:
                         leader.angular)
 
     def knows(self, time_ns: int) -> bool:
-        """Return whether poses were told shortly before and after."""
+        """Return whether poses were reported shortly before and after."""
         return self._motion.knows(self._start_ns + time_ns)
 
 

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-The vehicle of a real-time flight: flown by the embedded autopilot, or by one that runs elsewhere.
+The vehicle of a real-time flight: flown by the embedded autopilot, or by an external one.
 
-A flight asks for its motion at every step; times are integer nanoseconds since the flight's start.
+Times are integer nanoseconds since the flight's start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from flock_desk.external.told_motion import ExternalMotion
+from flock_desk.external.external_motion import ExternalMotion
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.flight_log import FlightLog
@@ -98,19 +98,19 @@ class EmbeddedVehicle(_Flown):
 
 class ExternalVehicle(_Flown):
     """
-    The vehicle of an autopilot elsewhere, in the ENU frame of that.
+    The vehicle of an external autopilot, in the ENU frame of that.
 
     :param start_ns: time zero of the flight on the clock of ``motion``.
-    :param height: m, of the place where it was first heard of above the ground.
+    :param height: m above the ground, of its first reported place.
     """
 
     in_place = False
 
     def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
         self.offboard = False
-        """Whether it obeys the bridge's setpoints, as the bridge says; its owner sets it."""
+        """Whether it obeys the bridge's setpoints, by the bridge's state; its owner sets it."""
         self.armed, self.mode = False, ''
-        """Likewise, as HEARTBEAT says; for the log."""
+        """Likewise, by its HEARTBEAT; for the log."""
         self.log = FlightLog()
         self._motion, self._start_ns = motion, start_ns
         self.origin = np.array([0.0, 0.0, height])
@@ -118,22 +118,22 @@ class ExternalVehicle(_Flown):
         self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
-        """Return the motion that was told, interpolated."""
+        """Return the reported motion, interpolated."""
         motion = self._motion.at(self._start_ns + time_ns)
         position = self.origin + motion.position
         self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
                        np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
                        self.mode)
-        # Not the rates told: poses count as of when they came, unevenly, and the camera sees that.
+        # Not the reported rates: poses arrive unevenly, and the camera sees that.
         return self._moved(time_ns, position, motion.velocity,
                            quaternion_to_matrix(motion.quaternion))
 
     def knows(self, time_ns: int) -> bool:
-        """Return whether poses were told shortly before and after a time of the last 0.3 s."""
+        """Return whether poses were reported shortly before and after a time of the last 0.3 s."""
         return self._motion.knows(self._start_ns + time_ns)
 
     def blow(self, wind: Array) -> None:
-        """Do nothing: the wind is that of whoever simulates the vehicle."""
+        """Do nothing: the external simulator has its own wind."""
 
 
 FlownVehicle = EmbeddedVehicle | ExternalVehicle

@@ -26,10 +26,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import Flock, LEADER
-from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.sensing import (
     facing,
     hidden,
@@ -53,7 +53,7 @@ from flock_follower.perception.range_tracking import PlacedRange, RangeSeries, R
 
 IMAGE_STEPS = 4
 BODY = 0.25  # m: radius of a vehicle that stands in the way of a view
-YAW_NOISE = 0.02  # rad: of the yaw that an image tells of a vehicle
+YAW_NOISE = 0.02  # rad: of a vehicle's yaw measured in an image
 ASKEW = 0.02  # rad: by which its markers hang
 _USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
 _CENTRE = np.zeros(3)
@@ -74,7 +74,7 @@ class Scene(NamedTuple):
 
 
 def others(flock: Flock) -> Any:
-    """Return whom each follower has around it: numbers of vehicles (m, m), 0 is the leader."""
+    """Return the vehicles around each follower, by number (m, m); 0 is the leader."""
     m = flock.followers
     return np.array([[v for v in range(m + 1) if v != f] for f in range(1, m + 1)])
 
@@ -126,14 +126,14 @@ class Lookout:
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
         """Which of the others an image has shown since this was last set to False."""
         self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
-        """Which of them the newest image would show, were nobody blinded."""
+        """Those in the newest image, outages and missed detections left out."""
 
     def look(self, k: int, scene: Scene, vio: Vio, travel: Array, placed: float,
              lost: bool) -> None:
         """
         Take the images of step k.
 
-        :param travel: integral of what ``vio`` says of the velocity (rows, 3), m.
+        :param travel: integral of the velocity of ``vio`` (rows, 3), m.
         :param placed: when there is odometry of the images, or newer, s.
         :param lost: whether odometry is lost, so that nothing can be placed in its frame.
         """
@@ -247,16 +247,16 @@ class Lookout:
 
     def arrived(self, now: float) -> list[tuple[list[float], list[Sighted]]]:
         """
-        Return what has come to the planner of each row since the last call.
+        Return the arrivals at the planner of each row since the last call.
 
-        That is the stamps of the images processed, s, and the newest estimate of each vehicle.
+        These are the stamps of the images processed, s, and the newest estimate of each vehicle.
         """
         return [(_due(images, now), [*{each.name: each for each in _due(coming, now)}.values()])
                 for images, coming in zip(self._images, self._coming)]
 
 
 class Sighted(NamedTuple):
-    """What perception says of one vehicle, in ENU, with the drift of one's own odometry."""
+    """The estimate of one vehicle, in ENU, with the drift of the own odometry."""
 
     name: str
     stamp: float
@@ -266,7 +266,7 @@ class Sighted(NamedTuple):
     velocity: Array
     """(3,), m/s."""
     yaw: float | None
-    """rad; None where it is not known."""
+    """rad; None if it is not known."""
     position_covariance: Array
     """(3, 3), m^2."""
     velocity_covariance: Array
@@ -289,9 +289,9 @@ def _due(coming: _Coming[T], now: float) -> list[T]:
 
 def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any]:
     """
-    Return what chance decides about the c images of one row.
+    Return the random draws of the c images of one row.
 
-    That is the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of the
+    These are the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of the
     others is found if it is in sight (c, m).
     """
     sensing, rng = scenario.sensing, scenario.random(run, 'images', number)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What people do around one simulated follower, and an autopilot of few modes that obeys them.
+Operator and pilot of one simulated follower, and an autopilot of few modes that obeys them.
 
 The operator arms, takes off, calls offboard and engage; the pilot takes over and gives back by
 the mode switch; the bridge may die and start again. The autopilot flies take-off, hold and the
@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 
 from flock_desk.closed_loop.world import GATE_STEPS
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario
 from flock_follower.follower import Follower
 from flock_follower.geometry import Array
@@ -55,7 +55,7 @@ class OperatedVehicle:
     One run's operator, pilot and autopilot.
 
     :param autopilot: a key of ``dialects.DIALECTS``.
-    :param follower: whom to hand HEARTBEATs and requests.
+    :param follower: receives HEARTBEATs and requests.
     :param new_control: makes what a bridge that starts has.
     :param start: where the vehicle begins (3,), m.
     """
@@ -80,7 +80,7 @@ class OperatedVehicle:
         self._setpoint: Setpoint | None = None
         self._setpoint_time = -math.inf
         self.asked = False
-        """Whether offboard was called, by what was done here and told to the bridge."""
+        """Whether offboard was called, by the operations and HEARTBEATs so far."""
         self.unasked = 0
         """How many setpoints left while it was not."""
         self.obeying_since: float | None = None
@@ -123,7 +123,7 @@ class OperatedVehicle:
             case 'offboard':
                 self.asked = True
                 follower.permit(time, OffboardRequested(now - 1e-3))
-                # The bridge has to stream first, and to hear that the mode is there.
+                # The bridge has to stream first, and to receive the mode by HEARTBEAT.
                 self._mode_asked = now + self._dialect.stream_before_offboard
             case 'engage':
                 follower.engage(time, True)

@@ -15,8 +15,8 @@
 """
 A flight of two vehicles as it goes on: the leader before, the follower as it is commanded.
 
-Whoever runs it has the vehicles flown, and takes what the sensors give: odometry after
-every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
+Its owner steps the vehicles and takes the output of the sensors: odometry after every step, an
+image when one is due. Times are integer nanoseconds since the start; no clock is
 read here.
 """
 
@@ -37,7 +37,7 @@ from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
 from flock_desk.closed_loop.flown_vehicle import FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.geometry import (
@@ -61,7 +61,7 @@ class RenderedImage(NamedTuple):
 
     stamp_ns: int
     due_ns: int
-    """When whoever waits for it gets it."""
+    """When it is delivered."""
     time: float
     """Of the scenario at the stamp, s; negative before it begins."""
     pixels: NDArray[np.uint8]
@@ -77,7 +77,7 @@ class RealTimeFlight:
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
     :param latest_ns: an image that is due for longer than this is left out.
-    :param leader: who flies before the follower; None: the scenario's own leader.
+    :param leader: None: the scenario's own leader.
     """
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,

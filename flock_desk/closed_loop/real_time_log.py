@@ -58,33 +58,31 @@ class RealTimeLog:
 
     def __init__(self, autopilot: FlightLog, epoch_ns: int, start: float) -> None:
         self._autopilot, self._epoch_ns, self._start = autopilot, epoch_ns, start
-        self._odometry: list[tuple[Any, ...]] = []
-        self._images: list[tuple[Any, ...]] = []
-        self._states: list[tuple[float, str]] = []
-        self._distances: list[tuple[float, float]] = []
-        self._pictures: list[tuple[int, Any]] = []
+        self._rows: dict[tuple[str, ...], list[tuple[Any, ...]]] = {
+            columns: [] for columns in (_ODOM, _IMAGE, _STATE, _DISTANCE, _PICTURE)}
+        self._next_picture = -math.inf
 
     def odometry(self, stamp_ns: int, state: Odometry) -> None:
         """Record odometry that was sent."""
-        self._odometry.append((stamp_ns, *_moving(state)))
+        self._rows[_ODOM].append((stamp_ns, *_moving(state)))
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Record what was true at an image, from when there is a leader on."""
         if frame.leader is None:
             return
-        self._images.append((stamp_ns, *_moving(frame.follower), *_moving(frame.leader),
-                             frame.usable))
-        kept = self._pictures[-1][0] if self._pictures else -math.inf
-        if frame.time >= 0.0 and stamp_ns - kept >= PICTURE_PERIOD * 1e9:
-            self._pictures.append((stamp_ns, frame.pixels))
+        self._rows[_IMAGE].append((
+            stamp_ns, *_moving(frame.follower), *_moving(frame.leader), frame.usable))
+        if frame.time >= 0.0 and stamp_ns >= self._next_picture:
+            self._next_picture = stamp_ns + PICTURE_PERIOD * 1e9
+            self._rows[_PICTURE].append((stamp_ns, frame.pixels))
 
     def distance(self, now: float, distance: float) -> None:
         """Record how far the vehicles are apart."""
-        self._distances.append((now, distance))
+        self._rows[_DISTANCE].append((now, distance))
 
     def planner(self, now: float, state: str) -> None:
         """Record a state of the planner."""
-        self._states.append((now, state))
+        self._rows[_STATE].append((now, state))
 
     def save(self, path: str, flight: RealTimeFlight, duration: float,
              sources: Mapping[str, str], clock: Sequence[tuple[float, float]] = (),
@@ -99,9 +97,7 @@ class RealTimeLog:
         :raises OSError: naming the file, where it cannot be written.
         """
         columns = self._autopilot.arrays()
-        for names, rows in ((_ODOM, self._odometry), (_IMAGE, self._images),
-                            (_STATE, self._states), (_DISTANCE, self._distances),
-                            (_PICTURE, self._pictures)):
+        for names, rows in self._rows.items():
             for i, name in enumerate(names):
                 columns[name] = np.array([row[i] for row in rows])
         began = np.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9

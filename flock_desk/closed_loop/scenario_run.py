@@ -21,9 +21,8 @@ import math
 import numpy as np
 
 from flock_desk.camera.renderer import Light
-from flock_desk.scenarios.leader import course, STEP, turn_rate
+from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.vehicle import attitude, GRAVITY
 from flock_follower.geometry import (

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One simulated follower: the real ``follower.Follower``, who operates it, and its odom frame.
+One simulated follower: the real ``follower.Follower``, its operator, and its odom frame.
 
 A lone follower's odom frame is the world's. In a flock each has one of its own, which begins
 where it stands and along where it faces, as visual-inertial odometry does.
@@ -29,7 +29,7 @@ import numpy as np
 from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
 from flock_desk.closed_loop.operations import OperatedVehicle
 from flock_desk.closed_loop.world import GATE_STEPS
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.follower import ControlCycle, Follower, Listener, Tick
@@ -64,7 +64,7 @@ _ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is kn
 
 class SimulatedFollower(Listener):
     """
-    One row's follower, and who operates it; listens to what the follower does.
+    The follower of one row and its operator; receives the follower's events.
 
     :param frame: name of the odom frame; :param T_odom_world: its place in the world.
     :param start: where its vehicle begins (3,), m.
@@ -98,8 +98,8 @@ class SimulatedFollower(Listener):
         self.cpu = 0.0
         """CPU time of the last tick, s."""
         self.failed = False
-        self.spoken: list[OdometryState] = []
-        """What it has told the others since somebody took it from here."""
+        self.outbox: list[OdometryState] = []
+        """Messages to the others; the owner empties it."""
         self._errors, self._alone = scenario.odometry, scenario.flock is None
         self._frame, self._T_odom_world = frame, T_odom_world
         self._turn = yaw_from_quaternion(T_odom_world.quaternion)
@@ -117,10 +117,10 @@ class SimulatedFollower(Listener):
             quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity, _ZERO,
             pose, twist, _LEVEL))
 
-    def hear(self, now: float, word: OdometryState) -> None:
-        """Take what another follower tells."""
+    def receive(self, now: float, message: OdometryState) -> None:
+        """Take a message of another follower."""
         if not self.failed:
-            self.follower.word(to_nanoseconds(now), word)
+            self.follower.word(to_nanoseconds(now), message)
 
     def plan(self, now: float, looked: list[float], seen: list[Sighted]) -> None:
         """Tick with what has arrived: stamps of images, s, and estimates."""
@@ -165,7 +165,7 @@ class SimulatedFollower(Listener):
 
     def words(self, time: int, words: list[OdometryState]) -> None:
         if not self.failed:
-            self.spoken += words
+            self.outbox += words
 
     def tick(self, tick: Tick) -> None:
         if not self.failed:
@@ -179,7 +179,7 @@ class SimulatedFollower(Listener):
 
 
 def _params(scenario: Scenario, guard: bool, name: str) -> PlannerParams:
-    """Return what the planner of a vehicle of a name is told."""
+    """Return the planner's parameters of a vehicle."""
     params = scenario.flight.planner(guard)
     return params if scenario.flock is None else replace(params, vehicles={
         other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)

@@ -15,7 +15,7 @@
 """
 The world around the followers of a scenario: leader, air, vehicles and sensors, stepped by STEP.
 
-Nothing here plans or reads a clock; whoever steps it hands in what the vehicles shall fly. Every
+Nothing here plans or reads a clock; the caller passes in the setpoints. Every
 follower is a row: those of the first run by their numbers, then those of the second, and so on.
 """
 
@@ -34,10 +34,9 @@ from flock_desk.closed_loop.lookout import (
     others,
     Scene,
 )
+from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.flock import facing_ahead, places
-from flock_desk.scenarios.leader import course, STEP, turn_rate
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
 from flock_desk.vehicles.equipment import Barometer
@@ -73,7 +72,7 @@ class World:
             scenario.random(run, 'wind')) for run in runs], axis=1), m, axis=1)
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self.others = others(self._flock)
-        """Whom each follower has around it (m, m): numbers of vehicles, 0 is the leader."""
+        """The vehicles around each follower, by number (m, m); 0 is the leader."""
         self.starts = self._starts()
         """Where each begins (rows, 3), m ..."""
         self.yaws = np.zeros(n) if scenario.flock is None else np.tile(
@@ -135,7 +134,7 @@ class World:
 
     @property
     def distances(self) -> Array:
-        """Return the true distances (rows, m) to the others, m; infinite to who is gone."""
+        """Return the true distances (rows, m) to the others, m; infinite if one is gone."""
         positions, m = self.positions, len(self.others)
         offsets = positions[:, self.others] - positions[:, 1:, None]
         there = self.present
@@ -231,11 +230,6 @@ class World:
         To be called once in every control cycle: each call is a new sample of the noise.
         """
         return self._barometer.heights(self.vehicle.position[:, 2], now)
-
-    @property
-    def on_ground(self) -> Any:
-        """Return which vehicles stand on the ground (rows,)."""
-        return self.vehicle.landed
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The link on which an autopilot that runs elsewhere tells where its vehicle is.
+The link on which an external autopilot reports the place of its vehicle.
 
-A thread of its own listens, since messages of ground truth carry no time: they count as of when
-they came. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+A thread of its own receives, since messages of ground truth carry no time: they count as of their
+arrival. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
 nothing else.
 """
 
@@ -32,7 +32,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.external.told_motion import (
+from flock_desk.external.external_motion import (
     ATTITUDE,
     CLOCK,
     ESTIMATE,
@@ -46,12 +46,12 @@ from flock_follower.mavlink.transport import open_transport
 POSE_RATE: Final[float] = 50.0
 """Hz, asked for."""
 SLOW_RATE: Final[float] = 2.0
-"""Hz, of what changes seldom."""
+"""Hz, of slow values."""
 LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
 """s between looks whether it comes at half the rate at least; else it is asked for again."""
 TRUTH_TIMEOUT: Final[float] = 6.0
-"""s of an autopilot that is heard, until its estimate has to do."""
+"""s of received messages without a truth, after which the estimate is used."""
 _IDS: Final[dict[str, int]] = {
     SIM_STATE: mavlink.MAVLINK_MSG_ID_SIM_STATE,
     HIL_STATE: mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
@@ -60,7 +60,7 @@ _IDS: Final[dict[str, int]] = {
     CLOCK: mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
     LANDED: mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
 }
-# Its own words for the truth; an autopilot may complain of messages that it does not know.
+# The truth of each; an autopilot may complain of messages that it does not know.
 _TRUTH_OF: Final[dict[str, str]] = {'px4': HIL_STATE, 'ardupilot': SIM_STATE}
 _COMPONENT: Final[int] = mavlink.MAV_COMP_ID_USER1
 
@@ -84,7 +84,7 @@ class ExternalAutopilot:
         self._stopping = False
         self._counts: Counter[str] = Counter()
         self._next_question = 0.0
-        self._first_heard = 0.0
+        self._first_received = 0.0
         self._thread = threading.Thread(target=self._listen, name='truth', daemon=True)
         self._thread.start()
 
@@ -126,7 +126,7 @@ class ExternalAutopilot:
 
     @property
     def armed(self) -> bool:
-        """Return whether its last HEARTBEAT says that it is armed."""
+        """Return whether it is armed, by its last HEARTBEAT."""
         status = self._link.telemetry.status
         return status is not None and status.armed
 
@@ -137,13 +137,13 @@ class ExternalAutopilot:
 
     @property
     def mode(self) -> str:
-        """Return its mode as its last HEARTBEAT says, '' before any."""
+        """Return the mode of its last HEARTBEAT, '' before any."""
         status = self._link.telemetry.status
         return '' if status is None else status.mode
 
     def _truth_is_late(self, now: float) -> bool:
-        """Return whether the autopilot has been heard for long without telling any truth."""
-        return bool(self._first_heard and now - self._first_heard > TRUTH_TIMEOUT
+        """Return whether messages have come for long without any truth."""
+        return bool(self._first_received and now - self._first_received > TRUTH_TIMEOUT
                     and not self.motion.source)
 
     def silence(self) -> str:
@@ -180,13 +180,13 @@ class ExternalAutopilot:
                 self._counts[message.get_type()] += 1
                 self._arrived.append((message, now_ns))
             if messages:
-                self._first_heard = self._first_heard or now
+                self._first_received = self._first_received or now
                 self._news.set()
             if now >= self._next_question:
                 self._ask(now)
 
     def _ask(self, now: float) -> None:
-        """Ask for what does not come, or comes at less than half the rate."""
+        """Request messages that come at less than half their rate."""
         dialect = self._link.telemetry.dialect
         if dialect is None:
             return

@@ -12,4 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Flocks of point agents under the law and its predecessors: the simulations of the paper."""
+"""
+Flocks of point agents under the law and its predecessors: the simulations of the paper.
+
+They need scipy, which is imported in the functions that use it: a command without it ends with one
+line.
+"""

@@ -24,7 +24,7 @@ Flocks of point agents under the law or its predecessors: one function from star
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import cast, get_args, Literal
@@ -33,11 +33,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_desk.flocks import graph as flock_graph
-from flock_desk.flocks import integrators, neighbor_search, vicsek
-from flock_desk.flocks.all_pairs import accelerations, Method
+from flock_desk.flocks import integrators
 from flock_desk.flocks.flock_metrics import Metrics, metrics
 from flock_desk.flocks.graph import Coupling, Graph
 from flock_desk.flocks.integrators import State
+from flock_desk.flocks.models import accelerations, Method, velocities_after
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -57,7 +57,7 @@ _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper 
 @dataclass(frozen=True)
 class Leader:
     """
-    A prescribed acceleration of agent 0, who then heeds nobody.
+    A prescribed acceleration of agent 0, which then reacts to no other.
 
     ``acceleration`` gives (n,), m/s^2, at a time in s; ``breaks`` are the times of its jumps.
     """
@@ -101,7 +101,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param duration: s to simulate.
     :param model: 'flocking', 'cucker_dong', 'cucker_smale'; 'vicsek', each at its own speed, or
         'vicsek_mean_velocity', both in steps of dt.
-    :param neighbors: with whom an agent flocks: 'all' as in the paper; 'graph', the neighbour
+    :param neighbors: the neighbours of an agent: 'all' as in the paper; 'graph', the neighbour
         graph of :mod:`flock_desk.flocks.graph`; 'nearest', the seven nearest. The
         latter two are for model 'flocking'.
     :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.
@@ -110,7 +110,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param sample_period: s between the times returned; for Vicsek's, rounded to whole steps.
     :param dt: s, 0.01 by default, 0.1 for Vicsek's.
     :param radius: how far an agent sees in Vicsek's model, m.
-    :param method: how the sum over all pairs is computed, see :mod:`.all_pairs`.
+    :param method: how the sum over all pairs is computed, see :mod:`.models`.
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
@@ -144,10 +144,8 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
                         acceptable=flock.step_is_small if flock.graph is not None else None)
     states = flock.looking_around(solve, (x, v), time) if flock.graph else solve((x, v), time)
     run = _collected(time, states, params, model, progress)
-    if flock.graph is None:
-        return run
-    return Simulation(run.time, run.positions, run.velocities, params, model, flock.graph,
-                      np.array(flock.joined))
+    return run if flock.graph is None else replace(
+        run, graph=flock.graph, joined=np.array(flock.joined))
 
 
 class _Flock:
@@ -173,7 +171,7 @@ class _Flock:
                                              self.near(x))
         if self.neighbors == 'nearest':
             return flock_graph.nearest_accelerations(
-                x, v, self.params, neighbor_search.nearest(x, NEAREST), self.coupling)
+                x, v, self.params, flock_graph.nearest(x, NEAREST), self.coupling)
         return accelerations(x, v, self.params, cast(flocking.Model, self.model), self.method)
 
     def step_is_small(self, before: Array, after: Array) -> bool:
@@ -185,7 +183,7 @@ class _Flock:
         """Return the pairs with r^2 < d1, or all where they are few; asked for twice a step."""
         if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
             self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else neighbor_search.pairs_within(x, np.sqrt(self.params.d1)))
+                          else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))
         return self._near[1]
 
     def looking_around(self, solve: Callable[[State, Array], Iterator[State]], start: State,
@@ -219,7 +217,7 @@ def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: flo
     """Yield the states after every so many steps of dt."""
     yield x, v
     for n in range(samples * every):
-        after = vicsek.velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
+        after = velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
         if leader is not None:
             after[0] = v[0] + dt * np.asarray(leader.acceleration(n * dt))
         x, v = x + dt * v, after  # in this order: the velocity of now takes one to the next place
@@ -272,7 +270,7 @@ def _check_band(x: Array, params: FlockingParams, model: Model, flock: _Flock) -
     """Raise ValueError where the law has no value, or cannot hold what it promises."""
     if model == 'cucker_smale' or len(x) < 2:
         return
-    close = neighbor_search.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
+    close = flock_graph.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
     if len(close):
         i, j = close[0]
         raise ValueError(

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import pdist
 
 from flock_desk.flocks.graph import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
@@ -115,6 +114,7 @@ def metrics(time: Array, positions: Array, velocities: Array, params: FlockingPa
 
 def _distances(positions: Array) -> tuple[Array, Array, Array]:
     """Return the least and greatest r^2 and the mean distance (m,)."""
+    from scipy.spatial.distance import pdist
     figures = []
     for x in positions:
         r2 = pdist(x, 'sqeuclidean')

@@ -38,10 +38,7 @@ from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from flock_desk.flocks.neighbor_search import pairs_within
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
     alignment,
@@ -61,7 +58,7 @@ _ROWS = 2048  # agents at a time, so that their arrays stay in cache
 
 @dataclass(frozen=True)
 class Graph:
-    """Who flocks with whom: ``count`` agents and the edges (m, 2) between them, i < j."""
+    """``count`` agents and the edges (m, 2) between them, i < j."""
 
     count: int
     edges: Pairs
@@ -78,6 +75,8 @@ class Graph:
     @cached_property
     def connected(self) -> bool:
         """Whether a path of edges leads from every agent to every other."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
         joined = coo_array((np.ones(len(self.edges)), self.edges.T), (self.count, self.count))
         return bool(connected_components(joined, directed=False, return_labels=False) == 1)
 
@@ -169,7 +168,7 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
     nearer ones do not avoid each other. Of 72 random starts of 10 to 50 agents 47 stayed apart
     and together for 20 s, most of the others in the narrow band, where the graph kept all 72.
 
-    :param neighbors: (k, m), for each agent whom it attends to, such as the seven nearest.
+    :param neighbors: (k, m), the neighbours of each agent, such as the seven nearest.
     :param coupling: as in :func:`accelerations`.
     :raises ValueError: as :func:`accelerations`.
     """
@@ -206,3 +205,23 @@ def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
         raise ValueError(f'coupling = {coupling!r}: must be one of '
                          f'{", ".join(get_args(Coupling))}')
     return x, v
+
+
+def pairs_within(positions: Array, distance: float) -> Pairs:
+    """Return all pairs (m, 2), i < j, of the positions (k, n) nearer than a distance, m."""
+    from scipy.spatial import cKDTree
+    return cKDTree(positions).query_pairs(distance, output_type='ndarray')
+
+
+def nearest(positions: Array, count: int) -> Pairs:
+    """Return for each position (k, n) the others nearest to it (k, min(count, k - 1))."""
+    from scipy.spatial import cKDTree
+    k = len(positions)
+    count = min(count, k - 1)
+    tree, found = cKDTree(positions), np.empty((k, count + 1), dtype=np.int64)
+    order = tree.indices  # leaf by leaf: what one query has read serves the next
+    # One more than asked for, because each finds itself; among coincident ones not first.
+    found[order] = tree.query(positions[order], count + 1)[1].reshape(k, count + 1)
+    others = found != np.arange(k)[:, None]
+    others[others.all(axis=1), -1] = False
+    return found[others].reshape(k, count)

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from flock_follower.geometry import Array
 
@@ -43,6 +42,7 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
     :param breaks: where the acceleration jumps, s: no step straddles these.
     :raises RuntimeError: where no step is small enough, as at a singularity of the law.
     """
+    from scipy.integrate import DOP853
     shape = np.shape(start)
     t, y = float(times[0]), np.ravel(start)
     yield start
@@ -77,7 +77,7 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
     Each step takes the velocity forward first and the position with the new velocity (also
     called symplectic Euler): first order, and stable where explicit Euler is not.
 
-    :param acceptable: of the positions before and after a step: where it says no the step is
+    :param acceptable: of the positions before and after a step: if it returns False the step is
         halved, and lengthened again, doubling, by the steps that follow.
     :raises RuntimeError: where a step a millionth of dt long is not acceptable yet.
     """

@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One bag through perception, planner and gate, and everything worth remembering of it."""
+"""One bag through perception, planner and gate, and the record of it."""
 
 from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 import tempfile
@@ -63,97 +63,82 @@ STATES = tuple(state.value for state in State)
 _NOTHING = (float('nan'),) * 3
 
 
-@dataclass(frozen=True)
-class Topics:
+def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
+                several: Iterable[CameraValues] = ()) -> dict[str, tuple[str, str]]:
     """
-    The names of the topics in a bag; those of the truth are '' where there is none.
+    Return the topics of a bag that a follower uses, and the truth.
 
-    ``images`` and ``camera_infos`` map them to the names of the cameras, '' of the only one.
+    Of images that are there raw and compressed the raw ones are used.
+
+    :param remaps: their names in the bag, by ours, if they differ.
+    :param several: cameras with topics of their own, in place of the only one.
+    :returns: our name of each topic, ``image_raw`` for all images, and the camera's name, ''
+        of the only one.
+    :raises BagError: naming a topic that is missing, or of another type, and those that it may be.
     """
+    remaps, kinds = remaps or {}, (RAW_IMAGES, COMPRESSED_IMAGES)
+    names = names_there(namespace, remaps)
+    images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
+    published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
+    used: dict[str, tuple[str, str]] = {}
 
-    images: Mapping[str, str]
-    camera_infos: Mapping[str, str]
-    odometry: str
-    true_odometry: str
-    true_neighbors: str
-    ranges: str = ''
+    def offered(name: str) -> str:
+        same = kinds if name in kinds else (name,)
+        offers = offer(name, published, [n for ours, n in names.items() if ours not in same])
+        return f'; {offers}' if offers else ''
 
-    @classmethod
-    def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
-           several: Iterable[CameraValues] = ()) -> Topics:
-        """
-        Return the topics of a bag, images uncompressed where it has both.
+    def found(name: str) -> bool:
+        full = names[name]
+        if published.get(full, TYPES[name]) != TYPES[name]:
+            raise BagError(f'{bag.path}: {full} holds {published[full]}, not {TYPES[name]}'
+                           f'{offered(name)}')
+        if full in published:
+            used[full] = RAW_IMAGES if name in kinds else name, ''
+        return full in published
 
-        :param remaps: their names in the bag, by ours, where they are others.
-        :param several: cameras with topics of their own, in place of the one.
-        :raises BagError: naming a topic that is missing, or of another type, and those that it
-            may be.
-        """
-        remaps = remaps or {}
-        kinds = (RAW_IMAGES, COMPRESSED_IMAGES)
-        names = names_there(namespace, remaps)
-        images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
-        published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
-
-        def find(name: str) -> str:
-            topic = bag.topics.get(names[name])
-            if topic is None or not topic.count:
-                return ''
-            if topic.msgtype != TYPES[name]:
-                raise BagError(f'{bag.path}: {topic.name} holds {topic.msgtype}, '
-                               f'not {TYPES[name]}{offered(name)}')
-            return topic.name
-
-        def offered(name: str) -> str:
-            same = kinds if name in kinds else (name,)
-            offers = offer(name, published, [n for ours, n in names.items() if ours not in same])
-            return f'; {offers}' if offers else ''
-
-        def others() -> tuple[str, ...]:
-            return tuple(map(find, ('odom', 'truth/odom', 'truth/neighbors', 'ranges')))
-
-        if named := {camera.name: _topics_of(camera, bag, namespace) for camera in several}:
-            if not find('odom'):
-                raise BagError(f'{bag.path}: holds no message on {names["odom"]}'
-                               f'{offered("odom")}')
-            return cls({image: name for name, (image, _) in named.items()},
-                       {info: name for name, (_, info) in named.items()}, *others())
-        # Where images are named, others that happen to be in the bag are not meant.
+    missing = {}
+    if several:
+        for camera in several:
+            used |= _topics_of(camera, bag, published, namespace)
+    else:
+        # If images are named, others that happen to be in the bag are not meant.
         meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
-        image = next((name for name in map(find, kinds) if name and name in (meant or [name])), '')
-        found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
-        if missing := [name for name, topic in found.items() if not topic]:
-            images = ' or '.join(meant or (names[kind] for kind in kinds))
-            wanted = ', '.join(images if name == RAW_IMAGES else names[name] for name in missing)
-            raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
-                           f'{", ".join(published)}{"".join(map(offered, missing))}')
-        return cls({image: ''}, {found['camera_info']: ''}, *others())
+        if not any(found(kind) for kind in kinds if not meant or names[kind] in meant):
+            missing[RAW_IMAGES] = ' or '.join(meant or (names[kind] for kind in kinds))
+        if not found('camera_info'):
+            missing['camera_info'] = names['camera_info']
+    if not found('odom'):
+        missing['odom'] = names['odom']
+    if missing:
+        raise BagError(f'{bag.path}: holds no message on {", ".join(missing.values())}, only on '
+                       f'{", ".join(published)}{"".join(map(offered, missing))}')
+    if not (found('truth/odom') and found('truth/neighbors')):
+        used.pop(names['truth/odom'], None)
+    found('ranges')
+    return used
 
-    @property
-    def truth(self) -> bool:
-        """Return whether there is any truth to compare with."""
-        return bool(self.true_odometry and self.true_neighbors)
 
-
-def _topics_of(camera: CameraValues, bag: Bag, namespace: str) -> tuple[str, str]:
+def _topics_of(camera: CameraValues, bag: Bag, published: Collection[str],
+               namespace: str) -> dict[str, tuple[str, str]]:
     """Return the topics of one of several cameras: images and calibration."""
-    published = [name for name, topic in bag.topics.items() if topic.count]
-    pair = []
-    for choice in ([camera.images(t) for t in ('raw', 'compressed')], [camera.camera_info]):
-        there = [name for name in (full_name(n, namespace) for n in choice) if name in published]
-        if not there:
+    used = {}
+    for ours, choice in ((RAW_IMAGES, [camera.images(t) for t in ('raw', 'compressed')]),
+                         ('camera_info', [camera.camera_info])):
+        full = next((name for name in (full_name(n, namespace) for n in choice)
+                     if name in published), '')
+        if not full:
             raise BagError(f'{bag.path}: holds no message on {full_name(choice[0])} of '
                            f'camera {camera.name}, only on {", ".join(published)}')
-        pair.append(there[0])
-    return pair[0], pair[1]
+        used[full] = ours, camera.name
+    return used
 
 
 @dataclass
 class Evaluation:
     """
-    What a run leaves behind; per image, tick and setpoint a few numbers each.
+    The record of a run; per image, tick and setpoint a few numbers each.
 
-    ``cpu`` holds CPU times, s, by what they were spent on; ``frames`` the time of each image, s
+    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s
     since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
     index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
     ``reasons`` are those of every tick in HOLD, with its time.
@@ -162,14 +147,13 @@ class Evaluation:
 
     bag: str
     duration: float
-    truth: bool
     errors: FrameErrors
     flight: RecordedFlight
     names: list[str]
     incomplete: str = ''
-    """Why the bag was never finished, '' where it was."""
+    """Why the bag was never finished, '' if it was."""
     findings: list[Finding] = field(default_factory=list)
-    """What the rules of ``check`` found in the bag; none if they were not asked."""
+    """Those of the rules of ``check`` in the bag; none if they were not applied."""
     images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
@@ -201,7 +185,7 @@ class Evaluation:
 
 
 class _Recorder(Listener):
-    """Listens to the follower: writes what is published, remembers the rest."""
+    """Listens to the follower: writes the messages published, keeps the rest."""
 
     def __init__(self, writer: BagWriter, start: int) -> None:
         self._writer = writer
@@ -270,73 +254,65 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
              namespace: str = '', remaps: Mapping[str, str] | None = None,
              checked: bool = True) -> Evaluation:
     """
-    Run a bag through the chain and write what the nodes would have published.
+    Run a bag through the chain and write the messages that the nodes would have published.
 
     :param values: the parameters of every node, see ``parameters.files.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag.
-    :param remaps: names of topics in the bag, by ours, where they are others.
+    :param remaps: names of topics in the bag, by ours, if they differ.
     :param checked: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
-    :raises OSError: where the result cannot be written.
+    :raises OSError: if the result cannot be written.
     """
     perception = values['relative_pose']
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        told = cameras(perception)
-        topics = Topics.of(bag, namespace, remaps, [camera for camera in told if camera.name])
+        mounted = cameras(perception)
+        used = topics_used(bag, namespace, remaps, [camera for camera in mounted if camera.name])
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
             recorder = _Recorder(writer, bag.start_ns)
             flight = RecordedFlight(values, recorder, empty, time.process_time)
             neighbors = flight.perceiver.tracker.config.neighbors
-            recorder.evaluation = Evaluation(
-                path.name, bag.duration_ns / NANOSECONDS, topics.truth,
-                FrameErrors(neighbors, {
-                    camera.name: camera_mounting(camera.position, camera.rpy) for camera in told},
-                    bag.start_ns),
+            evaluation = recorder.evaluation = Evaluation(
+                path.name, bag.duration_ns / NANOSECONDS, FrameErrors(neighbors, {
+                    camera.name: camera_mounting(camera.position, camera.rpy)
+                    for camera in mounted}, bag.start_ns),
                 flight, [n.name for n in neighbors], bag.incomplete)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
-            read = [bag.topics[name].msgtype for name in (*topics.images, *topics.camera_infos)]
-            for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):
+            for msgtype in (ODOMETRY, TRAJECTORY, STATE, *(
+                    bag.topics[topic].msgtype for topic in used)):
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
             system = None
             if checked:
                 recorder.own = OwnMotion(flight.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, recorder.own)
-            _play(bag, topics, flight, recorder.evaluation, system)
+            _play(bag, used, evaluation, system)
             if system is not None:
-                recorder.evaluation.findings = system.findings()
+                evaluation.findings = system.findings()
         (Path(unfinished) / 'result' / 'result.mcap').replace(result)
-        recorder.evaluation.errors.finish()
-        recorder.evaluation.wall_time = time.perf_counter() - begin
-    return recorder.evaluation
+        evaluation.wall_time = time.perf_counter() - begin
+    return evaluation
 
 
-def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation,
+def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
-    errors = evaluation.errors
-    wanted = [*topics.images, *topics.camera_infos, topics.odometry]
-    if topics.ranges:
-        wanted.append(topics.ranges)
-    if topics.truth:
-        wanted += [topics.true_odometry, topics.true_neighbors]
-    if system is not None:
-        wanted += system.topics
-    for topic, msgtype, stamp, data in bag.messages(wanted):
+    errors, flight = evaluation.errors, evaluation.flight
+    for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
         message = None if system is None else system.take(topic, msgtype, stamp, data)
-        if topic == topics.odometry:
+        name, camera = used.get(topic, ('', ''))
+        if name == 'odom':
             flight.take_odometry(stamp, data, message)
-        elif topic in topics.images:
+        elif name == RAW_IMAGES:
             evaluation.images += 1
-            flight.take_image(stamp, msgtype, data, topics.images[topic])
-        elif topic in topics.camera_infos:
-            flight.take_camera_info(stamp, data, topics.camera_infos[topic])
-        elif topic == topics.ranges:
+            flight.take_image(stamp, msgtype, data, camera)
+        elif name == 'camera_info':
+            flight.take_camera_info(stamp, data, camera)
+        elif name == 'ranges':
             flight.take_range(stamp, data)
-        elif topic == topics.true_odometry:
+        elif name == 'truth/odom':
             errors.true_odometry(from_odometry(read_odometry(data)))
-        elif topic == topics.true_neighbors:
+        elif name == 'truth/neighbors':
             errors.true_neighbor(from_odometry(read_odometry(data)))
     flight.finish()
 

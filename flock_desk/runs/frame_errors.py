@@ -13,19 +13,20 @@
 # limitations under the License.
 
 """
-What every image told of every neighbour, beside the truth where there is one: a table that grows.
+Errors of the estimates against the truth: one row per image and neighbour.
 
-Errors are those of the leader's state relative to the follower, each in its own follower's body
+Errors are those of the neighbour's state relative to the follower, each in its follower's body
 frame (FLU): estimate minus own odometry against truth minus truth, so that drift, which is common
-to leader and follower in odom, does not count. Their covariances follow from what was published.
+to leader and follower in odom, does not count. Their covariances follow from the published ones.
 
-- Position: z = R' (p_L - p_F). The filter measures p_L from the own place, and its covariance P_p
-  is of the leader as seen from there: the error of p_F is in p_L too and cancels. P = R' P_p R.
-- Velocity: z = R' (v_L - v_F). The filter takes v_L from positions seen from a place that moves
-  with the integral of v_F, so it follows the true velocity plus the error of v_F, which cancels as
-  far as v_L has followed it. How far it lags behind is in P_v, because that error's wandering is
-  part of the filter's noise (``odometry_noise``). P = R' P_v R; the covariance of the odometry's
-  velocity, added, would count it twice.
+- Position: z = R' (p_L - p_F). The filter measures p_L relative to the own position, and its
+  covariance P_p is that of the leader relative to it: the error of p_F is in p_L too and cancels.
+  P = R' P_p R.
+- Velocity: z = R' (v_L - v_F). The filter takes v_L from positions measured relative to a point
+  that moves with the integral of v_F, so v_L follows the true velocity plus the error of v_F,
+  which cancels as far as v_L has followed it. The lag is in P_v, because the random walk of that
+  error is part of the filter's noise (``odometry_noise``). P = R' P_v R; the covariance of the
+  odometry's velocity, added, would count it twice.
 
 P_v is the filter's covariance of the velocity in odom. The covariance in the message is that of
 the twist in the leader's body, so it also holds the error of the leader's attitude, of which the
@@ -35,7 +36,6 @@ velocity in odom is free.
 from __future__ import annotations
 
 from array import array
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -52,9 +52,10 @@ from flock_follower.perception.neighbor_filter import Estimate
 STAGES = ('none', 'track', 'roi', 'full')
 
 #: The columns of the table; three of a kind are along the follower's x, y, z (forward, left, up).
-#: ``stage`` is an index into STAGES; ``visible`` is 1 where the truth says a marker is in view;
-#: positions are in odom, m; sigmas are deviations of the errors; ``turned`` is the angle between
-#: estimated and true attitude of the neighbour relative to the follower, rad. NaN is unknown.
+#: ``stage`` is an index into STAGES; ``visible`` is 1 if by the truth a marker is in view;
+#: positions are in odom, m; sigmas are standard deviations of the errors; ``turned`` is the angle
+#: between estimated and true attitude of the neighbour relative to the follower, rad. NaN is
+#: unknown.
 COLUMNS = (
     'time', 'stage', 'visible', 'own_x', 'own_y', 'neighbor_x', 'neighbor_y',
     'distance', 'true_distance', 'position_x', 'position_y', 'position_z',
@@ -65,39 +66,29 @@ COLUMNS = (
 Table = Mapping[str, Array]
 #: States further apart than this are not interpolated, ns.
 MAX_GAP = NANOSECONDS // 2
-#: How long an image waits for odometry and truth of its stamp, ns.
-PATIENCE = NANOSECONDS
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
-_SPAN = 15 * NANOSECONDS  # odometry and truth kept at most
-_BATCH = 256  # images worked out at once: numpy is slow on single ones
+#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of what an
+#: image gives: stage, position, velocity, rotation matrix, covariance (6, 6).
+_STATE, _SEEN = 14, 52
 
 _P, _V = slice(0, 3), slice(3, 6)
 
 
-class _Seen(NamedTuple):
-    """An image of a stamp, ns, what it told: estimate and stage by neighbour; and its camera."""
-
-    stamp: int
-    estimates: Mapping[str, Estimate]
-    stages: Mapping[str, str]
-    camera: str
-
-
-class _At(NamedTuple):
-    """States at n stamps, in odom; covariances of estimates only; NaN where unknown."""
+class _States(NamedTuple):
+    """States at n stamps, in odom; covariances of estimates only; NaN if unknown."""
 
     position: Array
-    rotation: Array
     velocity: Array
+    rotation: Array
     covariance: Array
 
 
 class FrameErrors:
     """
-    Collects images, odometry and truth as they come, and works them out a batch at a time.
+    Collects images, odometry and truth as they arrive; :meth:`table` compares them.
 
-    Memory grows by one row of ``COLUMNS`` per image and neighbour, 192 bytes, and nothing else.
+    Memory grows by 0.6 kB per image and neighbour and by 0.1 kB per message of odometry or truth.
 
     :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
@@ -106,116 +97,116 @@ class FrameErrors:
     def __init__(self, neighbors: Sequence[MarkedNeighbor],
                  cameras: Transform | Mapping[str, Transform], start: int) -> None:
         self.models: dict[str, CameraModel | None] = {}
-        """The calibration of each camera, '' of the only one, where known."""
+        """The calibration of each camera, '' of the only one, if known."""
+        self.strangers: set[str] = set()
+        """Names in the truth that are no neighbour's."""
         self._neighbors = {n.name: n for n in neighbors}
         mounted = {'': cameras} if isinstance(cameras, Transform) else cameras
         self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
         self._start = start
-        self._rows = {name: array('d') for name in self._neighbors}
-        self._pending: list[_Seen] = []
-        self._own: deque[OdometryState] = deque()
-        self._true_own: deque[OdometryState] = deque()
-        self._true_neighbors: dict[str, deque[OdometryState]] = {
-            name: deque() for name in self._neighbors}
-        self.strangers: set[str] = set()
-        """Names in the truth that are no neighbour's."""
+        self._own, self._true_own = array('d'), array('d')
+        self._true = {name: array('d') for name in self._neighbors}
+        self._stamps = array('d')
+        self._cameras: list[str] = []
+        self._seen = {name: array('d') for name in self._neighbors}
+        self._compared: dict[str, list[Array]] = {name: [] for name in self._neighbors}
 
     def table(self, name: str) -> dict[str, Array]:
-        """Return the columns, (n,) each, of a neighbour, after :meth:`finish`."""
-        rows = np.frombuffer(self._rows[name]).reshape(-1, len(COLUMNS))
-        return dict(zip(COLUMNS, rows.T))
+        """Return the columns, (n,) each, of a neighbour."""
+        self._compare()
+        return dict(zip(COLUMNS, np.concatenate(self._compared[name] or [
+            np.empty((0, len(COLUMNS)))]).T))
 
     def odometry(self, state: OdometryState) -> None:
-        """Take one's own odometry."""
+        """Take the own odometry."""
         self._take(self._own, state)
 
     def true_odometry(self, state: OdometryState) -> None:
-        """Take one's own true state."""
+        """Take the own true state."""
         self._take(self._true_own, state)
 
     def true_neighbor(self, state: OdometryState) -> None:
         """Take a neighbour's true state; its name is the child frame."""
-        if state.child in self._true_neighbors:
-            self._take(self._true_neighbors[state.child], state)
+        if state.child in self._true:
+            self._take(self._true[state.child], state)
         else:
             self.strangers.add(state.child)
 
     def frame(self, stamp: int, estimates: Mapping[str, Estimate],
               stages: Mapping[str, str], camera: str = '') -> None:
-        """Take what the image of a stamp, ns, told."""
-        self._pending.append(_Seen(stamp, estimates, stages, camera))
-        if len(self._pending) >= _BATCH:
-            self._work_out(self._pending[-1].stamp - PATIENCE)
+        """Take the estimates of the image of a stamp, ns, and the stage that measured each."""
+        self._stamps.append(stamp - self._start)
+        self._cameras.append(camera)
+        for name, seen in self._seen.items():
+            if (estimate := estimates.get(name)) is None:
+                seen.extend((0.0, *[np.nan] * (_SEEN - 1)))
+            else:
+                seen.extend((STAGES.index(stages.get(name, 'full')), *estimate.position,
+                             *estimate.velocity, *estimate.rotation.ravel(),
+                             *estimate.covariance[:6, :6].ravel()))
 
-    def finish(self) -> None:
-        """Work out all that is left."""
-        if self._pending:
-            self._work_out(max(seen.stamp for seen in self._pending))
+    def _take(self, states: array[float], state: OdometryState) -> None:
+        """Keep states in the order of their stamps; if time jumps back, begin anew."""
+        time = state.stamp - self._start
+        if states and time <= states[-_STATE]:
+            if states[-_STATE] - time <= MAX_GAP:
+                return
+            self._compare()
+            del states[:]
+        states.extend((time, *state.position, *state.quaternion, *state.velocity,
+                       *state.angular_velocity))
 
-    def _take(self, states: deque[OdometryState], state: OdometryState) -> None:
-        _append(states, state)
-        if state.stamp - states[0].stamp > _SPAN:  # images are rare, or have stopped
-            self._work_out(state.stamp - PATIENCE)
-
-    def _work_out(self, newest: int) -> None:
-        batch = [seen for seen in self._pending if seen.stamp <= newest]
-        self._pending = [seen for seen in self._pending if seen.stamp > newest]
-        if batch:
-            self._add_rows(batch)
-        for states in (self._own, self._true_own, *self._true_neighbors.values()):
-            while len(states) > 1 and states[1].stamp <= newest:
-                states.popleft()
-
-    def _add_rows(self, batch: Sequence[_Seen]) -> None:
-        stamps = np.array([seen.stamp for seen in batch])
+    def _compare(self) -> None:
+        """Compare the images since the last call."""
+        if not self._stamps:
+            return
+        stamps = np.array(self._stamps)
         own, true_own = _at(self._own, stamps), _at(self._true_own, stamps)
         for name, neighbor in self._neighbors.items():
-            true = _at(self._true_neighbors[name], stamps)
-            rows = np.full((len(batch), len(COLUMNS)), np.nan)
-            columns = dict(zip(COLUMNS, rows.T))
-            columns['time'][:] = (stamps - self._start) / NANOSECONDS
-            columns['stage'][:] = [
-                STAGES.index(seen.stages.get(name, 'full')) if name in seen.estimates else 0
-                for seen in batch]
-            columns['own_x'][:], columns['own_y'][:] = own.position[:, 0], own.position[:, 1]
-            self._compare(columns, _estimated(batch, name), own, true, true_own)
-            columns['visible'][:] = self._visible(
-                [seen.camera for seen in batch], neighbor, true, true_own)
-            self._rows[name].frombytes(rows.tobytes())
+            true = _at(self._true[name], stamps)
+            seen = np.array(self._seen[name]).reshape(-1, _SEEN)
+            estimated = _States(seen[:, 1:4], seen[:, 4:7], seen[:, 7:16].reshape(-1, 3, 3),
+                                seen[:, 16:].reshape(-1, 6, 6))
+            columns = {
+                'time': stamps / NANOSECONDS, 'stage': seen[:, 0],
+                'visible': self._visible(neighbor, true, true_own),
+                'own_x': own.position[:, 0], 'own_y': own.position[:, 1],
+                **_errors(estimated, own, true, true_own)}
+            self._compared[name].append(np.stack([columns[key] for key in COLUMNS], axis=1))
+            del self._seen[name][:]
+        del self._stamps[:], self._cameras[:]
 
-    def _compare(self, columns: dict[str, Array], estimated: _At, own: _At, true: _At,
-                 true_own: _At) -> None:
-        position, velocity, rotation = _relative(estimated, own)
-        true_position, true_velocity, true_rotation = _relative(true, true_own)
-        columns['neighbor_x'][:] = estimated.position[:, 0]
-        columns['neighbor_y'][:] = estimated.position[:, 1]
-        columns['distance'][:] = np.linalg.norm(position, axis=1)
-        columns['true_distance'][:] = np.linalg.norm(true_position, axis=1)
-        turned = np.einsum('nij,nij->n', rotation, true_rotation)  # the trace of R' R_true
-        columns['turned'][:] = np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))
-        for kind, error, covariance in (
-                ('position', position - true_position, estimated.covariance[:, _P, _P]),
-                ('velocity', velocity - true_velocity, estimated.covariance[:, _V, _V])):
-            in_body = own.rotation.transpose(0, 2, 1) @ covariance @ own.rotation
-            columns[f'nees_{kind}'][:] = _nees(error, in_body)
-            for i, axis in enumerate('xyz'):
-                columns[f'{kind}_{axis}'][:] = error[:, i]
-                columns[f'{kind}_sigma_{axis}'][:] = np.sqrt(in_body[:, i, i])
-
-    def _visible(self, images: Sequence[str], neighbor: MarkedNeighbor, true: _At,
-                 true_own: _At) -> Array:
-        """Return for every image whether a marker is in view, NaN where there is no truth."""
+    def _visible(self, neighbor: MarkedNeighbor, true: _States, true_own: _States) -> Array:
+        """Return for every image whether a marker is in view, NaN if there is no truth."""
         position, _, rotation = _relative(true, true_own)
-        known = np.isfinite(position[:, 0])
-        visible = np.zeros(len(known), dtype=bool)
+        cameras, visible = np.array(self._cameras), np.zeros(len(position), dtype=bool)
         for name, T_camera_body in self._T_camera_body.items():
-            model, taken = self.models.get(name), np.array([name == image for image in images])
-            if model is None:
-                continue
-            for marker in neighbor.markers:
-                visible |= taken & _marker_visible(
-                    marker, model, T_camera_body, position, rotation)
-        return np.where(known, visible, np.nan)
+            if (model := self.models.get(name)) is not None:
+                for marker in neighbor.markers:
+                    visible |= (cameras == name) & _marker_visible(
+                        marker, model, T_camera_body, position, rotation)
+        return np.where(np.isfinite(position[:, 0]), visible, np.nan)
+
+
+def _errors(estimated: _States, own: _States, true: _States,
+            true_own: _States) -> dict[str, Array]:
+    position, velocity, rotation = _relative(estimated, own)
+    true_position, true_velocity, true_rotation = _relative(true, true_own)
+    turned = np.einsum('nij,nij->n', rotation, true_rotation)  # the trace of R' R_true
+    columns = {
+        'neighbor_x': estimated.position[:, 0], 'neighbor_y': estimated.position[:, 1],
+        'distance': np.linalg.norm(position, axis=1),
+        'true_distance': np.linalg.norm(true_position, axis=1),
+        'turned': np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))}
+    for kind, error, covariance in (
+            ('position', position - true_position, estimated.covariance[:, _P, _P]),
+            ('velocity', velocity - true_velocity, estimated.covariance[:, _V, _V])):
+        in_body = own.rotation.transpose(0, 2, 1) @ covariance @ own.rotation
+        columns[f'nees_{kind}'] = _nees(error, in_body)
+        for i, axis in enumerate('xyz'):
+            columns[f'{kind}_{axis}'] = error[:, i]
+            columns[f'{kind}_sigma_{axis}'] = np.sqrt(in_body[:, i, i])
+    return columns
 
 
 def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transform,
@@ -237,61 +228,38 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
     return result
 
 
-def _append(states: deque[OdometryState], state: OdometryState) -> None:
-    """Keep states in the order of their stamps; where time jumps back, begin anew."""
-    if states and state.stamp <= states[-1].stamp:
-        if states[-1].stamp - state.stamp <= MAX_GAP:
-            return
-        states.clear()
-    states.append(state)
-
-
-def _unknown(count: int) -> _At:
-    return _At(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan),
-               np.full((count, 3), np.nan), np.full((count, 6, 6), np.nan))
-
-
-def _at(states: deque[OdometryState], stamps: NDArray[np.int64]) -> _At:
+def _at(states: array[float], stamps: Array) -> _States:
     """
-    Return the states at stamps (n,), between two of them, for half a second at most.
+    Return the states at stamps (n,), ns, between two of them that are half a second apart at most.
 
-    They are interpolated as perception does it: what a line is off at 10 Hz is no error of its.
+    They are interpolated as perception does it, so that interpolation adds no error of its own.
     """
-    result = _unknown(len(stamps))
-    if not states:
+    n = len(stamps)
+    result = _States(np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
+                     np.empty(0))
+    rows = np.array(states).reshape(-1, _STATE)
+    if not len(rows):
         return result
-    have = list(states)
-    times = np.array([s.stamp for s in have])
-    after = np.minimum(np.searchsorted(times, stamps), len(have) - 1)
+    times = rows[:, 0]
+    after = np.minimum(np.searchsorted(times, stamps), len(rows) - 1)
     before = np.where(times[after] == stamps, after, np.maximum(after - 1, 0))
-    gap = times[after] - times[before]
-    known = (times[before] <= stamps) & (stamps <= times[after]) & (gap <= MAX_GAP)
-    for n in np.flatnonzero(known):
-        a, b = have[before[n]], have[after[n]]
-        state = a if a is b else between(
-            _sample(a, a.stamp), _sample(b, a.stamp), float(stamps[n] - a.stamp) / NANOSECONDS)
-        result.position[n], result.velocity[n] = state.position, state.velocity
-        result.rotation[n] = quaternion_to_matrix(state.quaternion)
+    known = ((times[before] <= stamps) & (stamps <= times[after])
+             & (times[after] - times[before] <= MAX_GAP))
+    for k in np.flatnonzero(known):
+        begin = times[before[k]]
+        state, end = (_sample(rows[row], begin) for row in (before[k], after[k]))
+        if before[k] != after[k]:
+            state = between(state, end, float(stamps[k] - begin) / NANOSECONDS)
+        result.position[k], result.velocity[k] = state.position, state.velocity
+        result.rotation[k] = quaternion_to_matrix(state.quaternion)
     return result
 
 
-def _sample(state: OdometryState, since: int) -> OdometrySample:
-    return OdometrySample((state.stamp - since) / NANOSECONDS, state.position, state.quaternion,
-                          state.velocity, state.angular_velocity)
+def _sample(row: Array, since: float) -> OdometrySample:
+    return OdometrySample((row[0] - since) / NANOSECONDS, row[1:4], row[4:8], row[8:11], row[11:])
 
 
-def _estimated(batch: Sequence[_Seen], name: str) -> _At:
-    result = _unknown(len(batch))
-    for n, seen in enumerate(batch):
-        estimate = seen.estimates.get(name)
-        if estimate is not None:
-            result.position[n], result.velocity[n] = estimate.position, estimate.velocity
-            result.rotation[n] = estimate.rotation
-            result.covariance[n] = estimate.covariance[:6, :6]
-    return result
-
-
-def _relative(neighbor: _At, own: _At) -> tuple[Array, Array, Array]:
+def _relative(neighbor: _States, own: _States) -> tuple[Array, Array, Array]:
     """Return positions (n, 3), velocities (n, 3), rotations (n, 3, 3) in the follower's body."""
     to_body = own.rotation.transpose(0, 2, 1)
     return (np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
@@ -303,7 +271,7 @@ def _nees(errors: Array, covariances: Array) -> Array:
     """
     Return e' P^-1 e (n,) of errors (n, 3) and covariances (n, 3, 3).
 
-    NaN where there is no estimate, infinite where its covariance is none.
+    NaN if there is no estimate, infinite if its covariance is invalid.
     """
     estimated = np.isfinite(errors).all(axis=1)
     known = estimated & (np.linalg.det(np.nan_to_num(covariances)) > 0.0)

@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The pictures of a flight: what it did, errors beside their deviations, stages of perception."""
+
+"""The pictures of the reports: a flight, errors and their deviations, stages of perception."""
 
 from __future__ import annotations
 
@@ -22,15 +23,19 @@ import io
 from itertools import cycle
 from typing import NamedTuple
 
+import cv2
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_desk.runs.evaluation import Evaluation
 from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.record import FlightRecord, LEADER_NAME, LiveRecord
 from flock_desk.runs.report import Chapter, Illustration
-from flock_desk.runs.summary import sight_figures
+from flock_desk.runs.summary import column_tracks, consistency, sight_figures
+from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
 from flock_follower.planner.params import PlannerParams
 
@@ -39,17 +44,13 @@ matplotlib.use('Agg')
 # Okabe and Ito's palette: told apart by the colour-blind, and by lightness in grey.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
+_OTHERS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
 _STAGE_COLOURS = {'none': LIMIT, 'track': VEHICLE, 'roi': '#E69F00', 'full': FOLLOWER}
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'TRACK')  # from bottom to top
-#: Of longer series every so manieth value is drawn.
-MOST_POINTS = 3000
-#: Across a longer gap no line is drawn, s.
-LONGEST_LINE = 0.5
-#: Shorter times in which the leader could not be seen are not shaded, s.
-LEAST_SHADED = 0.2
-#: Where leader and follower were at the same time is shown this often, s, but not more often than
-#: so many times.
-PAIR_PERIOD, MOST_PAIRS = 5.0, 24
+LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
+LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
+PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
+NARROWEST = 0.35  # of its length, of a map
 _TIME = 'time [s]'
 
 
@@ -65,13 +66,13 @@ class Curve(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class PlottedFlight:
     """
-    What the pictures of a flight behind one neighbour show, times in s from its beginning.
+    A flight behind one neighbour as its pictures show it, times in s from its beginning.
 
     ``table`` is that of ``frame_errors``; ``paths`` are seen from above, m, the leader's and the
-    follower's first, at the table's times; ``speeds`` are m/s over time. ``setpoints`` (k, 3),
-    m/s^2, were sent at ``setpoint_times`` (k,), for want of a command where ``commanded`` (k,) is
-    False. ``states`` are the planner's, with when it entered them. ``blind`` holds when the leader
-    could not be seen, from and to.
+    follower's, at the table's times; ``speeds`` are m/s over time. ``setpoints`` (k, 3), m/s^2,
+    were sent at ``setpoint_times`` (k,), for lack of a command if ``commanded`` (k,) is False.
+    ``states`` are the planner's, with the times at which it entered them. ``blind`` holds the
+    times in which the leader could not be seen, from and to.
     """
 
     name: str
@@ -82,229 +83,287 @@ class PlottedFlight:
     speeds: Sequence[Curve]
     setpoint_times: Array
     setpoints: Array
-    commanded: Array
+    commanded: NDArray[np.bool_]
     states: Sequence[tuple[float, str]]
     blind: Sequence[tuple[float, float]] = ()
 
+    @classmethod
+    def of(cls, flight: FlightRecord) -> PlottedFlight:
+        """Return a recorded flight."""
+        speeds = [Curve('follower', FOLLOWER, flight.velocity_times, _norms(flight.velocities))]
+        blind: list[tuple[float, float]] = []
+        if isinstance(flight, LiveRecord):
+            speeds.append(Curve('leader', LEADER, flight.table['time'], flight.leader_speed))
+            blind = flight.blind
+        else:
+            # The vehicle that flew the commands of a replay: its path means nothing in the bag.
+            speeds = [speeds[0]._replace(label='vehicle that flew the commands', colour=VEHICLE)]
+        return cls(
+            LEADER_NAME, flight.duration, flight.table, flight.params,
+            [Curve('leader', LEADER, *flight.leader[:, :2].T),
+             Curve('follower', FOLLOWER, *flight.follower[:, :2].T)], speeds,
+            flight.setpoint_times, flight.setpoints, np.ones(len(flight.setpoints), dtype=bool),
+            flight.states, blind)
+
+
+def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
+    """Return what the report of ``fly`` shows: plots, and images of the follower's camera."""
+    log, times = flight.log, flight.table['time']
+    epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
+    return [*chapters(
+        PlottedFlight.of(flight),
+        note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.'),
+        Chapter("Images of the follower's camera", '', [
+            Illustration(cv2.imencode('.jpg', image)[1].tobytes(), '',
+                         f'{(int(stamp) - epoch) * 1e-9:.1f} s')
+            for stamp, image in zip(log['picture_stamp'], log['picture'])])]
+
+
+def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
+    """Return what the report of ``evaluate`` shows."""
+    ticks, setpoints = evaluation.ticks, evaluation.setpoints
+    speed = Curve('follower in the bag, which does not fly the setpoints', FOLLOWER, ticks[:, 0],
+                  ticks[:, 3])
+    tables = {name: evaluation.errors.table(name) for name in evaluation.names}
+    found: list[Chapter] = []
+    for name, table in tables.items():
+        paths = [Curve(f'{name}, estimated', LEADER, table['neighbor_x'], table['neighbor_y']),
+                 Curve('follower, own odometry', FOLLOWER, table['own_x'], table['own_y'])]
+        found += chapters(PlottedFlight(
+            name, evaluation.duration, table, evaluation.flight.planner_params, paths, [speed],
+            setpoints[:, 0], setpoints[:, 1:4], setpoints[:, 4] == 1.0, evaluation.states))
+    return [*found, Chapter('Stages', '', [Illustration(stage_picture(
+        tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
+        evaluation.duration), 'stages and CPU time')])]
+
+
+def chapters(flight: PlottedFlight, note: str = '') -> list[Chapter]:
+    """Return the chapters of a flight behind a neighbour: the flight and, with truth, errors."""
+    result = [Chapter(f'Flight: {flight.name}', note, [Illustration(
+        flight_picture(flight), 'distance, path, setpoints, speed and state')])]
+    if _has_truth(flight.table):
+        result.append(Chapter(
+            f'Errors against the truth: {flight.name}',
+            'Relative to the follower, along its own axes. The band is two standard deviations of '
+            'the published covariances: 95 % of the errors should be inside. The NEES is the mean '
+            'squared error in units of the covariance: 3 is expected, more is overconfident.',
+            [Illustration(error_picture(flight), 'errors and their deviations')]))
+    return result
+
 
 def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
-    """Return the picture of a flight, PNG; it shows errors only where there is truth."""
-    truth = bool(np.any(np.isfinite(flight.table['true_distance'])))
-    figure = Figure(figsize=(13, 11), dpi=110, layout='constrained')
+    """Return the picture of a flight, PNG; it shows errors only if there is truth."""
+    truth = _has_truth(flight.table)
+    figure = Figure(figsize=(13, 9.5), dpi=110, layout='constrained')
     if title:
         figure.suptitle(title, fontsize=14, x=0.01, ha='left', weight='bold')
-    right = ['above', 'above', 'above', *(('position', 'velocity') if truth else 2 * ('above',))]
-    left = ['distance', 'acceleration', 'speed', 'state', 'axes']
+    left = ['distance', 'acceleration', 'speed', 'state']
+    right = ['above', 'above', *(('position', 'velocity') if truth else 2 * ('above',))]
     axes: dict[str, Axes] = figure.subplot_mosaic(
         [list(row) for row in zip(left, right)], width_ratios=[1.45, 1.0],
-        height_ratios=[1.2, 1.0, 1.0, 0.8, 1.0])
-    table, params = thinned(flight.table), flight.params
+        height_ratios=[1.2, 1.2, 1.0, 0.8])
+    table, params = with_gaps(flight.table), flight.params
     _draw_distance(axes['distance'], flight, table)
     _draw_above(axes['above'], flight)
-    every = _stride(flight.setpoint_times)
-    times, setpoints = flight.setpoint_times[::every], flight.setpoints[::every]
-    _draw_limited(axes['acceleration'], [Curve('', VEHICLE, times, _norms(setpoints))],
-                  params.a_max, 'a_max')
-    axes['acceleration'].set(title='acceleration setpoint', ylabel='‖a‖ [m/s²]')
-    own = ~flight.commanded[::every].astype(bool)
-    if own.any():
-        axes['acceleration'].plot(times[own], _norms(setpoints[own]), '.', color=FOLLOWER,
-                                  markersize=4, label='no command: brake or level')
-        _key(axes['acceleration'], 'upper left')
-    _draw_limited(axes['speed'], flight.speeds, params.v_max, 'v_max')
-    axes['speed'].set(title='speed', ylabel='‖v‖ [m/s]')
-    _key(axes['speed'], 'upper left', 3)
+    _draw_acceleration(axes['acceleration'], flight)
+    _draw_limit(axes['speed'], params.v_max, f'v_max\n{params.v_max:g} m/s')
+    for curve in flight.speeds:
+        axes['speed'].plot(curve.x, curve.y, color=curve.colour, linewidth=1.1, label=curve.label)
+    axes['speed'].set(ylabel='speed [m/s]')
+    axes['speed'].set_ylim(bottom=0.0)
+    _key(axes['speed'])
     _draw_states(axes['state'], flight)
-    for k, (name, colour) in enumerate((('x', LEADER), ('y', FOLLOWER), ('z', VEHICLE))):
-        axes['axes'].plot(times, setpoints[:, k], color=colour, linewidth=0.9, label=name)
-    axes['axes'].margins(y=0.25)  # room for the key
-    axes['axes'].set(title='acceleration setpoint by axis of odom', ylabel='[m/s²]', xlabel=_TIME)
-    _key(axes['axes'], 'upper left', 3)
     if truth:
         figures = sight_figures([flight.table], params.max_velocity_std)
-        _draw_error(axes['position'], table, 'position', 'cm', figures['position_rms_m'])
-        _draw_error(axes['velocity'], table, 'velocity', 'cm/s', figures['velocity_rms_m_s'])
-        axes['velocity'].set_xlabel(_TIME)
+        for kind, unit in (('position', 'cm'), ('velocity', 'cm/s')):
+            rms = figures['position_rms_m' if kind == 'position' else 'velocity_rms_m_s']
+            errors = 100.0 * _norms(_by_axis(table, kind))
+            axes[kind].plot(table['time'], errors, color=FOLLOWER, linewidth=0.9)
+            axes[kind].set(ylabel=f'{kind} error [{unit}]',
+                           ylim=(0.0, 1.2 * _usually(errors, 99.5)))
+            if rms is not None:
+                _heading(axes[kind], f'error of the relative {kind}: RMS {100 * rms:.2f} {unit}')
     for name, axis in axes.items():
         if name != 'above':
             axis.set_xlim(0.0, max(flight.duration, 1e-3))
         if name not in ('above', 'distance'):
             _shade(axis, flight.blind)
-    return _png(figure, axes.values())
+    for name in ('state', 'velocity') if truth else ('state',):
+        axes[name].set_xlabel(_TIME)
+    return _encoded(figure, axes.values())
 
 
 def error_picture(flight: PlottedFlight) -> bytes:
     """Return the picture of the errors and twice their deviations by axis, PNG."""
-    table = thinned(flight.table)
+    table = with_gaps(flight.table)
+    figures = sight_figures([flight.table], flight.params.max_velocity_std)
     figure = Figure(figsize=(13, 7), dpi=110, layout='constrained')
     axes = figure.subplots(3, 2, sharex=True)
     for column, (kind, unit) in enumerate((('position', 'cm'), ('velocity', 'cm/s'))):
-        # One scale for the three axes: a glance tells which is worse.
-        errors = 100 * np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'])
-        sigmas = 100 * np.stack([table[f'{kind}_sigma_{axis}'] for axis in 'xyz'])
+        # One scale for the three axes, which makes them comparable.
+        errors, sigmas = 100.0 * _by_axis(table, kind), 100.0 * _by_axis(table, f'{kind}_sigma')
         limit = 1.15 * max(_usually(np.abs(errors), 99.0), _usually(2.0 * sigmas, 90.0))
-        for row, (axis, direction) in enumerate(zip('xyz', ('forward', 'left', 'up'))):
+        for row, axis in enumerate(('x, forward', 'y, left', 'z, up')):
             plot: Axes = axes[row, column]
-            plot.fill_between(table['time'], -2.0 * sigmas[row], 2.0 * sigmas[row], color=LEADER,
-                              alpha=0.15, linewidth=0)
+            plot.fill_between(table['time'], -2.0 * sigmas[:, row], 2.0 * sigmas[:, row],
+                              color=LEADER, alpha=0.15, linewidth=0)
             plot.axhline(0.0, color=LIMIT, linewidth=0.6)
-            plot.plot(table['time'], errors[row], color=FOLLOWER, linewidth=0.9)
-            plot.set(ylim=(-limit, limit), ylabel=f'{axis}, {direction} [{unit}]')
-        axes[0, column].set_title(f'relative {kind}: error, and two deviations')
+            plot.plot(table['time'], errors[:, row], color=FOLLOWER, linewidth=0.9)
+            plot.set(ylim=(-limit, limit), ylabel=f'error {axis} [{unit}]')
+        known = np.isfinite(errors)
+        inside = float(np.mean(np.abs(errors[known]) <= 2.0 * sigmas[known])) if (
+            known.any()) else 0.0
+        nees = figures[f'nees_{kind}']
+        verdict = '' if nees is None else f'; NEES {nees:.1f}: {consistency(nees)}'
+        _heading(axes[0, column], f'relative {kind}: {100.0 * inside:.0f} % within two deviations'
+                                  f'{verdict}')
         axes[2, column].set_xlabel(_TIME)
     axes[0, 0].set_xlim(0.0, max(flight.duration, 1e-3))
     for plot in axes.ravel():
         _shade(plot, flight.blind)
-    return _png(figure, axes.ravel())
+    return _encoded(figure, axes.ravel())
 
 
 def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
                   duration: float) -> bytes:
-    """Return the picture of what stage measured each neighbour, and the images' CPU time, PNG."""
+    """Return the picture of the stage that measured each neighbour, and of CPU times, PNG."""
     figure = Figure(figsize=(13, 4), dpi=110, layout='constrained')
     stages, cpu = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.5])
-    for table in map(thinned, tables):
+    for table in map(with_gaps, tables):
         for code, stage in enumerate(STAGES):
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
                         markersize=13, markeredgewidth=1.2)
-    stages.set(title='stage that measured the neighbor in each image', ylim=(-0.6, 3.6))
+    _heading(stages, 'stage that measured the neighbour in each image, and CPU time of perception')
+    stages.set(ylabel='stage', ylim=(-0.6, 3.6))
     stages.set_yticks(range(len(STAGES)), STAGES)
-    every = _stride(times)
-    cpu.plot(times[::every], cpu_ms[::every], '.', color=LEADER, markersize=3.5)
-    cpu.set(title='CPU time of perception per image', ylabel='[ms]', xlabel=_TIME,
-            ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)), xlim=(0.0, max(duration, 1e-3)))
-    return _png(figure, (stages, cpu))
+    cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
+    cpu.set(ylabel='CPU time [ms]', xlabel=_TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
+            xlim=(0.0, max(duration, 1e-3)))
+    return _encoded(figure, (stages, cpu))
 
 
-def portrait(image: NDArray[np.uint8], flight: PlottedFlight) -> bytes:
-    """Return what one saw beside where both went and how far apart they were, JPEG."""
-    figure = Figure(figsize=(12, 4.4), dpi=100, layout='constrained')
+def portrait(record: LiveRecord) -> bytes:
+    """Return an image of the follower's camera beside both tracks and the distance, JPEG."""
+    flight, images = PlottedFlight.of(record), record.log['picture']
+    image: NDArray[np.uint8] = images[len(images) // 2]
+    figure = Figure(figsize=(12, 4.8), dpi=100, layout='constrained')
     axes: dict[str, Axes] = figure.subplot_mosaic([['seen', 'above'], ['seen', 'distance']],
                                                   width_ratios=[1.3, 1.0],
                                                   height_ratios=[1.3, 1.0])
     axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
     axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
     _draw_above(axes['above'], flight)
-    _draw_distance(axes['distance'], flight, thinned(flight.table))
+    _draw_distance(axes['distance'], flight, with_gaps(flight.table))
     axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
-    for axis in (axes['above'], axes['distance']):
-        axis.grid(alpha=0.25, linewidth=0.6)
-        axis.spines[['top', 'right']].set_visible(False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='jpg', pil_kwargs={'quality': 88})
-    return buffer.getvalue()
+    return _encoded(figure, (axes['above'], axes['distance']), 'jpg')
 
 
-def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
-                   params: PlannerParams) -> bytes:
-    """
-    Return the picture of several vehicles, PNG.
+def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> list[Chapter]:
+    """Return what the page of a column shows."""
+    return [Chapter(
+        'The column', 'In the frame of the first follower. Each has a page of its own: '
+        + ', '.join(f'{name}/report.html' for name in flights) + '.',
+        [Illustration(column_picture(scenario, flights),
+                      'tracks from above, and the distances of all pairs')])]
 
-    :param tracks: (n, 3) of each, m; :param distances: (n,) of each two, m.
-    """
+
+def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> bytes:
+    """Return the picture of a column: tracks, and distances of all pairs, PNG."""
+    times, tracks, distances = column_tracks(scenario, flights)
     figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
     above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
-    colours = [LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT]
-    every = _stride(times)
-    for (name, track), colour in zip(tracks.items(), cycle(colours)):
-        known = track[np.isfinite(track[:, 0])][::every]
-        above.plot(known[:, 0], known[:, 1], color=colour, linewidth=1.5, label=name)
-        for k, marker in ((0, 'o'), (-1, 's')):
-            above.plot(known[k, 0], known[k, 1], marker, color=colour, markersize=6)
-    above.set(title='from above (● start, ■ end)', xlabel='x [m]', ylabel='y [m]')
-    above.set_aspect('equal', adjustable='datalim')
-    _key(above, 'best')
-    apart.axhspan(np.sqrt(params.law.d0), np.sqrt(params.law.d1), color=LEADER, alpha=0.08, lw=0)
-    for (name, distance), colour in zip(distances.items(), cycle(colours)):
-        apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
-    apart.set(title='true distances; shaded: the band of each and the one before it',
-              xlabel=_TIME, ylabel='[m]', xlim=(0.0, float(times[-1])))
+    for (name, track), colour in zip(tracks.items(), cycle(_OTHERS)):
+        _draw_path(above, Curve(name, colour, *track[:, :2].T))
+    _finish_map(above, 'from above (● start, ■ end)')
+    law = next(iter(flights.values())).params.law
+    apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=LEADER, alpha=0.08, lw=0)
+    for (name, distance), colour in zip(distances.items(), cycle(_OTHERS)):
+        apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
+    apart.set(xlabel=_TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])))
     apart.set_ylim(bottom=0.0)
-    _key(apart, 'lower left', 3)
-    return _png(figure, (above, apart))
+    _heading(apart, 'distances; shaded: the band')
+    _key(apart)
+    return _encoded(figure, (above, apart))
 
 
-def chapters(flight: PlottedFlight, *, truth: bool = True, note: str = '') -> list[Chapter]:
-    """Return the chapters of a flight behind a neighbour: what it did and, with truth, errors."""
-    result = [Chapter(f'Flight: {flight.name}', note, [Illustration(
-        flight_picture(flight), 'distance, path, setpoints, speed and state')])]
-    if truth:
-        result.append(Chapter(
-            f'Errors against the truth: {flight.name}',
-            'Relative to the follower, along its own axes. The band is twice the deviation that '
-            'follows from the published covariances: 95 % of the errors should be inside.',
-            [Illustration(error_picture(flight), 'errors and their deviations')]))
-    return result
+def with_gaps(table: Table) -> Mapping[str, Array]:
+    """Return a table with a row of NaN where images are missing, and so no line."""
+    breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
+    return {name: np.insert(column, breaks, np.nan) for name, column in table.items()}
 
 
-def thinned(table: Table) -> Mapping[str, Array]:
-    """Return fewer rows where there are many, and one of NaN where images are missing."""
-    times = table['time']
-    every = _stride(times)
-    breaks = np.flatnonzero(np.diff(times[::every]) > LONGEST_LINE * every) + 1
-    return {name: np.insert(column[::every], breaks, np.nan) for name, column in table.items()}
-
-
-def _shade(axis: Axes, spans: Sequence[tuple[float, float]], label: str = '') -> None:
-    """Shade when the leader could not be seen; single images that miss it are no outage."""
-    for begin, end in spans:
-        if end - begin >= LEAST_SHADED:
-            axis.axvspan(begin, end, color=_SHADE, alpha=0.35, lw=0, zorder=0, label=label)
-            label = ''
+def equal_scales(axis: Axes) -> None:
+    """Give both axes one scale, and a box as narrow as the data, within ``NARROWEST``."""
+    limits = np.array([axis.get_xlim(), axis.get_ylim()])
+    spans = np.ptp(limits, axis=1)
+    half = 0.5 * np.maximum(spans, NARROWEST * spans.max())
+    (left, bottom), (right, top) = limits.mean(axis=1) - half, limits.mean(axis=1) + half
+    axis.set(xlim=(left, right), ylim=(bottom, top))
+    axis.set_aspect('equal', adjustable='box')
 
 
 def _draw_distance(axis: Axes, flight: PlottedFlight, table: Table) -> None:
-    params = flight.params
-    low, high = np.sqrt(params.law.d0), np.sqrt(params.law.d1)
+    law = flight.params.law
+    low, high = np.sqrt(law.d0), np.sqrt(law.d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
-    for bound, text in ((low, '√d0'), (high, '√d1')):
-        _draw_limit(axis, bound, f'{text} = {bound:.2f} m')
-    if np.any(np.isfinite(table['true_distance'])):
-        axis.plot(table['time'], table['true_distance'], color=LIMIT, linewidth=3, alpha=0.35,
-                  label='truth')
-    axis.plot(table['time'], table['distance'], color=FOLLOWER, linewidth=1.1, label='estimated')
+    _draw_limit(axis, low, f'√d0\n{low:.2f} m')
+    _draw_limit(axis, high, f'√d1\n{high:.2f} m')
+    axis.plot(table['time'], table['distance'], color=FOLLOWER, linewidth=2.6, alpha=0.6,
+              label='estimated')
+    if _has_truth(table):  # above the estimate: the difference is often less than a line's width
+        axis.plot(table['time'], table['true_distance'], color='black', linewidth=0.9,
+                  linestyle=(0, (5, 3)), label='true')
     shown = np.concatenate([table['distance'], table['true_distance']])
     shown = shown[np.isfinite(shown)]
-    axis.set(title=f'distance to {flight.name}; light blue: the band', ylabel='[m]',
-             ylim=(min(0.6 * low, 0.9 * np.min(shown, initial=np.inf)),
-                   max(1.1 * high, 1.08 * np.max(shown, initial=0.0))))
-    _shade(axis, flight.blind, 'cannot be seen, or placed')
-    _key(axis, 'lower left', 3)
+    axis.set(ylabel='distance [m]', ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
+                                          max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
+    _heading(axis, f'distance to {flight.name}')
+    _shade(axis, flight.blind, 'leader not visible')
+    _key(axis)
 
 
 def _draw_above(axis: Axes, flight: PlottedFlight) -> None:
     for path in flight.paths:
-        axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
-        known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
-        for k, marker in zip((*known[:1], *known[-1:]), 'os'):
-            axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
+        _draw_path(axis, path)
     times = flight.table['time']
     period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
     for k in np.searchsorted(times, np.arange(0.0, flight.duration, period)):
         if k < len(times):
-            axis.plot([path.x[k] for path in flight.paths[:2]],
-                      [path.y[k] for path in flight.paths[:2]],
+            axis.plot([path.x[k] for path in flight.paths], [path.y[k] for path in flight.paths],
                       color=LIMIT, linewidth=0.6, alpha=0.5)
-    axis.set(title=f'from above (● start, ■ end; a line every {period:.0f} s)', xlabel='x [m]',
-             ylabel='y [m]')
-    axis.set_aspect('equal', adjustable='datalim')
-    _key(axis, 'best')
+    _finish_map(axis, f'from above (● start, ■ end; a line every {period:.0f} s)')
 
 
-def _draw_limited(axis: Axes, curves: Sequence[Curve], limit: float, name: str) -> None:
-    _draw_limit(axis, limit, f'{name} = {limit:g}')
-    top = limit
-    for curve in curves:
-        axis.plot(curve.x, curve.y, color=curve.colour, linewidth=1.1, label=curve.label)
-        top = max(top, 0.9 * float(np.nanmax(curve.y, initial=0.0)))
-    axis.set_ylim(0.0, 1.25 * top)
+def _draw_path(axis: Axes, path: Curve) -> None:
+    axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
+    known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
+    for k, marker in zip((*known[:1], *known[-1:]), 'os'):
+        axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
 
 
-def _draw_limit(axis: Axes, value: float, text: str) -> None:
-    axis.axhline(value, color=LIMIT, linestyle='--', linewidth=1)
-    axis.annotate(text, (1.0, value), (-4, 3), fontsize=8, ha='right',
-                  xycoords=('axes fraction', 'data'), textcoords='offset points')
+def _finish_map(axis: Axes, title: str) -> None:
+    axis.set(title=title, xlabel='x [m]', ylabel='y [m]')
+    equal_scales(axis)
+    axis.set_anchor('N')
+    axis.legend(loc='best', fontsize=9)
+
+
+def _draw_acceleration(axis: Axes, flight: PlottedFlight) -> None:
+    """Draw the setpoints by axis of odom, and their norm, which a_max limits."""
+    times, setpoints = flight.setpoint_times, flight.setpoints
+    a_max = flight.params.a_max
+    _draw_limit(axis, a_max, f'a_max\n{a_max:g} m/s²')
+    for values, colour, label in zip(setpoints.T, (LEADER, FOLLOWER, VEHICLE), 'xyz'):
+        axis.plot(times, values, color=colour, linewidth=0.8, label=label)
+    norms = _norms(setpoints)
+    axis.plot(times, norms, color=LIMIT, linewidth=1.2, label='norm')
+    if (idle := ~flight.commanded).any():
+        axis.plot(times[idle], norms[idle], '.', color=_SHADE, markersize=5,
+                  label='no command: brake or level')
+    axis.set(ylabel='acceleration [m/s²]')
+    _heading(axis, 'setpoint (odom axes)')
+    _key(axis)
 
 
 def _draw_states(axis: Axes, flight: PlottedFlight) -> None:
@@ -312,21 +371,42 @@ def _draw_states(axis: Axes, flight: PlottedFlight) -> None:
     if entered:
         times, levels = zip(*entered, (flight.duration, entered[-1][1]))
         axis.step(times, levels, where='post', color=VEHICLE, linewidth=1.5)
-    axis.set(title="the planner's state", ylim=(-0.3, len(_STATES) - 0.7))
+    axis.set(ylabel="planner's state", ylim=(-0.3, len(_STATES) - 0.7))
     axis.set_yticks(range(len(_STATES)), _STATES)
 
 
-def _draw_error(axis: Axes, table: Table, kind: str, unit: str, rms: float | None) -> None:
-    errors = 100 * _norms(np.stack([table[f'{kind}_{axis_}'] for axis_ in 'xyz'], axis=1))
-    axis.plot(table['time'], errors, color=FOLLOWER if kind == 'position' else LEADER,
-              linewidth=0.9)
-    told = '' if rms is None else f', RMS {100 * rms:.2f} {unit}'
-    axis.set(title=f'error of the relative {kind}{told}', ylabel=f'[{unit}]',
-             ylim=(0.0, 1.4 * _usually(errors, 99.5)))
+def _draw_limit(axis: Axes, value: float, text: str) -> None:
+    """Draw a limit, with its name beside the axis, where no data are."""
+    axis.axhline(value, color=LIMIT, linestyle='--', linewidth=1)
+    axis.annotate(text, (1.0, value), (4, 0), fontsize=8, ha='left', va='center',
+                  xycoords=('axes fraction', 'data'), textcoords='offset points')
 
 
-def _key(axis: Axes, place: str, columns: int = 1) -> None:
-    axis.legend(loc=place, ncols=columns, frameon=False, fontsize=9)
+def _shade(axis: Axes, spans: Sequence[tuple[float, float]], label: str = '') -> None:
+    """Shade the times in which the leader could not be seen, but not single images."""
+    for begin, end in spans:
+        if end - begin >= LEAST_SHADED:
+            axis.axvspan(begin, end, color=_SHADE, alpha=0.35, lw=0, zorder=0, label=label)
+            label = ''
+
+
+def _heading(axis: Axes, text: str) -> None:
+    axis.set_title(text, loc='left', fontsize=11)
+
+
+def _key(axis: Axes) -> None:
+    """Add a legend above the axis, where no data are."""
+    axis.legend(loc='lower right', bbox_to_anchor=(1.0, 0.99), ncols=6, frameon=False, fontsize=9,
+                borderaxespad=0.0, columnspacing=1.2)
+
+
+def _has_truth(table: Table) -> bool:
+    return bool(np.any(np.isfinite(table['true_distance'])))
+
+
+def _by_axis(table: Table, kind: str) -> Array:
+    """Return the columns (n, 3) of a kind."""
+    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
 
 
 def _norms(vectors: Array) -> Array:
@@ -334,19 +414,15 @@ def _norms(vectors: Array) -> Array:
 
 
 def _usually(values: Array, percentile: float) -> float:
-    """Return what to draw up to: all values but the wildest."""
+    """Return the upper end of an axis that shows all values but the wildest."""
     finite = values[np.isfinite(values)]
     return max(float(np.percentile(finite, percentile)) if len(finite) else 0.0, 1e-3)
 
 
-def _stride(rows: Array) -> int:
-    return max(1, len(rows) // MOST_POINTS)
-
-
-def _png(figure: Figure, axes: Iterable[Axes]) -> bytes:
+def _encoded(figure: Figure, axes: Iterable[Axes], kind: str = 'png') -> bytes:
     for axis in axes:
         axis.grid(alpha=0.25, linewidth=0.6)
         axis.spines[['top', 'right']].set_visible(False)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format='png')
+    figure.savefig(buffer, format=kind, pil_kwargs={'quality': 88} if kind == 'jpg' else None)
     return buffer.getvalue()

@@ -210,6 +210,17 @@ class Processes:
         """Return the last line that a child has printed so far."""
         return (self.log(name).strip().splitlines() or [f'{name} has printed nothing'])[-1]
 
+    def cpu(self) -> dict[str, float]:
+        """Return the CPU time, s, that each running child has used; nothing without /proc."""
+        used = {}
+        for name, child in self.children.items():
+            with contextlib.suppress(OSError):
+                stat = Path(f'/proc/{child.pid}/stat').read_text(encoding='utf-8')
+                fields = stat.rpartition(')')[2].split()  # after the name, which may hold anything
+                if fields[0] != 'Z':
+                    used[name] = (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+        return used
+
     def wait_for_log(self, name: str, text: str, timeout: float = 40.0) -> None:
         """
         Wait until a child has printed a text.

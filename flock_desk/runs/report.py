@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+
 """
 What ``evaluate``, ``demo`` and ``fly`` show of a flight: a table on the console, a page of HTML.
 
 The console names figures by their keys in summary.json, as bounds do; the page in words, with the
-key beside each bound, and where the pointer rests on a figure.
+key beside each bound, and in the tooltip of each figure.
 """
 
 from __future__ import annotations
@@ -29,20 +30,75 @@ import sys
 import textwrap
 from typing import Any, NamedTuple
 
-from flock_desk.runs.figure_names import name, text
-from flock_desk.runs.judge import flat, Judgement
+from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
+from flock_desk.runs.summary import consistency, write_summary
 from flock_follower.whole_file import whole_file
 
 #: The figures printed, beside all that have a bound; the others are in summary.json.
 SHOWN = (
-    'duration_s', 'frames', 'recall', 'detections.', 'rejections.', 'distance_m.',
-    'true_distance_m.', 'distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
-    'nees_position', 'nees_velocity', 'orientation_wrong_share', 'leader_speed_max_m_s',
-    'leader_faster_than_v_max', 'own_speed_max_m_s', 'faster_than_v_max_share',
-    'time_in_band_share', 'planner.states.', 'planner.warning', 'holds.', 'setpoints.', 'outages.',
-    'latency_ms.', 'cpu_ms_per_frame', 'realtime_factor', 'skipped_images', 'cpu_cores.')
+    'duration_s.', 'frames.', 'recall.', 'detections.', 'rejections.', 'distance_m.',
+    'true_distance_m.', 'distance_rms_m.', 'distance_bias_m.', 'position_rms_m.',
+    'velocity_rms_m_s.', 'nees_position.', 'nees_velocity.', 'orientation_wrong_share.',
+    'leader_speed_max_m_s.', 'leader_faster_than_v_max.', 'own_speed_max_m_s.',
+    'faster_than_v_max_share.', 'time_in_band_share.', 'planner.states.', 'planner.warning.',
+    'holds.', 'setpoints.', 'outages.', 'latency_ms.', 'cpu_ms_per_frame.', 'realtime_factor.',
+    'skipped_images.', 'cpu_cores.')
 #: Characters of a line on the console.
 WIDTH = 100
+#: Units by the suffix of a key, the longest first.
+_UNITS = (('_m_s2', 'm/s²'), ('_m_s3', 'm/s³'), ('_m_s', 'm/s'), ('_ms', 'ms'), ('_hz', 'Hz'),
+          ('_m', 'm'), ('_s', 's'))
+#: Names of the keys whose words do not say it.
+_NAMES = {
+    'recall': 'share of images in view with an estimate (recall)',
+    'recall_of_processed': 'share of images looked at with an estimate',
+    'processed_share': 'share of images looked at in time',
+    'frames': 'images', 'frames_in_view': 'images with the leader in view',
+    'distance_m': 'estimated distance', 'true_distance_m': 'true distance',
+    'distance_rms_m': 'error of the distance, RMS',
+    'distance_bias_m': 'error of the distance, mean',
+    'position_rms_m': 'error of the relative position, RMS of the vector',
+    'position_bias_m': 'error of the relative position, mean by axis',
+    'velocity_rms_m_s': 'error of the relative velocity, RMS of the vector',
+    'velocity_rms_of_all_m_s': 'the same RMS of velocities, refused ones too',
+    'velocity_bias_m_s': 'error of the relative velocity, mean by axis',
+    'nees_position': 'consistency of positions (NEES; 3 is expected)',
+    'nees_velocity': 'consistency of velocities (NEES; 3 is expected)',
+    'orientation_wrong_share': "share with the leader's attitude wrong by over 20°",
+    'own_speed_max_m_s': 'greatest speed of the follower in the bag',
+    'faster_than_v_max_share': 'share of time it is faster than v_max',
+    'detections': 'images by the stage that measured the leader',
+    'track': 'track: edges, where it was expected', 'roi': 'roi: search near there',
+    'full': 'full: search everywhere', 'none': 'none',
+    'rejections': 'not used, and why', 'holds': 'HOLD of the planner: how long, and why',
+    'reasons': 'reasons given',
+    'cpu_ms_per_frame': 'CPU time of perception per image, ms',
+    'cpu_ms': 'CPU time', 'cpu_cores': 'CPU, in cores', 'total': 'all processes',
+    'realtime_factor': 'times faster than real time',
+    'timings': 'time that this took', 'wall_time_s': 'in all',
+    'latency_ms': 'from image to MAVLink', 'p50': 'median', 'p95': '95 % below',
+    'p99': '99 % below', 'failed_processes': 'processes that did not end well',
+    'time_in_band_share': 'share of time in the band',
+    'longest_gap_in_view_s': 'longest time without an estimate, leader in view',
+    'leader_speed_max_m_s': 'greatest speed of the leader',
+    'leader_faster_than_v_max': 'leader faster than v_max for over 1 s',
+    'altitude_off_m': "farthest from the leader's height",
+    'skipped_images': 'images not rendered in time', 'ended_early': 'ended early by the bridge',
+    'speed_max_m_s': 'greatest speed', 'missed_ticks': 'ticks missed',
+    'missed_ticks_share': 'share of ticks missed', 'warnings': 'warnings (times told)',
+    'warning': 'first warning', 'hold_count': 'times in HOLD', 'hold_s': 'time in HOLD',
+    'acceleration_max_m_s2': 'greatest acceleration', 'rate_hz': 'rate',
+    'outages': 'outages', 'hold_after_s': 'it held after', 'track_after_s': 'followed again after',
+    'reason': 'reason', 'problems': 'problems told by the nodes, seconds each',
+    'external': 'autopilot elsewhere', 'pace': 'pace of its clock by ours',
+    'nearest_m': 'nearest any two came', 'pairs': 'nearest by pair, m',
+    'column_of': 'scenario', 'min': 'least', 'max': 'greatest',
+    # Of flights in lock step.
+    'in_band': 'share of runs that never left the band',
+    'time_in_band': 'share of time in the band',
+    'min_separation_m': 'nearest of all runs', 'max_separation_m': 'farthest of all runs',
+    'time_in_sight': 'share of time with the leader in sight',
+    'guard_active': 'share of time in which the guard acted'}
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto;
@@ -80,44 +136,40 @@ class Chapter(NamedTuple):
     illustrations: Sequence[Illustration] = ()
 
 
-def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> list[str]:
-    """Return rows as lines of columns two apart, the first ``left`` of them flush left."""
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    return ['  '.join(cell.ljust(width) if n < left else cell.rjust(width)
-                      for n, (cell, width) in enumerate(zip(row, widths))).rstrip()
-            for row in rows]
-
-
 def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[str]:
     """Return the lines of the figures shown, bounds and verdicts beside those that have one."""
     bounds = {judgement.bound.key: judgement for judgement in judgements}
-    figures = dict(flat(summary))
-    keys = [key for key, value in figures.items()
-            if key in bounds or (_shown(key) and value is not None)]
-    keys += [key for key in bounds if key not in figures]
-    names = {key: _shown_name(key, figures) for key in keys}
+    figures = {key: value for key, value in flat(summary)
+               if key in bounds or (value is not None and f'{key}.'.startswith(SHOWN))}
+    figures |= {key: each.figure for key, each in bounds.items() if key not in figures}
+    names = {key: _shown_name(key, figures) for key in figures}
     key_width = max(map(len, names.values()))
-    numbers = {key: text(bounds[key].figure if key in bounds else figures[key]) for key in keys}
-    value_width = max((len(number) for key, number in numbers.items()
-                       if not isinstance(figures.get(key), str)), default=0)
+    value_width = max((len(text(value)) for value in figures.values()
+                       if not isinstance(value, str)), default=0)
     lines = []
-    for key in keys:
-        line = f'  {names[key]:<{key_width}}  {numbers[key]:>{value_width}}'
+    for key, value in figures.items():
+        line = f'  {names[key]:<{key_width}}  {text(value):>{value_width}}'
         if key in bounds:
             mark = 'FAILED' if bounds[key].fault else 'ok'
             line += f'  {bounds[key].bound!s:<16}  {mark}'
+        elif verdict := _verdict(key, value):
+            line += f'  {verdict}'
         lines += textwrap.wrap(line, WIDTH, drop_whitespace=False,
                                subsequent_indent=' ' * (key_width + 4))
     return lines
 
 
+def _verdict(key: str, value: Any) -> str:
+    return consistency(value) if key.startswith('nees_') else ''
+
+
 def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
              written: Sequence[Path], logs: Path | None = None) -> int:
     """
-    Print the table, what failed and where more is to be seen; return the exit code.
+    Print the table, what failed and where to look for more; return the exit code.
 
     :param written: the files to look at.
-    :param logs: the folder to look at where something failed.
+    :param logs: the folder to look at if something failed.
     """
     print('\n'.join(table(summary, judgements)))
     print('\n'.join(f'{"picture" if path.suffix == ".png" else "report"}: {path}'
@@ -130,16 +182,36 @@ def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
     return 1 if faults else 0
 
 
+def report(folder: Path, title: str, introduction: str, summary: Mapping[str, Any],
+           bounds: Sequence[FigureBound], draw: Callable[[], Iterable[Chapter]], *,
+           warnings: Sequence[str] = (), parts: Mapping[str, Any] | None = None
+           ) -> list[Judgement]:
+    """
+    Judge a summary, write summary.json and report.html to a folder, and return the judgements.
+
+    :param draw: returns the chapters, and imports matplotlib for it.
+    :param warnings: to be read first.
+    :param parts: summaries of the parts, which are judged and written, too, but not shown.
+    :raises OSError: if a file cannot be written.
+    """
+    whole = {**summary, **(parts or {})}
+    judgements = judge(bounds, whole)
+    write_summary(whole, folder / 'summary.json')
+    write_report(folder / 'report.html', title, introduction, summary, judgements, draw,
+                 warnings=warnings)
+    return judgements
+
+
 def write_report(path: Path, title: str, introduction: str, summary: Mapping[str, Any],
                  judgements: Sequence[Judgement],
                  draw: Callable[[], Iterable[Chapter]] | Iterable[Chapter] = (), *,
                  warnings: Sequence[str] = ()) -> None:
     """
-    Write the page; where matplotlib is missing it has no pictures, and says so.
+    Write the page; without matplotlib it has no pictures, and says so.
 
     :param draw: the chapters, or what returns them, and imports matplotlib for it.
-    :param warnings: what to know before reading on.
-    :raises OSError: where it cannot be written.
+    :param warnings: to be read first.
+    :raises OSError: if it cannot be written.
     """
     try:
         chapters = list(draw() if callable(draw) else draw)
@@ -150,7 +222,7 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
         *(f'<p class="warning">{escape(warning[:1].upper() + warning[1:])}.</p>'
           for warning in warnings), _bounds(judgements),
         *map(_chapter, chapters), '<h2>All figures</h2>',
-        '<p>The pointer on a figure shows its key in summary.json.</p><div class="figures">',
+        '<p>The tooltip of a figure shows its key in summary.json.</p><div class="figures">',
         *_groups(summary), '</div>'])
     page = ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -158,10 +230,6 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
             f'<body>{body}</body></html>\n')
     with whole_file(path) as file:
         file.write(page.encode())
-
-
-def _shown(key: str) -> bool:
-    return any(key == shown or (shown.endswith('.') and key.startswith(shown)) for shown in SHOWN)
 
 
 def _shown_name(key: str, figures: Mapping[str, Any]) -> str:
@@ -218,9 +286,37 @@ def _rows(figures: Mapping[str, Any], prefix: str, part: bool = False) -> Iterat
             continue
         indented = part or ('total' in figures and key != 'total')
         yield (f'<tr{" class=part" if indented else ""} title="{escape(prefix + key)}">'
-               f'<td>{escape(name(key))}</td><td>{escape(text(value))}</td></tr>')
+               f'<td>{escape(name(key))}</td><td>{escape(text(value))}{_remark(key, value)}</td>'
+               '</tr>')
+
+
+def _remark(key: str, value: Any) -> str:
+    verdict = _verdict(key, value)
+    return f'<br>{verdict}' if verdict else ''
 
 
 def _path_name(key: str) -> str:
     """Return the name of a figure by its whole key: what it is of, and what it is."""
     return ': '.join(map(name, key.split('.')))
+
+def name(key: str) -> str:
+    """Return the name of a figure by the last part of its key, with its unit."""
+    unit = next(((suffix, unit) for suffix, unit in _UNITS if key.endswith(suffix)), None)
+    if key in _NAMES:
+        return _NAMES[key] if unit is None else f'{_NAMES[key]}, {unit[1]}'
+    if unit is None or ' ' in key or key.startswith('at_') or '_at_' in key:
+        return key.replace('_', ' ')
+    return f'{key.removesuffix(unit[0]).replace("_", " ")}, {unit[1]}'
+
+
+def text(value: Any) -> str:
+    """Return a figure with the digits that people read."""
+    if value is None:
+        return 'unknown'
+    if isinstance(value, bool):
+        return 'yes' if value else 'no'
+    if isinstance(value, list):
+        return ', '.join(map(str, value))
+    if not isinstance(value, float):
+        return str(value)
+    return f'{value:.4g}' if abs(value) >= 1e-3 else f'{round(value, 5) + 0.0:g}'

@@ -13,32 +13,49 @@
 # limitations under the License.
 
 """
-The figures that ``evaluate``, ``demo`` and ``fly`` have in common, each defined once, here.
+The figures of a flight: those that ``evaluate``, ``demo`` and ``fly`` share, and those of each.
 
-A summary is a mapping of figures by name, groups of them nested; None is not known.
+A summary is a mapping of figures by name, groups of them nested; None is unknown.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 import json
 import math
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
 
-from flock_desk.runs.frame_errors import Table
+from flock_desk.runs.evaluation import Evaluation, STATES
+from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.record import FlightRecord, LiveRecord
+from flock_desk.scenarios.scenario import Outage, Scenario
+from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.geometry import Array
 from flock_follower.whole_file import whole_file
 
 #: Attitudes further than this from the truth count as wrong, rad.
 WRONG_ATTITUDE = math.radians(20.0)
+#: A mean NEES of three-dimensional errors that is still consistent; 3 is expected.
+CONSISTENT = (1.5, 6.0)
+#: Keys whose figures are times measured here, and so differ from run to run.
+TIMINGS = ('cpu_ms_per_frame', 'realtime_factor', 'timings')
+BRAKE_WITHIN = 0.3  # s after the last odometry
+HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
+LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
+OUTRUN = 1.0  # s for which a leader is faster than v_max that outruns; a gust is shorter
+OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
+STEP = 0.02  # s between the times at which the vehicles of a column are compared
 
 
 def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str, Any]:
     """
-    Return how often and how well neighbours were seen, from the tables of ``frame_errors``.
+    Return how often and how well neighbours were measured, from the tables of ``frame_errors``.
 
     Images count once for each neighbour. ``recall`` is the share with an estimate, of those in
     which the truth has a marker in view, or of all where there is no truth. Errors are over all
@@ -70,29 +87,291 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
         'orientation_wrong_share': mean(_finite(rows['turned']) > WRONG_ATTITUDE)}
 
 
-def holds(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[float, str]],
-          end: float) -> list[tuple[float, float, str]]:
-    """
-    Return every HOLD of the planner from time 0 to an end, s: when, for how long and why.
+def consistency(nees: float | None) -> str:
+    """Return the verdict on a mean NEES of three-dimensional errors, '' of an unknown one."""
+    if nees is None:
+        return ''
+    low, high = CONSISTENT
+    return ('consistent' if low <= nees <= high
+            else 'covariances too small' if nees > high else 'covariances too large')
 
-    :param states: that it entered, each with its time.
-    :param reasons: that it gave, each with its time; the first told during a HOLD is that one's.
+
+def hold_figures(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[float, str]],
+                 end: float) -> dict[str, dict[str, Any]]:
     """
-    found = []
+    Return number and total time of the planner's HOLDs from time 0 to an end, s, and each of them.
+
+    :param states: those entered, each with its time.
+    :param reasons: those reported, each with its time; of a HOLD the first one reported during it.
+    """
+    held: list[tuple[float, float, str]] = []
     for (begin, state), (until, _) in zip(states, [*states[1:], (end, '')]):
         begin, until = max(begin, 0.0), min(until, end)
         if state == 'HOLD' and begin < until:
-            why = next((reason for t, reason in reasons if begin <= t <= until and reason), '')
-            found.append((begin, until - begin, why))
-    return found
-
-
-def hold_figures(held: Sequence[tuple[float, float, str]]) -> dict[str, dict[str, Any]]:
-    """Return how often and how long it held, and a line for each time."""
-    unknown = 'too short for its reason to be on /diagnostics'
+            held.append((begin, until - begin, next(
+                (reason for t, reason in reasons if begin <= t <= until and reason),
+                'too short for its reason to be on /diagnostics')))
     return {'planner': {'hold_count': len(held), 'hold_s': float(sum(s for _, s, _ in held))},
-            'holds': {f'at_{begin:.1f}_s': f'{span:.1f} s: {why or unknown}'
-                      for begin, span, why in held}}
+            'holds': {f'at_{begin:.1f}_s': f'{span:.1f} s: {why}' for begin, span, why in held}}
+
+
+def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
+    """
+    Return the summary of an evaluation.
+
+    Beside :func:`sight_figures`: ``cpu_ms_per_frame`` is the CPU time of perception without
+    decoding; under ``timings`` it is by the costliest stage an image needed.
+    ``own_speed_max_m_s`` is that of the follower in the bag, ``faster_than_v_max_share`` the share
+    of ticks in which it was too fast. ``check`` holds the errors and the warnings of the rules of
+    ``check``, a line each.
+    """
+    tables = [evaluation.errors.table(name) for name in evaluation.names]
+    stages = np.concatenate([np.where(np.isfinite(table['distance']), table['stage'], 0.0)
+                             for table in tables])
+    cpu = {what: 1e3 * np.asarray(times, dtype=float) for what, times in evaluation.cpu.items()}
+    spent = np.concatenate([cpu.get(stage, np.empty(0)) for stage in STAGES])
+    ticks, params = evaluation.ticks, evaluation.flight.planner_params
+    acceleration, speed = (column[~np.isnan(column)] for column in (ticks[:, 2], ticks[:, 3]))
+    held = hold_figures(evaluation.states, evaluation.reasons, evaluation.duration)
+    return jsonable({
+        'bag': evaluation.bag,
+        'duration_s': evaluation.duration,
+        'check': {f'{level}s': [finding.line for finding in evaluation.findings
+                                if finding.level == level] for level in (ERROR, WARNING)},
+        'neighbors': evaluation.names,
+        'frames': evaluation.images,
+        **sight_figures(tables, params.max_velocity_std),
+        'own_speed_max_m_s': most(speed),
+        'faster_than_v_max_share': mean(ticks[:, 3] > params.v_max),
+        'detections': {stage: int(np.count_nonzero(stages == STAGES.index(stage)))
+                       for stage in (*STAGES[1:], STAGES[0])},
+        'rejections': dict(sorted(evaluation.rejections.items())),
+        'planner': {
+            'ticks': len(ticks), 'commands': len(acceleration),
+            'acceleration_max_m_s2': most(acceleration),
+            'states': {state: int(np.count_nonzero(ticks[:, 1] == i))
+                       for i, state in enumerate(STATES)},
+            **held['planner']},
+        'holds': held['holds'],
+        'setpoints': {
+            **{kind: evaluation.setpoint_kinds[kind]
+               for kind in ('command', 'brake', 'level', 'none')},
+            'acceleration_max_m_s2': most(np.linalg.norm(evaluation.setpoints[:, 1:4], axis=1)),
+            'reasons': dict(sorted(evaluation.brake_reasons.items()))},
+        'cpu_ms_per_frame': mean(spent),
+        'realtime_factor': evaluation.duration / evaluation.wall_time,
+        'timings': {
+            'wall_time_s': evaluation.wall_time,
+            'cpu_ms': {what: _percentiles(cpu.get(what, np.empty(0)))
+                       for what in ('decode', *STAGES, 'planner', 'gate')}}})
+
+
+def without_timings(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a summary without its timings: the part that two runs have in common."""
+    return {key: value for key, value in summary.items() if key not in TIMINGS}
+
+
+def flight_figures(flight: FlightRecord,
+                   exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+    """
+    Return the figures that ``demo`` and ``fly`` have in common, NaN if they are unknown.
+
+    ``true_distance_m`` is that of ``flight.distance``. ``setpoints`` are those on the wire,
+    ``speed_max_m_s`` is the vehicle's, ``latency_ms`` from an image's stamp to MAVLink, as the
+    bridge counts it. ``holds`` are those of the planner, each with its reason.
+    ``failed_processes`` counts those that did not end with 0 in time.
+    """
+    held = hold_figures(flight.states, flight.values('planner', 'reason'), flight.duration)
+    after = flight.duration + 1.0  # every node publishes its counters once per second
+    return {
+        'duration_s': flight.duration,
+        'frames': len(flight.table['time']),
+        **sight_figures([flight.table], flight.params.max_velocity_std),
+        'true_distance_m': spread(flight.distance),
+        'planner': {'missed_ticks': flight.value('planner', 'missed_ticks', after)
+                    - flight.value('planner', 'missed_ticks', 0.0, 0.0),
+                    **held['planner']},
+        'holds': held['holds'],
+        'setpoints': {
+            'sent': len(flight.setpoints),
+            'rate_hz': rate(flight.setpoint_times),
+            'acceleration_max_m_s2': most(np.linalg.norm(flight.setpoints, axis=1))},
+        'speed_max_m_s': most(np.linalg.norm(flight.velocities, axis=1)),
+        'latency_ms': {f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
+                       for p in (50, 95, 99)},
+        'failed_processes': sum(code != 0 for code in exit_codes.values())}
+
+
+def replay_figures(flight: FlightRecord,
+                   exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+    """
+    Return the summary of ``demo``.
+
+    Beside :func:`flight_figures`: ``processed_share`` is the share of the bag's images that
+    perception processed in time; ``recall_of_processed`` is that of these.
+    """
+    common = flight_figures(flight, exit_codes)
+    processed = flight.value('relative_pose', 'images_processed', math.inf) / common['frames']
+    return jsonable({
+        **common,
+        'processed_share': processed,
+        'recall_of_processed': (common['recall'] or 0.0) / processed if processed else 0.0,
+        'planner': {'rate_hz': rate(flight.command_times), **common['planner']}})
+
+
+def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
+                     exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+    """
+    Return the summary of ``fly``.
+
+    Beside :func:`flight_figures`: ``time_in_band_share`` is of all times,
+    ``longest_gap_in_view_s`` the longest time without an estimate in which all images showed the
+    leader; ``planner.warnings`` counts the times it published any, and ``warning`` is the first.
+    ``outages``: the times until the planner held, and followed again. ``altitude_off_m`` is the
+    greatest distance from the leader's height, see :func:`_altitude_off`. ``problems`` counts the
+    problems that each node reported, in seconds. ``external``: of an external autopilot, the
+    source of the vehicle's pose, and the rate of its clock by ours; the source of the leader's
+    pose, if another one flew that, too; and the reason why the bridge ended the flight early, if
+    it did.
+
+    :param cores: used by each process, empty if unknown.
+    """
+    params, table, log = flight.scenario.flight, flight.table, flight.log
+    common = flight_figures(flight, exit_codes)
+    warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
+    return jsonable({
+        'scenario': flight.scenario.name,
+        **common,
+        'time_in_band_share': flight.time_in_band_share,
+        'longest_gap_in_view_s': _longest(
+            table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
+        'leader_speed_max_m_s': most(flight.leader_speed),
+        'leader_faster_than_v_max': _longest(
+            table['time'], flight.leader_speed > 1.001 * params.v_max) >= OUTRUN,
+        'altitude_off_m': most(_altitude_off(flight)),
+        'planner': {
+            **common['planner'],
+            'missed_ticks_share': common['planner']['missed_ticks'] * flight.params.period
+            / flight.duration,
+            'warnings': len(warnings),
+            'warning': warnings[0] if warnings else None},
+        'outages': {outage_name(outage): _outage(flight, outage)
+                    for outage in judged_outages(flight)},
+        'problems': _problems(flight),
+        'external': ({'pose_from': str(log['pose_source']),
+                      'leader_from': str(log['pose_source_of_leader']) or None,
+                      'pace': flight.pace,
+                      'ended_early': str(log['ended_early']) or None}
+                     if flight.external else None),
+        'skipped_images': int(log['skipped_images']),
+        'cpu_cores': {'total': sum(cores.values()) if cores else None,
+                      **dict(sorted(cores.items(), key=lambda item: -item[1]))}})
+
+
+def _altitude_off(flight: LiveRecord) -> Array:
+    """
+    Return the distance of the follower's height from the leader's, m, at the images that count.
+
+    Those count whose leader has been in view for ``LEVEL_WITHIN``: the follower cannot know the
+    height of a leader that it does not see. One of the scenario begins at the follower's height,
+    so all images from the beginning count; one flown by an autopilot begins at any height.
+    """
+    times, hidden = flight.table['time'], flight.table['visible'] == 0.0
+    begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf
+    last_hidden = np.maximum.accumulate(np.where(hidden, times, begin))
+    off: Array = np.abs(flight.leader[:, 2] - flight.follower[:, 2])
+    return off[times - last_hidden >= LEVEL_WITHIN]
+
+
+def hold_within(outage: Outage) -> float:
+    """Return the time after which the planner must hold in an outage, s."""
+    return BRAKE_WITHIN if outage.what == 'vio' else HOLD_WITHIN
+
+
+def outage_name(outage: Outage) -> str:
+    """Return the key of an outage."""
+    return f'{outage.what}_at_{outage.at:g}_s'
+
+
+def judged_outages(flight: LiveRecord) -> list[Outage]:
+    """Return the outages long enough, and flown far enough, to demand HOLD."""
+    return [outage for outage in flight.scenario.outages if outage.duration >= hold_within(outage)
+            and flight.duration >= outage.at + hold_within(outage)]
+
+
+def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
+    """Return when the planner held after an outage began, and followed again after its end."""
+    end = outage.at + outage.duration
+    held = next((t for t, s in flight.states if s == 'HOLD' and t >= outage.at), math.nan)
+    again = next((t for t, s in flight.states if s == 'TRACK' and t >= max(held, end)), math.nan)
+    reasons = [r for t, r in flight.values('planner', 'reason') if outage.at < t < end and r]
+    return {'hold_after_s': held - outage.at, 'track_after_s': again - end,
+            'reasons': len(reasons), 'reason': reasons[-1] if reasons else None}
+
+
+def _problems(flight: LiveRecord) -> dict[str, int]:
+    """Return how often each node reported which problem in the scenario, without its numbers."""
+    reported = Counter(
+        f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
+        for t, array in flight.diagnostics if 0.0 < t <= flight.duration
+        for status in array.status if status.level not in OK)
+    return dict(reported.most_common())
+
+
+def _longest(times: Array, holds: Any) -> float:
+    """Return the longest time, s, at whose images (n,) something holds, from the one before."""
+    longest, since = 0.0, math.inf
+    for time, held in zip(times.tolist(), holds.tolist()):
+        since = min(since, time) if held else time
+        longest = max(longest, time - since)
+    return longest
+
+
+def spacing(scenario: Scenario) -> float:
+    """Return the distance between two vehicles of a column at its start, m: the mean one."""
+    return float(np.mean(scenario.start.distance))
+
+
+def column_tracks(scenario: Scenario, flights: Mapping[str, LiveRecord]
+                  ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """
+    Return the motion of a column while all of it flew the scenario, in the first one's frame.
+
+    :returns: times (n,), s; positions (n, 3), m, by vehicle; distances (n,), m, by pair.
+    """
+    logs = {name: flight.log for name, flight in flights.items()}
+    began = max(float(log['began']) for log in logs.values())
+    times = np.arange(began, min(float(log['ended']) for log in logs.values()), STEP)
+    first = next(iter(logs.values()))
+    tracks = {'leader': _at(times, float(first['start']) + (
+        first['image_stamp'] - int(first['epoch_ns'])) * 1e-9, first['leader_position'])}
+    for i, (name, log) in enumerate(logs.items()):
+        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + _at(
+            times, flights[name].velocity_times + float(log['began']), log['position'])
+    return times - began, tracks, {
+        f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
+        for a, b in combinations(tracks, 2)}
+
+
+def _at(times: Array, known: Array, positions: Array) -> Array:
+    """Return positions (n, 3) at times (n,); NaN if they are unknown."""
+    return np.stack([np.interp(times, known, column, np.nan, np.nan)
+                     for column in positions.T], axis=1)
+
+
+def column_figures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> dict[str, Any]:
+    """
+    Return the figures of a column as a whole.
+
+    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
+    """
+    _, _, distances = column_tracks(scenario, flights)
+    pairs = {pair: float(np.nanmin(distance)) for pair, distance in distances.items()}
+    return jsonable({
+        'column_of': scenario.name, 'followers': len(flights),
+        'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
+        'speed_max_m_s': most(np.concatenate(
+            [np.linalg.norm(flight.velocities, axis=1) for flight in flights.values()]))})
 
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
@@ -160,3 +439,10 @@ def _finite(values: Array) -> Array:
 
 def _by_axis(errors: Array) -> dict[str, float | None]:
     return {axis: mean(errors[:, i]) for i, axis in enumerate('xyz')}
+
+
+def _percentiles(values: Array) -> dict[str, float | int | None]:
+    if not len(values):
+        return {'p50': None, 'p99': None, 'count': 0}
+    p50, p99 = np.percentile(values, [50, 99])
+    return {'p50': float(p50), 'p99': float(p99), 'count': len(values)}

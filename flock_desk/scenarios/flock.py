@@ -35,7 +35,7 @@ _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from
 
 @dataclass(frozen=True)
 class FollowerFailure(Part):
-    """One follower's computer fails: it says and commands nothing, hovers, and then is gone."""
+    """One follower's computer fails: it sends nothing, hovers, and then is gone."""
 
     follower: int = parameter(MISSING, Range(1, whole=True), 'Its number, from 1 on.')
     at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')
@@ -64,13 +64,13 @@ class Flock(Part):
     farthest: float = parameter(
         5.0, Range(0.5, 100.0, 'm'), 'Distance up to which a marker is found, m.')
     words: bool = parameter(
-        False, None, 'Whether they tell each other where they are and whom they see.')
+        False, None, 'Whether they send each other their states and detections.')
     ranges: bool = parameter(
         False, None,
         "Whether they measure the distances to each other by radio, with the errors of 'ranges'.")
     delay: float = parameter(
-        0.05, Range(0.0, 2.0, 's'), "From a word's sending to its arrival, s.")
-    loss: float = parameter(0.0, Range(0.0, 1.0), 'Share of words that do not arrive.')
+        0.05, Range(0.0, 2.0, 's'), "From a message's sending to its arrival, s.")
+    loss: float = parameter(0.0, Range(0.0, 1.0), 'Share of messages that do not arrive.')
     fails: FollowerFailure | None = None
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class Place(NamedTuple):
     offset: Array
     """(3,), from the leader, which faces along x, m."""
     ahead: int
-    """Number of whom it faces and has next to it; 0 is the leader."""
+    """Number of the vehicle that it faces, its neighbour; 0 is the leader."""
 
 
 def places(flock: Flock) -> list[Place]:

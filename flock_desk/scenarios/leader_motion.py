@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How the leader of a scenario flies: what a scenario file says of it."""
+"""The motion of the leader, as a scenario file describes it."""
 
 from __future__ import annotations
 

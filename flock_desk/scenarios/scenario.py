@@ -36,10 +36,10 @@ from flock_follower.ranges import parameter, Range
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
 SEEDS = Range(0, 2**31 - 1, whole=True)
-#: For which a scenario is flown; 0: as long as it says.
+#: For which a scenario is flown; 0: its own duration.
 DURATIONS = Range(0.0, 3600.0, 's')
 OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
-ENGAGED = 1.0  # s: when the planner is engaged where no operation says so
+ENGAGED = 1.0  # s: when the planner is engaged, unless an operation does it
 _ALONE = Flock(followers=1)
 
 
@@ -118,7 +118,7 @@ class VioErrors(Part):
         'Hz; simulated flights have at most 100 with the nodes, 60 in lock step.')
     latency: Interval = parameter(
         (0.0, 0.0), Range(0.0, 0.5, 's'),
-        'From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one.')
+        'From a sample to its use, s, in whole steps of a simulation; each run draws one.')
     position_walk: float = parameter(
         0.02, Range(0.0, 10.0, 'm'),
         'Drift of each horizontal coordinate, m after 1 s, growing with the root of time.')
@@ -164,7 +164,7 @@ class RangeErrors(Part):
         1.0, Range(0.0, 100.0, 'm'), '... which adds at most so much, m; each draws one.')
     latency: Interval = parameter(
         (0.01, 0.03), Range(0.0, 0.5, 's'),
-        'From a measurement to whoever uses it, s; each run draws one.')
+        'From a measurement to its use, s; each run draws one.')
 
 
 @dataclass(frozen=True)

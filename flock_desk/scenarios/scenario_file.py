@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Scenarios as YAML files; whatever is wrong in one is told with file, line and what is allowed.
+Scenarios as YAML files; an error names file, line, key and the valid values.
 
 A file holds the fields of :class:`flock_desk.scenarios.scenario.Scenario`; its
-name is the scenario's. What a file does not say keeps its default::
+name is the scenario's. A missing key keeps its default::
 
     summary: the leader flies away at 0.4 m/s
     flight: {v_max: 0.5}
@@ -38,8 +38,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 
+from flock_desk.scenarios.courses import course
 from flock_desk.scenarios.flock import Flock
-from flock_desk.scenarios.leader import course
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.resources import resource
 
@@ -58,7 +58,7 @@ def names() -> list[str]:
 
 def load(name: str) -> Scenario:
     """
-    Return a scenario of the package by its name, or one of one's own by the path of its file.
+    Return a scenario of the package by its name, or another one by the path of its file.
 
     :raises ScenarioError: where there is none, or its file is wrong.
     """
@@ -141,7 +141,7 @@ class _ScenarioReader:
 
     def dataclass(self, kind: Any, node: Any, where: str, before: Any = None,
                   **given: Any) -> Any:
-        """Return one of a kind; what the node does not say is as ``before``, or the default."""
+        """Return one of a kind; a missing key is as in ``before``, or the default."""
         if not isinstance(node, yaml.MappingNode):
             raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
                                     f'{", ".join(self._keys(kind, given))}')

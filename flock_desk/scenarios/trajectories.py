@@ -75,11 +75,6 @@ class Track:
     rates: Array
     """(N, 3), angular velocity in base_link, rad/s."""
 
-    @property
-    def times(self) -> Array:
-        """Return the time (N,) of every sample, s."""
-        return _times(len(self.positions))
-
     def pose(self, time: float) -> Transform:
         """Return base_link in odom at a time within the track, s: cubic Hermite and slerp."""
         i, f = self._locate(time)

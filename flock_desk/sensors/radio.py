@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Words on their way from each follower of simulated flocks to the others: late, some lost."""
+"""Radios of simulated flocks: messages that come late or not at all, and measured distances."""
 
 from __future__ import annotations
 
@@ -22,16 +22,19 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from flock_desk.scenarios.scenario import RangeErrors
+from flock_follower.geometry import Array
+
 Word = TypeVar('Word')
 
 
 class Radio(Generic[Word]):
     """
-    What followers tell each other, in flocks of m that do not hear one another.
+    Messages within flocks of m; no flock receives those of another.
 
     :param company: m.
     :param delay: from sending to arrival, s.
-    :param loss: share of what is sent that does not arrive at one of those who listen.
+    :param loss: share of messages that do not arrive at one of the receivers.
     :param generators: of chance, one for each follower, flock by flock.
     """
 
@@ -42,7 +45,7 @@ class Radio(Generic[Word]):
         self._coming: deque[tuple[float, int, Word]] = deque()
 
     def send(self, now: float, teller: int, words: Sequence[Word]) -> None:
-        """Take words that a follower, counted through all flocks, tells at a time, s."""
+        """Take messages that a follower, counted through all flocks, sends at a time, s."""
         first = teller - teller % self._company
         draws = self._generators[teller].random((len(words), self._company))
         for word, luck in zip(words, draws.tolist()):
@@ -51,9 +54,33 @@ class Radio(Generic[Word]):
                 if first + k != teller and p >= self._loss]
 
     def arrived(self, now: float) -> list[tuple[int, Word]]:
-        """Return the words that have arrived since the last call, and who hears each."""
+        """Return the messages that have arrived since the last call, each with its receiver."""
         heard = []
         while self._coming and self._coming[0][0] <= now + 1e-9:
             _, hearer, word = self._coming.popleft()
             heard.append((hearer, word))
         return heard
+
+
+class Radios:
+    """
+    Measure distances with the errors of a scenario.
+
+    :param generators: of the random numbers, one for each row.
+    """
+
+    def __init__(self, errors: RangeErrors, generators: Sequence[np.random.Generator]) -> None:
+        self._errors, self._generators = errors, generators
+        self._bias = errors.bias * np.array([g.standard_normal() for g in generators])
+        self._walk = errors.bias_walk * errors.rate ** -0.5
+
+    def measure(self, distance: Array) -> Array:
+        """Return what is measured of true distances (n,), m, one period after the last."""
+        errors = self._errors
+        drawn = np.stack([g.standard_normal(2) for g in self._generators])
+        chance = np.stack([g.random(2) for g in self._generators])
+        self._bias = self._bias + self._walk * drawn[:, 0]
+        detour = np.where(chance[:, 0] < errors.outliers, errors.outlier * chance[:, 1], 0.0)
+        measured: Array = np.maximum(
+            distance + self._bias + errors.noise * drawn[:, 1] + detour, 0.0)
+        return measured

@@ -92,7 +92,7 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
 def facing(offsets: Array, rotations: Array, angle: float,
            faces: Sequence[str] = ('back',)) -> Any:
     """
-    Return which vehicles (n, 3, 3) show a marker to whoever looks, not too oblique (n,).
+    Return which vehicles (n, 3, 3) show a marker to the observer, not too oblique (n,).
 
     :param offsets: of the vehicles from there (n, 3), m.
     :param angle: from a marker's normal up to which it is found, rad.
@@ -107,7 +107,7 @@ def hidden(offsets: Array, present: Any, radius: float) -> Any:
     """
     Return behind which of m vehicles (..., m) another one stands in the way.
 
-    :param offsets: of all of them from whoever looks (..., m, 3), m.
+    :param offsets: of all of them from the observer (..., m, 3), m.
     :param present: which are there (..., m).
     :param radius: of a vehicle, m.
     """

@@ -115,7 +115,7 @@ class Vio:
 
 class VioEstimator:
     """
-    The odometry of one vehicle: what :class:`Vio` says, attitude, and covariances of it all.
+    The odometry of one vehicle: :class:`Vio`, attitude, and the covariances of both.
 
     :param start: the true motion at the start.
     :param period: between steps, s.
@@ -201,7 +201,7 @@ class GaussMarkov:
 
 
 class Due:
-    """Tells which of a simulation's steps give a sample, at most ``rate``, Hz, of them."""
+    """Selects the steps of a simulation that give a sample, at most ``rate``, Hz, of them."""
 
     def __init__(self, rate: float) -> None:
         self._period, self.next = 1.0 / rate, 0.0

@@ -43,7 +43,6 @@ class AutopilotParameters:
         self._types = {name: kind for name, (kind, _) in profile.parameters.items()}
         self._values = {name: float(value) for name, (_, value) in profile.parameters.items()}
         self._bytewise = profile.px4
-        self._listed: list[str] = []
 
     def __getitem__(self, name: str) -> float:
         """Return a value by its name."""
@@ -64,30 +63,21 @@ class AutopilotParameters:
         self._values[name] = float(value)
 
     def handle(self, message: Any) -> list[Any]:
-        """Answer PARAM_REQUEST_READ, PARAM_REQUEST_LIST and PARAM_SET; unknown names silently."""
-        kind, names = message.get_type(), list(self._values)
-        if kind == 'PARAM_REQUEST_LIST':
-            self._listed = names
-            return []
-        if kind == 'PARAM_REQUEST_READ' and message.param_index >= 0:
-            return [self._message(name) for name in names[message.param_index:][:1]]
+        """Answer PARAM_REQUEST_READ by name and PARAM_SET; unknown names silently."""
         name = str(message.param_id)
-        if name not in names:
+        if name not in self._values:
             return []
-        if kind == 'PARAM_SET':
+        if message.get_type() == 'PARAM_SET':
             with contextlib.suppress(ValueError):  # the answer tells the old value then
                 self.set(name, self._recode(message.param_value, name, '<f', '<i'))
         # ArduPilot does not look up the index of a parameter asked for by its name.
-        return [self._message(name, None if self._bytewise else _UNKNOWN_INDEX)]
+        return [self._message(name)]
 
-    def step(self) -> list[Any]:
-        """Return what is due of a list: one at a time, as a real one paces it."""
-        return [self._message(self._listed.pop(0))] if self._listed else []
-
-    def _message(self, name: str, index: int | None = None) -> Any:
+    def _message(self, name: str) -> Any:
         return mavlink.MAVLink_param_value_message(
             name.encode(), self._recode(self._values[name], name, '<i', '<f'), self._types[name],
-            len(self._values), list(self._values).index(name) if index is None else index)
+            len(self._values),
+            list(self._values).index(name) if self._bytewise else _UNKNOWN_INDEX)
 
     def _recode(self, value: float, name: str, old: str, new: str) -> float:
         """Return the value whose bytes in one layout are those of another in the other."""

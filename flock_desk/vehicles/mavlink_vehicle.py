@@ -82,7 +82,7 @@ class MavlinkVehicle:
             age = 0.0 if self._clock_offset is None else (
                 now - self._start - message.time_usec * 1e-6 - self._clock_offset)
             self.controller.estimator.on_odometry(message, now, age)
-        elif kind in ('PARAM_REQUEST_READ', 'PARAM_REQUEST_LIST', 'PARAM_SET'):
+        elif kind in ('PARAM_REQUEST_READ', 'PARAM_SET'):
             return self.controller.parameters.handle(message)
         elif kind == 'TIMESYNC':
             return self._answer_timesync(message, now)
@@ -107,7 +107,7 @@ class MavlinkVehicle:
     def step(self, now: float) -> list[Any]:
         """Fly on to ``now`` and return the messages that are due."""
         self.controller.step(now)
-        messages = [*self._said(), *self.controller.parameters.step()]
+        messages = self._said()
         self._note_mode(now)
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:

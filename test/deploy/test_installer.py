@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-import shutil
 import subprocess
 
 import pytest
@@ -78,14 +77,6 @@ def test_a_dry_run_prints_the_same_and_writes_nothing(tmp_path: Path) -> None:
     assert install(tmp_path, '--undo').stdout == planned
 
 
-def test_to_install_again_changes_nothing(tmp_path: Path) -> None:
-    install(tmp_path)
-    before = files(tmp_path)
-    again = install(tmp_path)
-    assert 'write' not in again.stdout and again.returncode == 0
-    assert files(tmp_path) == before
-
-
 def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: Path) -> None:
     install(tmp_path)
     (tmp_path / SETTINGS).write_text('WORKSPACE=/mine\n')
@@ -93,14 +84,6 @@ def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: 
         assert f'yours, unchanged: {tmp_path / SETTINGS}' in install(
             tmp_path, *arguments).stdout
     assert files(tmp_path) == {SETTINGS: 'WORKSPACE=/mine\n'}
-
-
-def test_another_version_of_a_file_of_ours_is_brought_up_to_date(tmp_path: Path) -> None:
-    install(tmp_path)
-    program = tmp_path / 'usr/local/lib/flock_follower/start'
-    program.write_text('of last year\n')
-    assert f'write {program}\n' in install(tmp_path).stdout
-    assert program.read_text() == (DEPLOY / 'start').read_text()
 
 
 def test_each_vehicle_has_settings_of_its_own(tmp_path: Path) -> None:
@@ -120,12 +103,3 @@ def test_what_cannot_be_is_refused_before_anything_is_written(
     ended = install(tmp_path, *arguments)
     assert ended.returncode == 2 and told in ended.stderr
     assert files(tmp_path) == {}
-
-
-def test_the_workspace_is_found_above_the_installed_package(tmp_path: Path) -> None:
-    deploy = tmp_path / 'ws/install/flock_follower/share/flock_follower/deploy'
-    shutil.copytree(DEPLOY, deploy)
-    (tmp_path / 'ws/install/setup.bash').touch()
-    ended = subprocess.run(['bash', str(deploy / 'install.sh'), '--user', 'pilot', '--root',
-                            str(tmp_path / 'root')], text=True, capture_output=True, timeout=20.0)
-    assert f'workspace {tmp_path}/ws:' in ended.stdout, ended.stderr

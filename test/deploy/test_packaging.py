@@ -21,11 +21,9 @@ from importlib import import_module
 from pathlib import Path
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 from typing import Any
-from zipfile import ZipFile
 
 import pytest
 
@@ -36,9 +34,8 @@ ROOT = Path(__file__).resolve().parents[2]
 ON_PYPI = {'rclpy': 'ros-jazzy-rclpy', 'python3-opencv': 'opencv-python-headless',
            'python3-numpy': 'numpy', 'python3-yaml': 'pyyaml', 'python3-matplotlib': 'matplotlib',
            'python3-pymavlink-pip': 'pymavlink', 'python3-rosbags-pip': 'rosbags'}
-#: How those import and install who build for ROS, and what pip calls.
-BUILDS = {'install': True, 'develop': True, 'bdist_wheel': False, 'editable_wheel': False,
-          'dist_info': False, 'egg_info': False, 'sdist': False}
+#: Commands of builds for ROS, and of pip.
+BUILDS = {'install': True, 'develop': True, 'bdist_wheel': False, 'editable_wheel': False}
 
 
 def setup(monkeypatch: pytest.MonkeyPatch, command: str) -> dict[str, Any]:
@@ -104,37 +101,6 @@ def test_what_package_xml_asks_for_is_in_the_extra_and_not_required(
     locked = (ROOT / 'requirements' / 'requirements.in').read_text().splitlines()
     for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'):
         assert extra[name] in locked
-
-
-@pytest.mark.ros
-def test_programs_land_where_they_belong(tmp_path: Path) -> None:
-    source = tmp_path / 'source'
-    source.mkdir()
-    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
-        shutil.copy(ROOT / name, source)
-    for name in ('resource', 'flock_follower', 'config', 'launch', 'deploy', 'bags'):
-        shutil.copytree(ROOT / name, source / name,
-                        ignore=shutil.ignore_patterns('__pycache__'))
-
-    def run(*arguments: str) -> None:
-        ended = subprocess.run([sys.executable, *arguments], cwd=source, text=True,
-                               capture_output=True, timeout=60.0)
-        assert ended.returncode == 0, ended.stderr
-    # As pip does it.
-    run('-c', f'from setuptools import build_meta as b; b.build_wheel({str(tmp_path)!r})')
-    (wheel,) = tmp_path.glob('*.whl')
-    with ZipFile(wheel) as archive:
-        (entries,) = [name for name in archive.namelist() if name.endswith('entry_points.txt')]
-        assert archive.read(entries).decode().split('\n', 1)[1].strip() == (
-            'flock_follower = flock_desk.program:main')
-        shared = [name for name in archive.namelist() if 'share/flock_follower/deploy/' in name]
-    assert len(shared) == len(list((ROOT / 'deploy').iterdir()))
-    # As colcon does it, in the same folder.
-    run('setup.py', 'egg_info', 'build', 'install', '--prefix', str(tmp_path / 'prefix'),
-        '--record', str(tmp_path / 'record'), '--single-version-externally-managed')
-    made = {path.name for path in (tmp_path / 'prefix/lib/flock_follower').iterdir()}
-    assert {'planner', 'replay', 'figures'} <= made and 'flock_follower' not in made
-    assert not (tmp_path / 'prefix' / 'bin').exists()
 
 
 @pytest.mark.ros

@@ -14,12 +14,9 @@
 
 """ArduCopter's BRAKE mode: it stops the vehicle quickly and holds its position."""
 
-from embedded_flight import Flight, odometry, setpoint
+from embedded_flight import BLIND, Flight, odometry, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
-
-BLIND = {'VISO_TYPE': 1, 'GPS1_TYPE': 0, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6,
-         'EK3_SRC1_VELZ': 6, 'EK3_SRC1_YAW': 6}
 
 
 def test_brake_stops_quickly_and_holds_the_position():
@@ -40,7 +37,7 @@ def test_brake_stops_quickly_and_holds_the_position():
 
 
 def test_brake_is_refused_without_a_position():
-    flight = Flight('arducopter', parameters=BLIND)
+    flight = Flight('arducopter', parameters=BLIND['arducopter'])
     still = odometry((0.0, 0.0, 2.0))
     flight.fly(1.5, still, rate=30.0)
     flight.fly(7.5)

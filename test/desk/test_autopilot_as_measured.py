@@ -15,7 +15,7 @@
 """What the embedded autopilots learnt from the real ones, see docs/autopilots.md."""
 
 from captured import decoded
-from embedded_flight import Flight, odometry, setpoint
+from embedded_flight import BLIND, Flight, seen, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -24,20 +24,12 @@ from flock_desk import autopilot
 from flock_follower.mavlink.status_texts import ArmingChecks
 
 pytestmark = pytest.mark.slow
-NO_GPS = {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3}
 ORIGIN = mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488000)
-
-
-def seen(flight):
-    """Return a function for ODOMETRY of the flight's truth."""
-    return lambda: odometry(flight.vehicle.position,
-                            flight.vehicle.rotation.T @ flight.vehicle.velocity,
-                            yaw=flight.vehicle.yaw)
 
 
 def aloft():
     """Return a PX4 without GPS and origin that has just taken off."""
-    flight = Flight(start='landed', parameters=NO_GPS)
+    flight = Flight(start='landed', parameters=BLIND['px4'])
     flight.fly(1.0, seen(flight))
     assert flight.arm() == [1]  # in Hold, which it cannot fly
     assert flight.take_off(np.nan) == [0] and flight.arm() == [0]

@@ -33,7 +33,7 @@ from flock_desk.scenarios.scenario import (
     Sensing,
 )
 from flock_desk.scenarios.scenario_file import load
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 
 
 def generators(count: int) -> list[np.random.Generator]:

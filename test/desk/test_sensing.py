@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flock_desk.scenarios.courses import wind_course
 from flock_desk.scenarios.scenario import Wind
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.sensing import (
     facing,
     in_view,

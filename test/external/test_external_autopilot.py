@@ -24,10 +24,10 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.autopilot import Endpoint
-from flock_desk.external import external_autopilot, vehicles_elsewhere
+from flock_desk.external import external_autopilot, external_vehicles
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.told_motion import LONGEST_GAP
-from flock_desk.external.vehicles_elsewhere import FORWARDED, LATE, VehiclesElsewhere
+from flock_desk.external.external_motion import LONGEST_GAP
+from flock_desk.external.external_vehicles import ExternalVehicles, FORWARDED, LATE
 from flock_desk.runs.processes import free_udp_port
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 
@@ -75,7 +75,7 @@ class Told:
 @pytest.fixture
 def two(monkeypatch):
     monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.3)
-    monkeypatch.setattr(vehicles_elsewhere, 'POSE_TIMEOUT', 1.0)
+    monkeypatch.setattr(external_vehicles, 'POSE_TIMEOUT', 1.0)
     both = [Told(), Told(2, 'leader_truth_connection')]
     yield both
     for told in both:
@@ -141,7 +141,7 @@ def test_a_url_that_is_none_is_refused(url, said):
 
 def test_both_count_from_where_the_follower_was_first_heard_of(two):
     follower, leader = two
-    vehicles = VehiclesElsewhere(follower.link, leader.link)
+    vehicles = ExternalVehicles(follower.link, leader.link)
     deadline = time.monotonic() + DEADLINE
     while not leader.link._arrived:  # the leader tells first
         assert leader.say(pose(1.5, 2.0)) and time.monotonic() < deadline
@@ -158,7 +158,7 @@ def test_both_count_from_where_the_follower_was_first_heard_of(two):
     (1, True, '^leader_truth_connection = .*its own estimate will not do'),
     (1, False, '^leader_truth_connection = .*no pose of a vehicle within 1 s: nothing arrives$')])
 def test_of_two_vehicles_both_have_to_tell_the_truth(silent, heard, told, two):
-    vehicles = VehiclesElsewhere(two[0].link, two[1].link)
+    vehicles = ExternalVehicles(two[0].link, two[1].link)
 
     def speak():
         return (two[silent].say() if heard else True) and two[1 - silent].say(pose())
@@ -168,7 +168,7 @@ def test_of_two_vehicles_both_have_to_tell_the_truth(silent, heard, told, two):
 
 def test_whose_poses_stall_is_told_and_what_is_missing(two):
     follower, leader = two
-    vehicles = VehiclesElsewhere(follower.link, leader.link)
+    vehicles = ExternalVehicles(follower.link, leader.link)
     vehicles.find(False, lambda: follower.say(pose()) and leader.say(pose(1.5)))
     newest = [told.link.motion.newest for told in two]
     assert vehicles.stalled(max(newest) * 1e-9, 0) == ''  # though one pose is all that there is

@@ -26,8 +26,7 @@ import pytest
 
 from flock_desk.flocks import graph as flock_graph
 from flock_desk.flocks.agents import simulate
-from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph
-from flock_desk.flocks.neighbor_search import nearest
+from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph, nearest
 from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,

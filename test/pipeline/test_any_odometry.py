@@ -25,7 +25,7 @@ import pytest
 from rewritten_odometry import rewritten_bag, Source, sources
 
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
-from flock_desk.runs.evaluation_summary import summarize
+from flock_desk.runs.summary import evaluation_figures
 from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.planner.modes import State
 from flock_follower.resources import resource
@@ -64,7 +64,7 @@ def evaluated(case: Case, folder: Path) -> tuple[Evaluation, dict[str, Any]]:
     for node in values:
         values[node].update({name: told[node][name] for name in case.source.parameters})
     evaluation = evaluate(bag, values, folder / 'result.mcap')
-    return evaluation, summarize(evaluation)
+    return evaluation, evaluation_figures(evaluation)
 
 
 def worst_second(evaluation: Evaluation) -> float:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`make demo`: what is read from the records of a flight, and the bounds on it."""
+"""`make demo`: the figures of a recorded flight, and the bounds on them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ import numpy as np
 import pytest
 
 from flock_desk.demo import BOUNDS, PARAMS
-from flock_desk.runs.demo_record import chapters, read, ReplayedFlight, summarize
 from flock_desk.runs.evaluation import evaluate
-from flock_desk.runs.evaluation_summary import summarize as summarize_evaluation
 from flock_desk.runs.judge import judge
+from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
+from flock_desk.runs.record import FlightRecord, read_replayed
+from flock_desk.runs.summary import evaluation_figures, replay_figures
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.writer import BagWriter
@@ -47,12 +48,12 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
     """Return what the nodes would publish of the sample bag, and its summary."""
     path = tmp_path_factory.mktemp('out') / 'result.mcap'
     values = read_parameters(resource('config/follower.yaml'), TABLE)
-    return path, summarize_evaluation(evaluate(BAG, values, path))
+    return path, evaluation_figures(evaluate(BAG, values, path))
 
 
 @pytest.fixture(scope='module')
 def flight(evaluated: tuple[Path, dict[str, Any]],
-           tmp_path_factory: pytest.TempPathFactory) -> ReplayedFlight:
+           tmp_path_factory: pytest.TempPathFactory) -> FlightRecord:
     """Return the flight of a record made of that: nothing late, nothing lost."""
     out = tmp_path_factory.mktemp('record')
     with open_bag(evaluated[0]) as result, BagWriter(out / 'record') as record:
@@ -65,7 +66,7 @@ def flight(evaluated: tuple[Path, dict[str, Any]],
     along = np.tile([1.0, 0.0, 0.0], (240, 1))
     np.savez(out / 'autopilot.npz', state_time=times, position=0 * along, velocity=0.5 * along,
              setpoint_time=times, setpoint_acceleration=0.3 * along)
-    return read(BAG, out / 'record', out / 'autopilot.npz', PARAMS)
+    return read_replayed(BAG, out, PARAMS)
 
 
 def diagnostics() -> Any:
@@ -79,8 +80,8 @@ def diagnostics() -> Any:
 
 
 def test_its_figures_are_those_of_evaluate(
-        evaluated: tuple[Path, dict[str, Any]], flight: ReplayedFlight) -> None:
-    mine, theirs = summarize(flight, {}), evaluated[1]
+        evaluated: tuple[Path, dict[str, Any]], flight: FlightRecord) -> None:
+    mine, theirs = replay_figures(flight, {}), evaluated[1]
     for key in ('frames', 'frames_in_view', 'recall'):
         assert mine[key] == theirs[key]
     for key in ('distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
@@ -89,13 +90,13 @@ def test_its_figures_are_those_of_evaluate(
         assert mine[key] == pytest.approx(theirs[key], rel=1e-6, abs=1e-9), key
     assert mine['planner']['rate_hz'] == pytest.approx(10.0)
     assert mine['setpoints'] == pytest.approx(
-        {'sent': len(flight.recorded.setpoints), 'rate_hz': 20.0, 'acceleration_max_m_s2': 0.3})
+        {'sent': len(flight.setpoints), 'rate_hz': 20.0, 'acceleration_max_m_s2': 0.3})
 
 
-def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: ReplayedFlight) -> None:
-    summary = summarize(flight, {'planner': 0, 'replay': 0})
+def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: FlightRecord) -> None:
+    summary = replay_figures(flight, {'planner': 0, 'replay': 0})
     assert [j.fault for j in judge(BOUNDS, summary) if j.fault] == []
-    ended_badly = summarize(flight, {'planner': None, 'replay': 1})
+    ended_badly = replay_figures(flight, {'planner': None, 'replay': 1})
     assert [j.fault for j in judge(BOUNDS, ended_badly) if j.fault] == [
         'failed_processes = 2: must be at most 0']
     broken = {key: dict.fromkeys(value, 1000.0) if isinstance(value, dict) else 1e3
@@ -105,8 +106,7 @@ def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: Replayed
     assert all(j.fault for j in judge(BOUNDS, {}))
 
 
-def test_the_picture_is_in_the_report_and_in_a_file(
-        flight: ReplayedFlight, tmp_path: Path) -> None:
-    flown, errors = chapters(flight, 'a title', tmp_path / 'report.png')
-    assert (tmp_path / 'report.png').read_bytes()[:4] == b'\x89PNG'
+def test_the_report_shows_the_flight_and_its_errors(flight: FlightRecord) -> None:
+    flown, errors = chapters(PlottedFlight.of(flight))
     assert [len(chapter.illustrations) for chapter in (flown, errors)] == [1, 1]
+    assert flight_picture(PlottedFlight.of(flight), 'a title').startswith(b'\x89PNG')

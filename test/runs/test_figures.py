@@ -12,16 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command that redraws the paper's figures: its simulations."""
+
+"""The command that redraws the paper's figures: simulations, and flights that `fly` recorded."""
 
 from __future__ import annotations
 
 import csv
-import io
+import json
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axis import Axis
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.quiver import Quiver
@@ -30,19 +32,41 @@ import numpy as np
 import pytest
 
 from flock_desk import figures
-from flock_desk.runs.figure_style import styled, WIDTH
-from flock_desk.runs.progress import Progress
+from flock_desk.runs import paper_plots
+from flock_desk.runs.paper_plots import distance, positions, styled, WIDTH
+from flock_desk.runs.record import last_flight, LiveRecord, read_flown, scenario_flown, set_aside
+from flock_desk.scenarios.scenario_file import load
+from flock_follower.bags.bag import open_bag
+from flock_follower.bags.message_types import empty
+from flock_follower.bags.writer import BagWriter
+from flock_follower.geometry import Array
+from flock_follower.messages import ODOMETRY, odometry
 
 pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
          'leaderless_lyapunov', 'leader_trajectories', 'leader_speeds', 'leader_distances')
+SECONDS, RATE, START = 6, 20, 10**18  # of the images
+DRIFT = np.array([0.1, -0.2, 0.0])  # of odom, m
+NO_IMAGE, NO_ESTIMATE = (2.0, 2.8), (4.0, 4.4)  # from and to, s
+SEEN_FARTHER = 0.05  # m
 
 
 @pytest.fixture(scope='module')
-def redrawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp('redrawn')
-    assert figures.main(['--out', str(out / 'figures'), '--flights', str(out / 'none')]) == 0
-    return out / 'figures'
+def redrawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Figure]]:
+    """Return the folder of the simulations' figures, and the figures, with two larger flocks."""
+    out, kept = tmp_path_factory.mktemp('redrawn') / 'figures', {}
+    save = paper_plots.save
+
+    def keep(figure: Figure, path: Path) -> str:
+        kept[path.name] = figure
+        return save(figure, path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_plots, 'save', keep)
+        assert figures.main(['--out', str(out), '--flights', str(out / 'none')]) == 0
+        for dim in '23':
+            assert figures.main(['--out', str(out / 'flocks'), '--agents', '9', '--dim', dim,
+                                 '--duration', '1']) == 0
+    return out, kept
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -50,19 +74,51 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_every_figure_is_written_in_every_kind(redrawn: Path) -> None:
-    assert {p.name for p in redrawn.iterdir()} == {
+def assert_legible(figure: Figure, name: str) -> None:
+    """Every text is on its page, large enough, and no title."""
+    with styled():
+        figure.draw_without_rendering()
+    assert figure.get_size_inches()[0] == WIDTH and not figure.get_suptitle(), name
+    texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
+    assert min(t.get_fontsize() for t in texts) >= 7.0, name
+    labels = [text for legend in figure.findobj(Legend) for text in legend.get_texts()]
+    labels += [side.label for side in figure.findobj(Axis) if side.label.get_text()]
+    for text in [*figure.texts, *labels, *(axis.title for axis in figure.axes)]:
+        box = text.get_window_extent()
+        assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, (name, text.get_text())
+        assert box.y0 >= 0.0 and box.y1 <= figure.bbox.y1, (name, text.get_text())
+
+
+def test_every_figure_is_written_in_every_kind_and_legible(
+        redrawn: tuple[Path, dict[str, Figure]]) -> None:
+    out, kept = redrawn
+    assert {p.name for p in out.iterdir() if p.is_file()} == {
         'results.csv', *(f'{name}.{kind}' for name in DRAWN for kind in ('png', 'svg', 'pdf'))}
     for name in DRAWN:
-        assert (redrawn / f'{name}.png').read_bytes().startswith(b'\x89PNG')
-        assert (redrawn / f'{name}.png').stat().st_size > 20_000
-        assert '</svg>' in (redrawn / f'{name}.svg').read_text(encoding='utf-8')
-        page = (redrawn / f'{name}.pdf').read_bytes()
+        assert (out / f'{name}.png').read_bytes().startswith(b'\x89PNG')
+        assert '</svg>' in (out / f'{name}.svg').read_text(encoding='utf-8')
+        page = (out / f'{name}.pdf').read_bytes()
         assert page.startswith(b'%PDF') and b'/MediaBox [ 0 0 239.76 ' in page  # 3.33 in
+    assert len(kept) == len(DRAWN) + 2
+    for name, figure in kept.items():
+        assert_legible(figure, name)
 
 
-def test_only_the_law_keeps_the_band_in_both_scenarios(redrawn: Path) -> None:
-    rows = read(redrawn / 'results.csv')
+def test_arrows_at_the_start_are_seen_whole(redrawn: tuple[Path, dict[str, Figure]]) -> None:
+    arrows = [(axis, *axis.findobj(Quiver)) for name, figure in redrawn[1].items()
+              for axis in figure.axes if 'trajectories' in name and axis.axison]
+    assert len(arrows) == 10
+    for axis, quiver, *_ in arrows:
+        inches = np.hypot(quiver.U, quiver.V) / quiver.scale
+        assert np.all((inches >= 0.12) & (inches <= 0.35))
+        tips = axis.transData.transform(quiver.XY) + axis.figure.dpi * np.stack(
+            [quiver.U, quiver.V], axis=1) / quiver.scale
+        assert np.all((tips > axis.bbox.min) & (tips < axis.bbox.max))
+
+
+def test_only_the_law_keeps_the_band_in_both_scenarios(
+        redrawn: tuple[Path, dict[str, Figure]]) -> None:
+    rows = read(redrawn[0] / 'results.csv')
     assert len(rows) == 10
     assert [(r['scenario'], r['model']) for r in rows if r['band'] == 'kept'] == [
         ('leaderless', 'Flocking law'), ('leader-follower', 'Flocking law')]
@@ -73,71 +129,15 @@ def test_only_the_law_keeps_the_band_in_both_scenarios(redrawn: Path) -> None:
     assert [f'{float(r["to 1 % [s]"]):.2f}' for r in rows[:2]] == ['5.64', '1.98']  # for good
 
 
-def test_two_runs_write_the_same_bytes(redrawn: Path, tmp_path: Path) -> None:
-    assert figures.main(['--out', str(tmp_path), '--flights', str(tmp_path / 'none')]) == 0
-    for path in redrawn.iterdir():
-        assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
-
-
 @pytest.mark.parametrize(('arguments', 'name', 'least_rows'), [
-    (['--agents', '12', '--dim', '3', '--seed', '4'], 'flock_flocking_graph_12_3d_seed4', 20),
     (['--agents', '8', '--neighbors', 'nearest'], 'flock_flocking_nearest_8_2d_seed1', 20),
-    (['--agents', '8', '--model', 'vicsek'], 'flock_vicsek_all_8_2d_seed1', 10),
-    (['--agents', '8', '--model', 'cucker_dong', '--band', 'paper'],
-     'flock_cucker_dong_all_8_2d_seed1', 20)])
+    (['--agents', '8', '--model', 'vicsek'], 'flock_vicsek_all_8_2d_seed1', 10)])
 def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path, arguments: list[str],
                                                     name: str, least_rows: int) -> None:
     assert figures.main(['--out', str(tmp_path), '--duration', '1', *arguments]) == 0
     assert {p.name for p in tmp_path.iterdir()} == {f'{name}.{kind}'
                                                     for kind in ('png', 'svg', 'pdf', 'csv')}
     assert len(read(tmp_path / f'{name}.csv')) > least_rows
-
-
-def test_every_text_is_on_its_page_and_legible(monkeypatch: pytest.MonkeyPatch,
-                                               tmp_path: Path) -> None:
-    drawn: dict[str, Figure] = {}
-
-    def keep(figure: Figure, path: Path) -> str:
-        drawn[path.name] = figure
-        with styled():
-            figure.draw_without_rendering()
-        return ''
-    monkeypatch.setattr('flock_desk.runs.figure_style.save', keep)
-    figures.redraw(tmp_path)
-    for dim in '23':
-        figures.main(['--out', str(tmp_path), '--agents', '9', '--dim', dim, '--duration', '1'])
-    assert len(drawn) == len(DRAWN) + 2
-    for name, figure in drawn.items():
-        assert figure.get_size_inches()[0] == WIDTH and not figure.get_suptitle(), name
-        texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
-        assert min(t.get_fontsize() for t in texts) >= 7.0, name
-        told = [text for legend in figure.findobj(Legend) for text in legend.get_texts()]
-        told += [side.label for side in figure.findobj(Axis) if side.label.get_text()]
-        told += [axis.title for axis in figure.axes]
-        for text in figure.texts + told:
-            box = text.get_window_extent()
-            assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, (name, text.get_text())
-            assert box.y0 >= 0.0 and box.y1 <= figure.bbox.y1, (name, text.get_text())
-
-
-def test_arrows_at_the_start_are_seen_whole(monkeypatch: pytest.MonkeyPatch,
-                                            tmp_path: Path) -> None:
-    arrows: list[Any] = []
-
-    def keep(figure: Figure, path: Path) -> str:
-        figure.draw_without_rendering()
-        arrows.extend((axis, *axis.findobj(Quiver)) for axis in figure.axes if axis.axison
-                      if 'trajectories' in path.name)
-        return ''
-    monkeypatch.setattr('flock_desk.runs.figure_style.save', keep)
-    figures.redraw(tmp_path)
-    assert len(arrows) == 10
-    for axis, quiver in arrows:
-        inches = np.hypot(quiver.U, quiver.V) / quiver.scale
-        assert np.all((inches >= 0.15) & (inches <= 0.45))
-        tips = axis.transData.transform(quiver.XY) + axis.figure.dpi * np.stack(
-            [quiver.U, quiver.V], axis=1) / quiver.scale
-        assert np.all((tips > axis.bbox.min) & (tips < axis.bbox.max))
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
@@ -148,31 +148,165 @@ def test_arrows_at_the_start_are_seen_whole(monkeypatch: pytest.MonkeyPatch,
 def test_bad_options_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
                                      arguments: list[str], message: str) -> None:
     assert figures.main(['--out', str(tmp_path), *arguments]) == 1
-    error = capsys.readouterr().err.splitlines(keepends=True)[-1]
-    assert error.startswith(message)
+    assert capsys.readouterr().err.splitlines(keepends=True)[-1].startswith(message)
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
+def write_flight(folder: Path, scenario: str = 'indoor') -> None:
+    """Write what `fly` leaves of a flight in which the leader goes ahead, 2 to 2.3 m away."""
+    folder.mkdir(parents=True)
+    times = np.arange(SECONDS * RATE) / RATE
+    stamps = START + np.round(times * 1e9).astype(np.int64)
+    follower = np.stack([0.3 * times, 0.1 * np.sin(times), np.full(len(times), 1.5)], axis=1)
+    leader = follower + np.outer(2.0 + 0.05 * times, [1.0, 0.0, 0.0])
+    velocity, level = np.full_like(leader, 0.3), np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    seen = (times < NO_IMAGE[0]) | (times >= NO_IMAGE[1])
+    known = seen & ((times < NO_ESTIMATE[0]) | (times >= NO_ESTIMATE[1]))
+    now = 100.0 + times
+    columns = {
+        'image_stamp': stamps[seen], 'image_usable': known[seen],
+        **{f'{who}_{what}': values[seen] for who, place in (('follower', follower),
+                                                            ('leader', leader))
+           for what, values in (('position', place), ('quaternion', level),
+                                ('velocity', velocity))},
+        'odom_stamp': stamps, 'odom_position': follower + DRIFT, 'odom_quaternion': level,
+        'odom_velocity': velocity, 'distance_time': now,
+        'distance': np.linalg.norm(leader - follower, axis=1), 'state_time': now,
+        'position': follower, 'velocity': velocity, 'acceleration': 0.0 * velocity,
+        'mode': np.full(len(now), 'OFFBOARD'), 'setpoint_time': now,
+        'setpoint_acceleration': 0.0 * velocity, 'planner_time': now[:1],
+        'planner_state': np.array(['TRACK'])}
+    np.savez(folder / 'flight.npz', **columns, epoch_ns=START, start=100.0, began=100.0,
+             ended=100.0 + SECONDS, skipped_images=0, pose_source='', pose_source_of_leader='',
+             clock=np.empty((0, 2)))
+    with BagWriter(folder / 'record') as bag:
+        for stamp, place in zip(stamps[known].tolist(), leader[known]):
+            place = place + DRIFT + [SEEN_FARTHER, 0.0, 0.0]
+            bag.write('neighbors', ODOMETRY, stamp, odometry(
+                empty, stamp, 'odom', 'leader', place, [0.0, 0.0, 0.0, 1.0], [0.3, 0.0, 0.0],
+                [0.0, 0.0, 0.0], 1e-4 * np.eye(6), 1e-4 * np.eye(6)))
+    (folder / 'summary.json').write_text(json.dumps({'scenario': scenario}))
 
 
-def run_two_jobs(stream: Any, monkeypatch: pytest.MonkeyPatch) -> str:
-    clock = iter(range(0, 100, 2))  # s
-    monkeypatch.setattr('time.monotonic', lambda: float(next(clock)))
-    progress = Progress(2, stream)
-    progress.start('first')
-    for share in (0.2, 0.4, 0.6):
-        progress.share(share)
-    progress.start('second')
-    progress.finish()
-    return stream.getvalue()
+@pytest.fixture(scope='module')
+def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of `fly`: outdoor was flown last, indoor before."""
+    folder = tmp_path_factory.mktemp('build') / 'fly'
+    write_flight(folder, 'outdoor')
+    write_flight(folder / 'earlier' / 'indoor', 'indoor')
+    return folder
 
 
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    assert run_two_jobs(io.StringIO(), monkeypatch) == (
-        '[1/2] first\n[1/2] first: 30 %\n[2/2] second\ndone\n')
-    drawn = run_two_jobs(Terminal(), monkeypatch)
-    assert '\r[######........................]  20 %  first' in drawn
-    assert '100 %  done' in drawn and drawn.endswith('\n') and drawn.count('\n') == 1
+@pytest.fixture(scope='module')
+def flight(flights: Path) -> LiveRecord:
+    return read_flown(load('outdoor'), flights)
+
+
+def line(axis: Any, colour: str, *, truth: bool) -> Array:
+    """Return a line's data; that of the truth is the broad one."""
+    (found,) = [line.get_xydata() for line in axis.lines
+                if to_hex(line.get_color()) == colour.lower()
+                and (line.get_linewidth() > 3.0) == truth and len(line.get_xydata()) > 2]
+    return found.T
+
+
+@pytest.mark.parametrize(('colour', 'begin', 'slope', 'error'), [
+    ('#0072B2', 2.0, 0.35, DRIFT[0] + SEEN_FARTHER), ('#D55E00', 0.0, 0.3, DRIFT[0])])
+def test_positions_are_those_the_follower_knew_above_the_true_ones(
+        flight: LiveRecord, colour: str, begin: float, slope: float, error: float) -> None:
+    figure = positions(flight)
+    above, below = figure.axes
+    t, known = line(above, colour, truth=False)
+    shown = np.isfinite(known)
+    assert known[shown] == pytest.approx(begin + slope * t[shown] + error, abs=1e-6)
+    t, true = line(above, colour, truth=True)
+    shown = np.isfinite(true)
+    assert true[shown] == pytest.approx(begin + slope * t[shown], abs=1e-6)
+    t, y = line(below, colour, truth=True)
+    assert y[np.isfinite(y)] == pytest.approx(0.1 * np.sin(t[np.isfinite(y)]), abs=1e-6)
+    # No line across a gap.
+    assert not np.any((t > NO_IMAGE[0] + 1e-6) & (t < NO_IMAGE[1] - 1e-6) & np.isfinite(true))
+    assert_legible(figure, 'positions')
+
+
+def test_the_distance_is_drawn_in_its_band_and_where_the_leader_was_hidden(
+        flight: LiveRecord) -> None:
+    figure = distance(flight)
+    axis, = figure.axes
+    t, known = line(axis, '#0072B2', truth=False)
+    shown = np.isfinite(known)
+    assert known[shown] == pytest.approx(2.0 + SEEN_FARTHER + 0.05 * t[shown], abs=1e-6)
+    hidden = (t >= NO_ESTIMATE[0]) & (t < NO_ESTIMATE[1])
+    assert not np.any(hidden & shown)
+    assert np.isfinite(line(axis, '#333333', truth=True)[1][hidden]).all()
+    edges = sorted({line.get_ydata()[0] for line in axis.lines if line.get_linestyle() == '--'})
+    assert edges == pytest.approx([1.0, np.sqrt(8.0)])
+    assert axis.get_ylim()[0] == 0.0 and axis.get_ylim()[1] > edges[1]
+    spans = [patch.get_extents().transformed(axis.transData.inverted()) for patch in axis.patches]
+    assert [(box.x0, box.x1) for box in spans] == [pytest.approx(NO_ESTIMATE)]
+    assert_legible(figure, 'distance')
+
+
+def test_flights_are_drawn_twice_the_same_or_how_to_fly_them_is_said(
+        flights: Path, tmp_path: Path) -> None:
+    only = flights / 'earlier' / 'indoor'
+    for folder in (tmp_path / 'once', tmp_path / 'again'):
+        folder.mkdir()
+        written, notes, faults = figures.redraw_flights(folder, only)
+        assert not faults
+    assert written == [f'indoor_{name}.png/.svg/.pdf' for name in ('positions', 'distance')]
+    assert notes == [
+        f'indoor: 6 s in {only}, 2.00 to 2.30 m apart, 100.0 % of the time in the band',
+        f'outdoor: not drawn, there is no flight of it in {only}: make fly SCENARIO=outdoor']
+    files = sorted((tmp_path / 'once').iterdir())
+    assert len(files) == 6
+    for path in files:
+        assert path.read_bytes() == (tmp_path / 'again' / path.name).read_bytes()
+    page = (tmp_path / 'once' / 'indoor_distance.pdf').read_bytes()
+    assert b'/FontFile2' in page and b'/Type3' not in page  # as publishers want them
+
+
+def test_a_flight_that_cannot_be_read_is_an_error_after_all_else(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(figures, 'redraw', lambda out: [])
+    for name, damage in (('indoor', b'no zip'), ('outdoor', b'')):
+        folder = tmp_path / 'fly' / 'earlier' / name
+        folder.mkdir(parents=True)
+        (folder / 'summary.json').write_text(json.dumps({'scenario': name}))
+        (folder / 'flight.npz').write_bytes(damage)
+    assert figures.main(['--out', str(tmp_path / 'out'), '--flights', str(tmp_path / 'fly')]) == 1
+    for name, error in zip(('indoor', 'outdoor'), capsys.readouterr().err.splitlines(),
+                           strict=True):
+        file = tmp_path / 'fly' / 'earlier' / name / 'flight.npz'
+        assert error.startswith(f'error: {name}: not drawn: {file}: cannot be read: ')
+
+
+def test_the_last_flight_of_every_scenario_is_kept(tmp_path: Path) -> None:
+    for scenario in ('indoor', 'outdoor', 'indoor'):
+        set_aside(tmp_path / 'fly')
+        assert scenario_flown(tmp_path / 'fly') == ''
+        write_flight(tmp_path / 'new', scenario)
+        (tmp_path / 'fly').mkdir(exist_ok=True)
+        for path in (tmp_path / 'new').iterdir():
+            path.replace(tmp_path / 'fly' / path.name)
+        (tmp_path / 'new').rmdir()
+        assert last_flight(tmp_path / 'fly', scenario) == tmp_path / 'fly'
+    earlier = tmp_path / 'fly' / 'earlier'
+    assert last_flight(tmp_path / 'fly', 'outdoor') == earlier / 'outdoor'
+    assert last_flight(tmp_path / 'fly', 'hover') is None
+    # Both are complete where they have been moved; the second of indoor replaces the first.
+    (earlier / 'indoor' / 'report.html').write_text('of the first')
+    set_aside(tmp_path / 'fly')
+    assert sorted(path.name for path in (earlier / 'indoor').iterdir()) == [
+        'flight.npz', 'record', 'summary.json']
+    with open_bag(earlier / 'indoor' / 'record') as bag:
+        assert bag.message_count > 50
+
+
+@pytest.mark.parametrize('summary', ['', '[]', '{"scenario": null}', '{"scenario": "../x"}'])
+def test_files_that_fly_has_not_written_stay_where_they_are(tmp_path: Path, summary: str) -> None:
+    (tmp_path / 'fly').mkdir()
+    (tmp_path / 'fly' / 'summary.json').write_text(summary)
+    set_aside(tmp_path / 'fly')
+    assert [path.name for path in (tmp_path / 'fly').iterdir()] == ['summary.json']
+    assert [path.name for path in tmp_path.iterdir()] == ['fly']

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command that draws markers: to scale, detected again, and refusals in one line."""
+"""The command that draws markers: to scale, detected from near and far, refusals in one line."""
 
 from __future__ import annotations
 
@@ -22,34 +22,29 @@ from pathlib import Path
 import re
 import subprocess
 import sys
-from typing import NamedTuple
 
 import cv2
+from marker_images import make_camera, render, SIDE
 import numpy as np
 import pytest
 import yaml
 
-from flock_desk.marker import draw, main, PAGES
-from flock_desk.runs.drawing import Box
-from flock_follower.geometry import Array
+from flock_desk.marker import main
+from flock_desk.runs.marker_pages import Box, draw, entry, layout, Page, PAGES, panel_entry
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
-    dictionary_names,
     dictionary_size,
     marker_cells,
 )
+from flock_follower.perception.tracker import camera_mounting, Tracker
 
 POINT = 25.4 / 72.0  # mm
 NUMBER = r'(-?[\d.]+)'
 ISSUE = ['--id', '0', '--dictionary', 'DICT_4X4_50', '--size', '0.16']
-
-
-class Page(NamedTuple):
-    width: float  # mm
-    height: float
-    boxes: list[Box]
 
 
 def objects_of(pdf: bytes) -> list[bytes]:
@@ -82,7 +77,8 @@ def pages_of(pdf: bytes) -> list[Page]:
         assert not re.search(r'\b(cm|W)\b', white + black) and ' l\n' not in text
         assert '\n1 g ' in white and '\n0 g ' in '\n' + black
         boxes = boxes_of(black, f'{NUMBER} {NUMBER} [ml]')
-        pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes]))
+        pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes],
+                          []))
     return pages
 
 
@@ -135,7 +131,8 @@ def test_the_pdf_is_to_scale_and_its_marker_is_detected(tmp_path: Path) -> None:
     assert any(w == pytest.approx(100.0, abs=1e-4) for w in widths)  # the ruler
 
 
-@pytest.mark.parametrize('dictionary', dictionary_names())
+@pytest.mark.parametrize('dictionary', [
+    'DICT_4X4_50', 'DICT_6X6_250', 'DICT_7X7_1000', 'DICT_ARUCO_ORIGINAL'])
 def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str,
                                                                tmp_path: Path) -> None:
     marker_id = dictionary_size(dictionary) - 1
@@ -159,14 +156,14 @@ def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str,
 @pytest.mark.parametrize(('side', 'page'), [
     (0.01, 'exact'), (0.149, 'A4'), (0.15, 'A3'), (0.5, 'exact')])
 def test_boxes_do_not_overlap_and_stay_where_printers_print(side: float, page: str) -> None:
-    drawing = draw('DICT_5X5_100', 42, side, page)
+    drawing = draw(layout('DICT_5X5_100', [42], [side]), page)
     for x, y, w, h in drawing.boxes:
         assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
     for (x0, y0, w0, h0), (x1, y1, w1, h1) in combinations(drawing.boxes, 2):
         assert (min(x0 + w0, x1 + w1) < max(x0, x1) + 1e-9
                 or min(y0 + h0, y1 + h1) < max(y0, y1) + 1e-9)
-    for text in drawing.texts:
-        assert text.x >= 5.0 and text.y < drawing.height - 5.0
+    for x, y, *_ in drawing.texts:
+        assert x >= 5.0 and y < drawing.height - 5.0
 
 
 @pytest.mark.parametrize(('arguments', 'page'), [
@@ -246,7 +243,12 @@ def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,
     (['--page', 'A4'], r"page = 'A4': .* takes 224 x 254 mm; use --page A3"),
     (['--size', '1'], "page = 'auto': .* use --page exact"),
     (['--output', 'marker.docx'], r'output = marker\.docx: must end in \.pdf'),
-    (['--output', '/nowhere/m.pdf'], 'No such file or directory')])
+    (['--output', '/nowhere/m.pdf'], '/nowhere/m.pdf: No such file or directory'),
+    (['--panel', '--id', '0'], 'takes one for each of at least two ids'),
+    (['--panel', '--id', '1', '2', '3', '--size', '0.3', '0.1'], 'takes one for each'),
+    (['--panel', '--id', '0', '1', '--size', '0.3', '0.06', '--page', 'A3'],
+     'a panel of 0.3 and 0.06 m .* takes 411 x 521 mm; use --page A2'),
+    (['--size', '0.3', '0.1'], 'several are for --panel')])
 def test_bad_options_end_in_one_line_and_exit_code_2(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
         arguments: list[str], message: str) -> None:
@@ -258,8 +260,82 @@ def test_bad_options_end_in_one_line_and_exit_code_2(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_place_of_the_file_is_named(tmp_path: Path,
-                                                capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / 'm.pdf').mkdir()
-    assert main([*ISSUE, '--output', str(tmp_path / 'm.pdf')]) == 2
-    assert 'm.pdf' in capsys.readouterr().err
+@pytest.mark.parametrize(('ids', 'sizes', 'page'), [
+    ([0, 1], [0.3, 0.06], 'A2'), ([7, 3, 4], [0.05, 0.2, 0.06], 'A3'),
+    ([5, 6], [0.04, 0.12], 'A4')])
+def test_the_print_holds_the_markers_where_the_entry_says(
+        ids: list[int], sizes: list[float], page: str, tmp_path: Path,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['--panel', '--id', *map(str, ids), '--size', *map(str, sizes), '--output',
+                 str(tmp_path / 'm.pdf')]) == 0
+    told = capsys.readouterr()
+    assert f'page {page}, ' in told.err
+    (leader,) = neighbors.parse(yaml.safe_load(told.out)).neighbors
+    assert {m.marker_id: m.side_length for m in leader.markers} == dict(zip(ids, sizes))
+
+    drawing = draw(layout('DICT_4X4_50', ids, sizes), page)
+    found = detect(rasterize(drawing, 2, 4), 'DICT_4X4_50')
+    at = {number: corners.mean(axis=0) / 2e3 + 0.25e-3 for number, corners in zip(
+        found.ids.tolist(), found.corners)}
+    sides = {number: np.linalg.norm(corners[1] - corners[0]) / 2e3
+             for number, corners in zip(found.ids.tolist(), found.corners)}
+    assert sides == pytest.approx(dict(zip(ids, sizes)), abs=6e-4)  # a pixel is 0.5 mm
+    for one, other in combinations(leader.markers, 2):
+        right, down = at[other.marker_id] - at[one.marker_id]
+        moved = other.T_body_marker.translation - one.T_body_marker.translation
+        # Seen from behind, the leader's left is on the left; up is up.
+        np.testing.assert_allclose(moved, [0.0, -right, -down], atol=6e-4)
+    smallest = min(leader.markers, key=lambda marker: marker.side_length)
+    np.testing.assert_allclose(smallest.T_body_marker.translation, [-0.2, 0.0, 0.0])
+    for x, y, w, h in drawing.boxes:
+        assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
+
+
+CAMERA = make_camera()
+MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+PANEL = neighbors.parse(yaml.safe_load(panel_entry(layout('DICT_4X4_50', [0, 1], [0.3, 0.06]))))
+SINGLE = neighbors.parse(yaml.safe_load(entry('DICT_4X4_50', [0], 0.16)))
+
+
+def misplaced(config: neighbors.NeighborConfig, distance: float, aside: float,
+              up: float) -> Array | None:
+    """
+    Return by how much the leader is misplaced, (3,), m; None where it is not seen.
+
+    :param distance: of its tail before the camera, m; ``aside`` and ``up``, as shares of that,
+        how far off the middle of the image.
+    """
+    leader = Transform(translation=np.array([0.3, 0.0, 0.0]) + distance * np.array(
+        [1.0, aside, up]))
+    image = np.full((CAMERA.height, CAMERA.width), 255, dtype=np.uint8)
+    for marker in config.neighbors[0].markers:
+        pose = MOUNTING.inverse() @ leader @ marker.T_body_marker
+        # A marker half as large looks the same at half the distance.
+        scaled = Transform(pose.rotation, pose.translation * (SIDE / marker.side_length))
+        alone = render(CAMERA, {marker.marker_id: scaled}, rays=3, noise=0.0, black=30.0,
+                       white=200.0)
+        empty = render(CAMERA, {}, rays=3, noise=0.0)
+        image = np.where(alone != empty, alone, image)
+    image = np.where(image == 255, empty, image)
+    tracker = Tracker(config, MOUNTING)
+    for stamp in (0.98, 1.0, 1.02):
+        tracker.feed_odometry(OdometrySample(
+            stamp, np.zeros(3), IDENTITY_QUATERNION, np.zeros(3), np.zeros(3)))
+    estimate = tracker.process_image(1.0, image, CAMERA).estimates.get('leader')
+    return None if estimate is None else estimate.position - leader.translation
+
+
+@pytest.mark.parametrize(('distance', 'aside', 'up', 'error'), [
+    (0.3, 0.2, -0.17, 0.003), (1.4, 0.1, 0.0, 0.01),
+    (8.0, 0.1, 0.1, 0.1)])
+def test_a_panel_is_seen_from_near_and_far(distance: float, aside: float, up: float,
+                                           error: float) -> None:
+    off = misplaced(PANEL, distance, aside, up)
+    assert off is not None and np.linalg.norm(off) < error
+
+
+@pytest.mark.parametrize(('distance', 'aside', 'up'), [(0.3, 0.2, -0.17), (12.0, 0.1, 0.1)])
+def test_one_marker_is_not(distance: float, aside: float, up: float) -> None:
+    assert misplaced(SINGLE, distance, aside, up) is None
+    off = misplaced(SINGLE, 1.4, aside, up)
+    assert off is not None and np.linalg.norm(off) < 0.01

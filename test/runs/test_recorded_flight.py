@@ -18,27 +18,21 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from bag_excerpts import Change, edited, excerpt, SAMPLE, without
+from bag_excerpts import Change, edited, SAMPLE, without
 import numpy as np
 import pytest
 
 from flock_desk.runs.recorded_flight import RecordedFlight
-from flock_follower.bags.bag import BagMessage, deserialize, open_bag
+from flock_follower.bags.bag import BagMessage, open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.follower import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.messages import (
-    from_odometry,
-    from_trajectory,
-    ODOMETRY,
     OdometryState,
     stamp_to_nanoseconds,
 )
 from flock_follower.parameters.files import parse_parameters, TABLE
-from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.params import PlannerParams
 
 IMAGE, ODOM, CAMERA = '/image_raw/compressed', '/odom', '/camera_info'
 TENTH = 100_000_000  # ns
@@ -113,13 +107,6 @@ def test_ticks_and_setpoints_come_at_their_rates_from_one_interval_on(log: Log) 
         k * TENTH // 2 for k in range(1, len(log.setpoints) + 1)]
 
 
-def test_times_of_what_is_published_never_go_back(log: Log) -> None:
-    times = [time for _, time, _ in log.published]
-    assert times == sorted(times)
-    assert {topic for topic, _, _ in log.published} == {
-        'neighbors', 'neighbors/acceleration', 'command/trajectory', 'planner/state', 'setpoint'}
-
-
 def test_an_estimate_is_out_when_image_and_odometry_are_recorded(log: Log) -> None:
     recorded = {ODOM: [], IMAGE: []}  # type: dict[str, list[int]]
     for message in messages():
@@ -131,15 +118,6 @@ def test_an_estimate_is_out_when_image_and_odometry_are_recorded(log: Log) -> No
         reached = next(state for state in log.states if state.stamp >= stamp)
         came = recorded[ODOM][log.states.index(reached)]
         assert time == max(image, came)
-
-
-def test_an_image_is_processed_when_late_odometry_reaches_it() -> None:
-    late = sorted((m._replace(stamp_ns=m.stamp_ns + 30_000_000) if m.topic == ODOM else m
-                   for m in messages()), key=lambda m: m.stamp_ns)
-    log = play(late)
-    arrivals = {m.stamp_ns for m in late if m.topic == ODOM}
-    times = [time for topic, time, _ in log.published if topic == 'neighbors']
-    assert len(times) > 30 and arrivals.issuperset(times)
 
 
 def test_an_image_waits_for_odometry_no_longer_than_max_wait() -> None:
@@ -169,41 +147,6 @@ def test_a_calibration_that_changes_is_taken() -> None:
     log = play(messages(0.6, lambda m: uncalibrated(m) if m.stamp_ns > half else m))
     assert log.rejections['invalid camera_info'] == 1
     assert 5 < len(log.on('neighbors')) < 11 and log.rejections['no usable camera_info'] > 5
-
-
-def test_what_came_counts_for_one_tick_only() -> None:
-    loop = PlannerLoop(require_bridge=False)
-    loop.engage(True)
-    first = next(m for m in messages(0.1) if m.topic == ODOM)
-    state = from_odometry(deserialize(first.data, ODOMETRY))
-    loop.take_odometry(state, first.stamp_ns)
-    now = messages(0.1)[-1].stamp_ns
-    far = empty('nav_msgs/msg/Odometry')
-    far.header.frame_id, far.child_frame_id = 'odom', 'leader'
-    far.pose.pose.orientation.w, far.pose.pose.position.x = 1.0, 500.0
-    loop.take_neighbor(from_odometry(far))
-    rejected = [loop.tick(now + k * TENTH, PlannerParams())[0].rejected for k in range(2)]
-    assert len(rejected[0]) == 1 and rejected[1] == ()
-
-
-def test_a_command_rests_on_the_newest_estimate_and_applies_at_its_tick(log: Log) -> None:
-    estimates = [(time, stamp_to_nanoseconds(message.header.stamp))
-                 for topic, time, message in log.published if topic == 'neighbors']
-    commands = [(time, from_trajectory(message, 'odom'))
-                for topic, time, message in log.published if topic == 'command/trajectory']
-    assert len(commands) == 11
-    for time, command in commands:
-        assert command.stamp == max(stamp for out, stamp in estimates if out <= time)
-        assert command.stamp + command.ahead == time
-
-
-def test_setpoints_pass_the_commands_on(log: Log) -> None:
-    assert log.setpoints[0].setpoint.reason == 'no command'
-    assert all(s.setpoint.kind == 'command' for s in log.setpoints[1:])
-    first = from_trajectory(log.on('command/trajectory')[0], 'odom')
-    sent = from_trajectory(log.on('setpoint')[1], 'odom')
-    assert sent.yaw == pytest.approx(first.yaw)
-    np.testing.assert_allclose(sent.acceleration, first.acceleration, atol=1e-9)
 
 
 def test_two_runs_are_the_same_bit_for_bit(log: Log) -> None:
@@ -243,20 +186,11 @@ def test_when_images_cease_the_planner_brakes_at_once() -> None:
     assert sum((t.time - start) % TENTH != 0 for t in log.ticks) == 1
 
 
-def test_a_camera_that_is_frozen_is_as_good_as_none() -> None:
-    last = [m for m in messages(0.7) if m.topic == IMAGE][-1]
-    log = play(messages(change=lambda m: m._replace(data=last.data) if (
-        m.topic == IMAGE and m.stamp_ns > last.stamp_ns) else m))
-    held = next(t for t in log.ticks if t.decision.state.value == 'HOLD')
-    assert held.decision.reason == 'no image processed for 0.20 s'
-    assert {t.decision.state.value for t in log.ticks if t.time > held.time} == {'HOLD'}
-
-
 def test_without_camera_info_every_image_is_dropped_and_says_why() -> None:
     log = play(messages(0.5, without(CAMERA)))
     images = sum(m.topic == IMAGE for m in messages(0.5))
     assert log.rejections == {'no usable camera_info': images}
-    assert [frame.sighting for frame in log.frames] == [None] * images
+    assert [frame.sighting and frame.sighting.stage for frame in log.frames] == ['none'] * images
 
 
 def uncalibrated(message: BagMessage) -> BagMessage:
@@ -304,9 +238,3 @@ def test_a_silence_of_years_is_skipped_with_the_ticks_in_step() -> None:
 def test_the_velocity_of_odom_stands_in_for_the_autopilots(log: Log) -> None:
     other = play(messages(), velocity_source='autopilot')
     assert [s.setpoint.kind for s in other.setpoints] == [s.setpoint.kind for s in log.setpoints]
-
-
-def test_a_bag_written_and_read_again_gives_the_same(tmp_path: Path, log: Log) -> None:
-    with open_bag(excerpt(tmp_path / 'copy')) as bag:
-        copied = play(list(bag.messages([ODOM, CAMERA, IMAGE])))
-    assert [repr(p) for p in copied.published] == [repr(p) for p in log.published]

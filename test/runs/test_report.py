@@ -21,9 +21,10 @@ from typing import Any
 
 import pytest
 
-from flock_desk.runs.figure_names import name, text
+from flock_desk.runs.console import aligned, guarded, Progress
 from flock_desk.runs.judge import FigureBound, judge
-from flock_desk.runs.report import aligned, announce, table, WIDTH, write_report
+from flock_desk.runs.processes import TooBusyError
+from flock_desk.runs.report import announce, name, table, text, WIDTH, write_report
 
 SUMMARY: dict[str, Any] = {
     'frames': 360, 'recall': 0.97, 'nees_position': None, 'bag': 'sample',
@@ -60,6 +61,31 @@ def test_a_bound_on_what_is_not_in_the_summary_is_shown(
         'the logs of every process are in logs']
     assert announce(SUMMARY, judgements[:1], [], Path('logs')) == 0
     assert capsys.readouterr().err == ''
+
+
+@pytest.mark.parametrize(('error', 'code', 'line'), [
+    (ValueError('a\nb'), 2, 'error: a b'), (RuntimeError('c'), 2, 'error: c; see logs'),
+    (OSError(28, 'No space', 'x.json'), 2, 'error: x.json: No space; see logs'),
+    (TooBusyError('d'), 3, 'too busy: d'), (KeyboardInterrupt(), 130, 'interrupted')])
+def test_a_command_ends_in_one_line_and_its_exit_code(
+        error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def command() -> int:
+        raise error
+    assert guarded(command, refused=2, hint='; see logs') == code
+    assert capsys.readouterr().err.strip() == line
+
+
+def test_progress_is_a_line_for_each_job_and_now_and_then(
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    clock = iter(range(0, 100, 2))  # s
+    monkeypatch.setattr('time.monotonic', lambda: float(next(clock)))
+    progress = Progress(2)
+    progress.start('first')
+    for share in (0.2, 0.4, 0.6):
+        progress.share(share)
+    progress.start('second')
+    progress.finish()
+    assert capsys.readouterr().err == '[1/2] first\n[1/2] first: 30 %\n[2/2] second\ndone\n'
 
 
 def test_columns_are_aligned() -> None:

@@ -88,46 +88,6 @@ def test_the_bag_is_small_and_holds_what_it_should(bag):
         'nav_msgs/msg/Odometry'}
 
 
-def test_images_come_at_30_hz_and_odometry_at_200_hz(bag):
-    image, odom = (stamps(decoded(bag, t)) for t in ('/image_raw/compressed', '/odom'))
-    np.testing.assert_allclose(np.diff(image), 1e9 / 30, atol=1)
-    np.testing.assert_array_equal(np.diff(odom), 5_000_000)
-    assert odom[0] < image[0] and image[-1] < odom[-1]  # every image can be interpolated
-    assert not np.any(np.isin(image, odom))
-
-
-@pytest.mark.parametrize('topic', TOPICS)
-def test_messages_are_recorded_in_order_and_soon_after_their_stamp(bag, topic):
-    late = np.array([m.stamp_ns for m in bag[topic]]) - stamps(decoded(bag, topic))
-    assert np.all(np.diff([m.stamp_ns for m in bag[topic]]) > 0)
-    assert np.all((late > 1_000_000) & (late < 15_000_000))
-
-
-def test_every_image_has_calibration_before_it_and_truth_at_its_stamp(bag):
-    image = stamps(decoded(bag, '/image_raw/compressed'))
-    for topic in ('/camera_info', '/truth/odom', '/truth/neighbors'):
-        np.testing.assert_array_equal(stamps(decoded(bag, topic)), image)
-    for info, message in zip(bag['/camera_info'], bag['/image_raw/compressed']):
-        assert info.stamp_ns < message.stamp_ns
-
-
-def test_frames_are_named(bag):
-    for topic, child in (('/odom', 'base_link'), ('/truth/odom', 'base_link'),
-                         ('/truth/neighbors', 'leader')):
-        message = decoded(bag, topic)[0]
-        assert (message.header.frame_id, message.child_frame_id) == ('odom', child)
-    for topic in ('/camera_info', '/image_raw/compressed'):
-        assert decoded(bag, topic)[0].header.frame_id == 'camera_optical_frame'
-
-
-def test_the_calibration_is_that_of_the_rendered_camera(bag):
-    info, camera = decoded(bag, '/camera_info')[17], Camera()
-    np.testing.assert_array_equal(
-        info.k, [camera.focal_x, 0, camera.centre_x, 0, camera.focal_y, camera.centre_y, 0, 0, 1])
-    np.testing.assert_array_equal(info.d, camera.distortion)
-    assert (info.distortion_model, info.width, info.height) == ('plumb_bob', 640, 480)
-
-
 def test_images_are_grey_jpegs_of_quality_80_or_better(bag):
     reference = cv2.imencode('.jpg', np.zeros((8, 8), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     for message in decoded(bag, '/image_raw/compressed')[::30]:
@@ -148,14 +108,6 @@ def test_the_true_flight_keeps_1_2_to_2_6_m_and_accelerates_up_to_1_m_s2(bag):
     moved = np.diff([p.translation for p in poses(leader)], axis=0) * 30.0
     np.testing.assert_allclose(moved, (velocities(leader)[1:] + velocities(leader)[:-1]) / 2,
                                atol=0.001)
-
-
-def test_the_leader_flies_upright_where_its_body_points(bag):
-    leader = decoded(bag, '/truth/neighbors')
-    for pose, message in zip(poses(leader), leader):
-        linear = vector(message.twist.twist.linear)
-        assert linear[0] > 0.95 * np.linalg.norm(linear)
-        assert pose.rotation[2, 2] > 0.97
 
 
 def test_odometry_drifts_from_the_truth_by_no_more_than_a_good_estimator(bag):
@@ -257,19 +209,6 @@ def project(camera, points):
     pixels, _ = lens.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix,
                                    np.array(camera.distortion))
     return pixels.reshape(-1, 2)
-
-
-def test_the_hard_flight_goes_out_to_4_m_and_in_to_1_m_with_twice_the_noise():
-    hard, plain = sample.VARIANTS['hard'], sample.VARIANTS['sample']
-    flight = sample.Recording(hard).flight
-    distances = np.linalg.norm(flight.leader.positions - flight.follower.positions, axis=1)
-    assert 0.95 < distances.min() < 1.05 and 3.95 < distances.max() < 4.05
-    assert np.argmax(distances) < np.argmin(distances)
-    for signal in (0.0, 0.1, 1.0):  # share of the full well
-        deviations = [np.sqrt(signal / s.full_well + (s.read_noise / s.full_well)**2)
-                      for s in (hard.sensor, plain.sensor)]
-        assert deviations[0] == pytest.approx(2.0 * deviations[1], rel=1e-9)
-    assert hard.sensor.gamma == 2.2 and hard.sensor.exposure >= 0.015
 
 
 @pytest.mark.parametrize(('name', 'size'), [('hd', (1280, 720)), ('full_hd', (1920, 1080))])

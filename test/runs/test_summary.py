@@ -19,11 +19,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_desk.runs.flight_record import compared
 from flock_desk.runs.frame_errors import Table
+from flock_desk.runs.record import compared
 from flock_desk.runs.summary import (
+    consistency,
     hold_figures,
-    holds,
     jsonable,
     most,
     rate,
@@ -124,14 +124,18 @@ def test_a_hold_is_told_with_its_length_and_reason() -> None:
               (7.1, 'TRACK'), (9.0, 'HOLD')]
     reasons = [(3.5, ''), (4.5, 'no neighbor seen for 2.5 s'), (5.5, 'no neighbor seen for 3.5 s'),
                (9.5, 'odometry too old'), (10.5, 'after the end')]
-    held = holds(states, reasons, 10.0)
-    assert [(t, pytest.approx(span), why) for t, span, why in held] == [
-        (4.0, 2.5, 'no neighbor seen for 2.5 s'), (7.0, 0.1, ''), (9.0, 1.0, 'odometry too old')]
-    figures = hold_figures(held)
+    figures = hold_figures(states, reasons, 10.0)
     assert figures['planner'] == {'hold_count': 3, 'hold_s': pytest.approx(3.6)}
-    assert figures['holds']['at_4.0_s'] == '2.5 s: no neighbor seen for 2.5 s'
-    assert figures['holds']['at_7.0_s'].startswith('0.1 s: too short')
-    assert hold_figures([]) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
+    assert figures['holds'] == {
+        'at_4.0_s': '2.5 s: no neighbor seen for 2.5 s',
+        'at_7.0_s': '0.1 s: too short for its reason to be on /diagnostics',
+        'at_9.0_s': '1.0 s: odometry too old'}
+    assert hold_figures([], [], 1.0) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
+
+
+def test_the_consistency_of_covariances_has_a_verdict() -> None:
+    assert [consistency(nees) for nees in (None, 1.4, 3.0, 6.1)] == [
+        '', 'covariances too large', 'consistent', 'covariances too small']
 
 
 def test_a_rate_counts_intervals() -> None:

@@ -12,12 +12,22 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The figures of simulated flocks: a panel for each model, the key among them."""
+
+"""
+The figures for a paper: simulated flocks, a panel for each model; flights of ``fly``.
+
+They are one column wide, told apart in grey too, without a title, which is the caption's, and
+every font is legible at that width.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
 
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -28,22 +38,61 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 import numpy as np
 
 from flock_desk.flocks.agents import Simulation
-from flock_desk.runs.figure_style import (
-    bounds_handle,
-    COLOURS,
-    draw_bounds,
-    Handle,
-    INK,
-    PALE,
-    styled,
-    WIDTH,
-)
+from flock_desk.runs.plots import with_gaps
+from flock_desk.runs.record import LiveRecord
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array
 
+WIDTH = 3.33  # in: a column of the paper's two
+# Okabe and Ito's palette, for the colour-blind, and a dash for each where there is no colour.
+COLOURS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
+INK, PALE = '#333333', '#BBBBBB'
+KINDS = ('png', 'svg', 'pdf')
+#: No names by chance and no dates: the same run gives the same bytes.
+_METADATA = {'png': {'Software': None}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
+_STYLE = {
+    'font.size': 7.5, 'axes.titlesize': 7.5, 'axes.labelsize': 7.5, 'legend.fontsize': 7.5,
+    'xtick.labelsize': 7, 'ytick.labelsize': 7, 'axes.titlelocation': 'left',
+    'axes.titlepad': 4, 'axes.labelpad': 2.5, 'axes.linewidth': 0.6, 'lines.linewidth': 1.2,
+    'axes.grid': True, 'axes.axisbelow': True, 'axes.spines.top': False,
+    'axes.spines.right': False, 'xtick.major.width': 0.6, 'ytick.major.width': 0.6,
+    'xtick.major.size': 2.5, 'ytick.major.size': 2.5, 'grid.linewidth': 0.4, 'grid.alpha': 0.35,
+    'legend.frameon': False, 'legend.handlelength': 2.4, 'legend.borderaxespad': 0.0,
+    'svg.hashsalt': 'flock_follower', 'path.simplify_threshold': 0.05,
+    'pdf.fonttype': 42}  # whole outlines of its letters, as publishers ask for
+
+Handle = Line2D | Patch
 Runs = Mapping[str, Simulation]
 Draw = Callable[[Axes, Simulation], None]
 #: in, of the arrow of 1 m/s: on the page, as the scale of the ground is another in each panel.
-_ARROW = 0.4
-_SIDE = 0.8  # in, of what a panel has room for beside the arrows
+_ARROW = 0.3
+_SIDE = 0.8  # in, the room of a panel beside the arrows
+_TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'butt', 'zorder': 1.8}
+_TIME = 'time [s]'
+
+
+def styled() -> AbstractContextManager[None]:
+    """Return the context to make a figure in; nothing of a user's matplotlibrc counts there."""
+    return style.context(['default', _STYLE])
+
+
+def save(figure: Figure, path: Path) -> str:
+    """Write a figure in every kind, beside each other, and return the names in one."""
+    with styled():
+        for kind in KINDS:
+            figure.savefig(path.with_suffix(f'.{kind}'), dpi=300, metadata=_METADATA[kind])
+    return f'{path.name}.' + '/.'.join(KINDS)
+
+
+def draw_bounds(axis: Axes, params: FlockingParams) -> None:
+    """Draw the edges of the band, as distances, m."""
+    for bound in np.sqrt([params.d0, params.d1]):
+        axis.axhline(bound, color=INK, linestyle='--', linewidth=0.9, zorder=1.5)
+
+
+def bounds_handle(label: str) -> Handle:
+    """Return the edges of the band, for a legend."""
+    return Line2D([], [], color=INK, linestyle='--', linewidth=0.9, label=label)
 
 
 def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
@@ -51,30 +100,33 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
     def draw(axis: Axes, run: Simulation) -> None:
         shown = run.time <= end + 1e-9
         x = run.positions[shown]
-        for n, style in ((0, ':'), (-1, '-')):
+        for n, line in ((0, ':'), (-1, '-')):
             loop = np.append(np.arange(x.shape[1]), 0)
-            axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=style, zorder=1)
+            axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=line, zorder=1)
         for i, (colour, dash) in enumerate(COLOURS[:x.shape[1]]):
             axis.plot(*x[:, i].T, color=colour, linestyle=dash)
             axis.plot(*x[0, i], 'o', color='white', markeredgecolor=colour, markersize=4,
                       zorder=5)
             axis.plot(*x[-1, i], 'o', color=colour, markersize=4)
         velocities = run.velocities[0]
-        axis.quiver(*x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS],
-                    units='inches', width=0.022, scale_units='inches', scale=1.0 / _ARROW,
-                    headwidth=4.2, headlength=4.5, headaxislength=4.0, zorder=6)
+        arrows = axis.quiver(
+            *x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS], units='inches',
+            width=0.022, scale_units='inches', scale=1.0 / _ARROW, headwidth=4.2, headlength=4.5,
+            headaxislength=4.0, zorder=6)
         reach = _ARROW / _SIDE * np.ptp(x, axis=(0, 1)).max()  # m, of the arrow of 1 m/s
         axis.update_datalim(x[0] + reach * velocities)
         axis.margins(0.12)
         axis.set_aspect('equal', adjustable='datalim')
+        if run is first:  # beside the legend
+            axis.quiverkey(arrows, 1.42, -0.07, 0.5, 'initial velocity,\n0.5 m/s', labelpos='E',
+                           color=INK, labelsep=0.08)
 
+    first = next(iter(runs.values()))
     with styled():
         handles: list[Handle] = _agent_handles(names)
         handles += [
             Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
                    markersize=4, label='start'),
-            Line2D([], [], color=INK, marker='$\\rightarrow$', linestyle='', markersize=11,
-                   markeredgewidth=0.3, label='initial velocity'),
             Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
                    label=f'after {end:g} s'),
             Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
@@ -93,7 +145,7 @@ def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Fi
         axis.set(xlim=(0.0, end), ylim=(0.0, top))
 
     with styled():
-        return _panels(runs, draw, _agent_handles(names), 'time [s]', 'speed [m/s]', note)
+        return _panels(runs, draw, _agent_handles(names), _TIME, 'speed [m/s]', note)
 
 
 def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '') -> Figure:
@@ -122,7 +174,7 @@ def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '
             handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
                                  label='least to greatest'))
         handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
-        return _panels(runs, draw, handles, 'time [s]', 'distance [m]', note)
+        return _panels(runs, draw, handles, _TIME, 'distance [m]', note)
 
 
 def agreement(runs: Runs, end: float) -> Figure:
@@ -151,7 +203,7 @@ def agreement(runs: Runs, end: float) -> Figure:
         below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
         below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
                        ha='right')
-        below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel='time [s]', xlim=(0.0, end),
+        below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel=_TIME, xlim=(0.0, end),
                   ylim=(1e-5, 4.0))
         figure.align_ylabels([above, below])
         figure.legend(*below.get_legend_handles_labels(), loc='outside upper center', ncols=3,
@@ -180,7 +232,7 @@ def flock(run: Simulation) -> Figure:
         agreeing.plot(m.time, m.order, color=INK, label='order parameter')
         agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
                       linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
-        agreeing.set(xlabel='time [s]', ylabel='agreement', xlim=(0.0, m.time[-1]))
+        agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]))
         agreeing.set_ylim(bottom=0.0)
         for axis in figure.axes:  # above the axis, where no data can be
             axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
@@ -241,3 +293,72 @@ def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
 def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
     return [Line2D([], [], color=colour, linestyle=dash, label=name)
             for name, (colour, dash) in zip(names, COLOURS)]
+
+
+def positions(flight: LiveRecord) -> Figure:
+    """
+    Return x and y of leader and follower over time, m in odom.
+
+    As in the paper they are what the follower knew: its own odometry, and where it saw the leader.
+    The true ones, in a frame without drift, are beneath.
+    """
+    table = _table(flight)
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
+        axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
+        for axis, name in zip(axes, 'xy'):
+            for who, (colour, dash), known in (('leader', COLOURS[0], f'neighbor_{name}'),
+                                               ('follower', COLOURS[1], f'own_{name}')):
+                axis.plot(table['time'], table[f'{who}_{name}'], color=colour, **_TRUTH)
+                axis.plot(table['time'], table[known], color=colour, linestyle=dash)
+            axis.set_ylabel(f'{name} [m]')
+        axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
+        figure.align_ylabels(axes)
+        handles: list[Handle] = [
+            Line2D([], [], color=colour, linestyle=dash, label=who)
+            for who, (colour, dash) in (('leader', COLOURS[0]), ('follower', COLOURS[1]))]
+        figure.legend(handles=[*handles, _truth_handle('true positions')],
+                      loc='outside upper center', ncols=3)
+        return figure
+
+
+def distance(flight: LiveRecord) -> Figure:
+    """Return the distance over time, m, as the follower knew it and as it was, in the band."""
+    table, law = _table(flight), flight.params.law
+    with styled():
+        figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
+        axis: Axes = figure.subplots()
+        for begin, end in flight.blind:
+            axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
+        axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
+        axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
+        draw_bounds(axis, law)
+        top = max(1.12 * np.sqrt(law.d1), 1.05 * _greatest(table))
+        axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
+                 ylim=(0.0, top))
+        handles: list[Handle] = [
+            Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
+            _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
+        if flight.blind:
+            handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
+        figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
+                      columnspacing=1.2, handlelength=1.8)
+        return figure
+
+
+def _table(flight: LiveRecord) -> Mapping[str, Array]:
+    """Return the columns drawn; NaN where images are missing, and so no line."""
+    true = {f'{who}_{name}': column
+            for who, places in (('leader', flight.leader), ('follower', flight.follower))
+            for name, column in zip('xy', places.T)}
+    return with_gaps({**flight.table, **true})
+
+
+def _greatest(table: Mapping[str, Array]) -> float:
+    apart = np.concatenate([table['distance'], table['true_distance']])
+    return float(np.max(apart[np.isfinite(apart)], initial=0.0))
+
+
+def _truth_handle(label: str) -> Handle:
+    return Line2D([], [], color=INK, linewidth=_TRUTH['linewidth'], alpha=_TRUTH['alpha'],
+                  label=label)

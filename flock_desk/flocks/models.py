@@ -12,7 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The accelerations of large flocks in which every agent sees every other, some rows at a time."""
+"""
+Flocks in which every agent sees every other, and the model of Vicsek et al. (1995).
+
+``accelerations`` sums over all pairs, in blocks for large flocks. ``velocities_after`` is Vicsek's
+rule in discrete time, without noise, in two readings: in the literal one each agent keeps its own
+speed and takes the mean heading of the agents within a radius, itself included. The paper's figure
+of three agents, whose speeds become equal, fits only the other: each takes their mean velocity.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +28,7 @@ from typing import get_args, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_desk.flocks.graph import pairs_within
 from flock_follower import flocking
 from flock_follower.flocking import (
     alignment,
@@ -66,3 +74,27 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
         if model == 'flocking':
             u[rows] += scale * np.sum(cohesion(r2, params) * offset, axis=1)
     return u
+
+
+def velocities_after(positions: Array, velocities: Array, radius: float = 1.0,
+                     mean_velocity: bool = False) -> Array:
+    """
+    Return the velocities (k, n), m/s, that the agents take next.
+
+    :param positions: (k, n), m, now.
+    :param velocities: (k, n), m/s, now.
+    :param radius: how far an agent sees, m.
+    :param mean_velocity: take the mean velocity, not the mean heading at one's own speed.
+    """
+    speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+    seen = velocities if mean_velocity else velocities / np.where(speed > 0.0, speed, 1.0)
+    i, j = pairs_within(positions, radius).T
+    k = len(positions)
+    total, count = seen.copy(), 1 + np.bincount(i, minlength=k) + np.bincount(j, minlength=k)
+    for axis in range(positions.shape[1]):
+        total[:, axis] += np.bincount(i, seen[j, axis], k) + np.bincount(j, seen[i, axis], k)
+    if mean_velocity:
+        return total / count[:, None]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    heading = np.where(length > 1e-12, total / np.where(length > 0.0, length, 1.0), seen)
+    return speed * heading

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The courses a simulated leader flies: sampled ahead of the flight, with bounded jerk.
+The courses of simulated leaders, sampled ahead of the flight with bounded jerk, and the wind.
 
 Speeds change the way a trapezoid of acceleration does: a step in speed, averaged over two windows
 of T1 = dv / a and T2 = a / j, has an acceleration of at most a and a jerk of at most j.
@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from flock_desk.scenarios import random_motions
+from flock_desk.scenarios import random_courses
 from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Scenario
+from flock_desk.scenarios.scenario import Scenario, Wind
 from flock_follower.geometry import Array
 
 STEP = 1.0 / 120.0  # s
@@ -99,7 +99,7 @@ def course(scenario: Scenario, run: int) -> Course:
                          f'{motion.acceleration:g} m/s^2 (slower, or a larger size)')
     p = np.zeros_like(v)
     p[1:] = np.cumsum(0.5 * STEP * (v[1:] + v[:-1]), axis=0)
-    headings: Array = np.zeros(count)  # where it faces 'away', whoever simulates it turns it
+    headings: Array = np.zeros(count)  # 'away' is turned by the simulation
     if motion.heading == 'course':
         moving = np.hypot(v[:, 0], v[:, 1]) > 0.05
         known = np.maximum.accumulate(np.where(moving, np.arange(count), 0))
@@ -169,15 +169,28 @@ def _wander(motion: LeaderMotion, speed: float, times: Array,
     return speed * waves / fastest * begin[:, None]
 
 
-def _random(stretches: Callable[..., Iterator[random_motions.Stretch]], motion: LeaderMotion,
+def _random(stretches: Callable[..., Iterator[random_courses.Stretch]], motion: LeaderMotion,
             speed: float, times: Array, rng: np.random.Generator) -> Array:
-    return _averaged(random_motions.flown(stretches(motion, speed, rng), motion, times),
+    return _averaged(random_courses.flown(stretches(motion, speed, rng), motion, times),
                      motion.acceleration / motion.jerk)
 
 
 #: By name: of a motion, its speed and times (n,), s, the velocities (n, 3) from rest.
 _MOTIONS: dict[str, Callable[..., Array]] = {
     'legs': _legs, 'circle': _circle, 'figure_eight': _figure_eight, 'wander': _wander,
-    'spline': random_motions.spline, 'random_walk': partial(_random, random_motions.random_walk),
-    'stairs': partial(_random, random_motions.stairs),
-    'approach': partial(_random, random_motions.approach)}
+    'spline': random_courses.spline, 'random_walk': partial(_random, random_courses.random_walk),
+    'stairs': partial(_random, random_courses.stairs),
+    'approach': partial(_random, random_courses.approach)}
+
+
+def wind_course(wind: Wind, count: int, period: float, rng: np.random.Generator) -> Array:
+    """Return the air's velocity (count, 3), m/s, ENU, every period, s, in one run."""
+    direction = rng.uniform(-math.pi, math.pi)
+    speed = rng.uniform(*wind.speed)
+    steady = speed * np.array([math.cos(direction), math.sin(direction), 0.0])
+    keep = math.exp(-period / wind.gust_time)
+    fresh = wind.gust * rng.standard_normal((count, 3)) * [1.0, 1.0, 0.5]
+    gusts = fresh
+    for k in range(1, count):
+        gusts[k] = keep * gusts[k - 1] + math.sqrt(1.0 - keep * keep) * fresh[k]
+    return steady + gusts

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The motion of a vehicle that an autopilot elsewhere flies, from its MAVLink messages.
+The motion of a vehicle that an external autopilot flies, from its MAVLink messages.
 
 Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); where neither
 comes, the autopilot's own estimate is LOCAL_POSITION_NED with ATTITUDE_QUATERNION. Times are
@@ -48,9 +48,9 @@ MEMORY: Final[int] = 256
 LONGEST_GAP: Final[int] = 150_000_000
 """Poses further apart than this, ns, have no known motion between them."""
 SMOOTHING: Final[float] = 1.0
-"""s in which the place that the velocity leads to gives way to that told, in steps of 1.1 cm."""
+"""s in which the integrated velocity approaches the reported place, in steps of 1.1 cm."""
 JUMP: Final[float] = 0.5
-"""m between the two from which on the place has been changed, not flown to."""
+"""m between the two; beyond it the vehicle was moved, not flown."""
 _DEGREE = 111_320.0  # m along a meridian
 _WRAP = 2**32  # ms of time_boot_ms, 50 days
 _RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clocks differ
@@ -74,20 +74,20 @@ class Motion(NamedTuple):
 
 class BootClock:
     """
-    Puts stamps of the autopilot's clock, ``time_boot_ms``, on ours.
+    Converts stamps of the autopilot's clock, ``time_boot_ms``, to the own clock.
 
-    The quickest message of late tells how far the clocks are apart; a slower one was late.
+    The quickest recent message gives the offset of the clocks; a slower one was late.
     """
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._boot = 0  # ms since boot, unwrapped
         self._offset = math.inf  # s, ours less the autopilot's
-        self._heard = 0.0
+        self._received = 0.0
         self.reboots = 0
 
     def stamp(self, time_boot_ms: int, now: int) -> int:
-        """Return when, ns on our clock, a message received now was stamped."""
+        """Return the stamp of a message received now, ns of the own clock."""
         if self._last is not None:
             step = (time_boot_ms - self._last + _WRAP // 2) % _WRAP - _WRAP // 2
             if step < -_REBOOT:
@@ -96,9 +96,9 @@ class BootClock:
             self._boot += step
         self._last = time_boot_ms
         seconds = now * 1e-9
-        self._offset = min(self._offset + _RISE * (seconds - self._heard),
+        self._offset = min(self._offset + _RISE * (seconds - self._received),
                            seconds - self._boot * 1e-3)
-        self._heard = seconds
+        self._received = seconds
         return round((self._offset + self._boot * 1e-3) * 1e9)
 
 
@@ -106,15 +106,15 @@ class ExternalMotion:
     """
     The motion of one vehicle at any time of the last second, from messages as they come.
 
-    The frame is ENU; its origin is where the vehicle was first heard of, if not set before.
+    The frame is ENU; its origin is the first reported place, if not set before.
     """
 
     def __init__(self) -> None:
         self.source = ''
-        """Name of the message that places it; '' until a truth is heard, or ``use_estimate``."""
+        """Name of the message that places it; '' until a truth comes, or ``use_estimate``."""
         self.reboots = 0
         self.times: list[tuple[float, float]] = []
-        """Our time and the autopilot's since it booted, s: simulators may be slow."""
+        """Own time and the autopilot's since it booted, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self._clock = BootClock()
@@ -122,7 +122,7 @@ class ExternalMotion:
         """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""
 
     def use_estimate(self) -> None:
-        """Take the autopilot's own estimate from now on, where no truth has come."""
+        """Take the autopilot's own estimate from now on, if no truth has come."""
         self.source = self.source or ESTIMATE
 
     @property
@@ -156,7 +156,7 @@ class ExternalMotion:
         return self._poses[-1].time if self._poses else None
 
     def pace(self, since: float) -> float:
-        """Return how fast the autopilot's time goes by ours since a time of ours, s, or NaN."""
+        """Return the rate of the autopilot's time to the own time since an own time, s, or NaN."""
         recent = [sample for sample in self.times[-20:] if sample[0] >= since]
         if len(recent) < 2 or recent[-1][0] - recent[0][0] < 1.0:
             return math.nan
@@ -171,11 +171,11 @@ class ExternalMotion:
 
     def at(self, time: int) -> Motion:
         """
-        Return the motion at a time, ns, interpolated, also where ``knows`` says no.
+        Return the motion at a time, ns, interpolated, also if ``knows`` is False.
 
         Before the first pose it is that one, after the last one the last: nothing is extrapolated.
 
-        :raises ValueError: where no pose has come yet.
+        :raises ValueError: if no pose has come yet.
         """
         if not self._poses:
             raise ValueError('no pose has come yet')
@@ -237,16 +237,17 @@ class ExternalMotion:
         self.add(Motion(time, position - self.origin,
                         ned_to_enu([message.vx, message.vy, message.vz]), *turned))
 
-    def _place(self, now: int, told: Array, velocity: Array,
+    def _place(self, now: int, reported: Array, velocity: Array,
                turned: tuple[Array, Array]) -> None:
-        """Add a place told in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
-        position = told
+        """Add a place given in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
+        position = reported
         if self._poses:
             last = self._poses[-1]
             elapsed = (now - last.time) * 1e-9
             expected = last.position + 0.5 * elapsed * (last.velocity + velocity)
-            if np.linalg.norm(told - expected) < JUMP:
-                position = expected + (1.0 - math.exp(-elapsed / SMOOTHING)) * (told - expected)
+            if np.linalg.norm(reported - expected) < JUMP:
+                share = 1.0 - math.exp(-elapsed / SMOOTHING)
+                position = expected + share * (reported - expected)
         self.add(Motion(now, position, velocity, *turned))
 
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_desk.flocks import neighbor_search
-from flock_desk.flocks.all_pairs import accelerations
+from flock_desk.flocks.graph import nearest, pairs_within
+from flock_desk.flocks.models import accelerations
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -82,23 +82,23 @@ def test_pairs_within_a_distance_are_all_found_once(dimension: int) -> None:
     x = np.random.default_rng(1).random((60, dimension)) * 4.0
     expected = [[i, j] for i in range(60) for j in range(i + 1, 60)
                 if np.linalg.norm(x[i] - x[j]) < 1.2]
-    assert sorted(neighbor_search.pairs_within(x, 1.2).tolist()) == expected
-    assert neighbor_search.pairs_within(x[:1], 1.2).shape == (0, 2)
+    assert sorted(pairs_within(x, 1.2).tolist()) == expected
+    assert pairs_within(x[:1], 1.2).shape == (0, 2)
 
 
 def test_the_nearest_are_found_without_oneself() -> None:
     x = np.random.default_rng(2).random((40, 3))
-    found = neighbor_search.nearest(x, 7)
+    found = nearest(x, 7)
     assert found.shape == (40, 7)
     for i, others in enumerate(found):
         distances = np.linalg.norm(x - x[i], axis=1)
         distances[i] = np.inf
         assert sorted(others) == sorted(np.argsort(distances)[:7])
-    assert neighbor_search.nearest(x[:3], 7).shape == (3, 2)
-    assert neighbor_search.nearest(x[:1], 7).shape == (1, 0)
+    assert nearest(x[:3], 7).shape == (3, 2)
+    assert nearest(x[:1], 7).shape == (1, 0)
 
 
 def test_agents_in_one_place_do_not_find_themselves() -> None:
-    found = neighbor_search.nearest(np.zeros((12, 2)), 3)
+    found = nearest(np.zeros((12, 2)), 3)
     assert found.shape == (12, 3)
     assert not np.any(found == np.arange(12)[:, None])

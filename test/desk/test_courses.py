@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flock_desk.scenarios.leader import Course, course, STEP
+from flock_desk.scenarios.courses import Course, course, STEP
 from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
 from flock_desk.scenarios.scenario import Scenario, Start
 

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The vehicles that autopilots elsewhere fly in one flight: the follower, perhaps its leader.
+The vehicles that external autopilots fly in one flight: the follower, perhaps its leader.
 
-Each has a link of its own. They share a frame, ENU from where the follower was first heard of,
-since both truths are latitude, longitude and height.
+Each has a link of its own. They share a frame, ENU from the follower's first reported place, since
+both truths are latitude, longitude and height.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ import time
 from typing import Final
 
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.told_motion import LONGEST_GAP
+from flock_desk.external.external_motion import LONGEST_GAP
 
 POSE_TIMEOUT: Final[float] = 30.0
 """s for the first pose of a vehicle."""
 LATE: Final[float] = 0.5
-"""s without a pose from which on it is told."""
+"""s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
 """s without a pose of the follower after which there is nothing to simulate."""
 PACE_WINDOW: Final[float] = 5.0
 """s over which the time of an autopilot is compared with ours."""
 SLOW: Final[float] = 0.95
-"""Of our clock's pace: a simulator that goes slower is not as agile as it says."""
+"""Of the own clock's pace: a slower simulator is less agile than its model."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 
 
-class VehiclesElsewhere:
+class ExternalVehicles:
     """
-    The links of a flight; both motions count from where the follower was first heard of.
+    The links of a flight; both motions count from the follower's first reported place.
 
     :param follower: to its autopilot.
     :param leader: likewise; None: the scenario has a leader of its own.
@@ -63,7 +63,7 @@ class VehiclesElsewhere:
 
         :param forwarded: whether the follower is sent odometry made of where it is.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: where a vehicle tells no pose, or no truth where it has to.
+        :raises ValueError: if a vehicle sends no pose, or no truth although it has to.
         """
         why_truth = TWO_ORIGINS if self.leader else FORWARDED if forwarded else ''
         self.follower.await_pose(POSE_TIMEOUT, why_truth, wanted)
@@ -74,7 +74,7 @@ class VehiclesElsewhere:
         self.start_ns = self.follower.motion.newest or time.monotonic_ns()
 
     def receive(self, wait: float) -> None:
-        """Take what has arrived; wait for news of the follower for ``wait`` seconds at most."""
+        """Take what has arrived; wait for the follower for ``wait`` seconds at most."""
         for _, link in self._links:
             link.receive(wait)
             wait = 0.0
@@ -108,17 +108,18 @@ class VehiclesElsewhere:
 
     def stalled(self, now: float, time_ns: int) -> str:
         """Return, for people, which poses are missing at a time of the flight; '' for none."""
-        told = []
+        problems = []
         for name, link in self._links:
             # Whether the leader's poses reach up to now is known a little later.
             at = self.start_ns + time_ns - (LONGEST_GAP if name == 'leader' else 0)
             lacking = 'no image' if name == 'leader' else 'no image, no odometry'
             age = now - link.known(now)
             if age > LATE:
-                told.append(f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
+                problems.append(
+                    f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
             elif time_ns > 2 * LONGEST_GAP and not link.motion.knows(at):  # one pose at first
-                told.append(f'poses of the {name} come too far apart: {lacking} between them')
-        return '; '.join(told)
+                problems.append(f'poses of the {name} come too far apart: {lacking} between them')
+        return '; '.join(problems)
 
     def slow(self, now: float) -> str:
         """Return, for people, whose simulator is too slow; '' where none is."""

@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.external.told_motion import (
+from flock_desk.external.external_motion import (
     BootClock,
     ExternalMotion,
     JUMP,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A flight of a vehicle elsewhere: where the scenario is put, and what is not invented."""
+"""A flight of vehicles elsewhere: where the scenario is put, and what is not invented."""
 
 import math
 
@@ -20,21 +20,28 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk.closed_loop.flown_leader import ExternalLeader
 from flock_desk.closed_loop.flown_vehicle import ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
+    LATEST_NS,
     real_time_camera,
     RealTimeFlight,
+    SENSOR,
     STEP_NS,
 )
-from flock_desk.external.told_motion import ExternalMotion
+from flock_desk.external.external_motion import ExternalMotion
+from flock_desk.scenarios.leader_motion import LeaderMotion
 from flock_desk.scenarios.scenario import Scenario, Sensing, VioErrors
 from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
 
 pytestmark = pytest.mark.slow
 START = 5_000_000_000  # ns, of the flight
+PERIOD = 20_000_000  # ns between poses
+LATE = 13_000_000  # ns by which those of the leader come later
 EXACT = VioErrors(latency=(0.0, 0.0), **dict.fromkeys((
     'position_walk', 'height_walk', 'yaw_walk', 'position', 'tilt', 'tilt_bias', 'attitude',
     'velocity', 'velocity_white', 'gyro_bias', 'gyro'), 0.0))
+NEVER = math.inf, math.inf
 
 
 @pytest.fixture(scope='module')
@@ -42,38 +49,55 @@ def camera():
     return real_time_camera(0)
 
 
+def told(north, up, yaw=0.0, velocity=(0.0, 0.0, 0.0)):
+    """Return ground truth, yaw from north."""
+    return mavlink.MAVLink_sim_state_message(
+        math.cos(yaw / 2), 0, 0, math.sin(yaw / 2), *[0] * 11, 488.0 + up, 0, 0, *velocity,
+        round(474000000 + north / 111_320.0 * 1e7), 85000000)
+
+
 class Elsewhere:
-    """A vehicle that flies north at 0.2 m/s, facing north-east, as ground truth tells at 50 Hz."""
+    """
+    A vehicle that climbs to 2 m, flies north at 0.2 m/s and faces north-east.
 
-    def __init__(self, camera):
-        self.motion = ExternalMotion()
-        self.told_ns = START
-        self.tell(START)
+    With ``led`` its leader, too, is flown elsewhere: 2 m ahead at 2 m height, north at 0.3 m/s.
+    """
+
+    def __init__(self, camera, led=False):
+        self.motion, self.ahead = ExternalMotion(), ExternalMotion()
+        self.told_ns, self.led_ns = START - PERIOD, START - PERIOD
+        self.tell(START, NEVER, NEVER)
         self.vehicle = ExternalVehicle(self.motion, START, height=0.0)
-        scenario = Scenario('test', 'for a test', sensing=Sensing(latency=(0.1, 0.1)),
-                            odometry=EXACT)
-        self.flight = RealTimeFlight(scenario, 0, self.vehicle, camera)
-        self.odometry, self.frames = [], []
+        self.flight = RealTimeFlight(
+            Scenario('test', 'for a test', sensing=Sensing(latency=(0.1, 0.1)), odometry=EXACT,
+                     leader=LeaderMotion(motion='circle', speed=1.0) if led else LeaderMotion()),
+            0, self.vehicle, camera, LATEST_NS + 40_000_000 * led,
+            ExternalLeader(self.ahead, START, self.vehicle.origin) if led else None)
+        self.odometry, self.frames, self.distances = [], [], []
 
-    def tell(self, now):
-        seconds = (now - START) * 1e-9
-        north = 0.2 * seconds
-        yaw = math.pi / 4
-        self.motion.take(mavlink.MAVLink_sim_state_message(
-            math.cos(yaw / 2), 0, 0, math.sin(yaw / 2), 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-            488.0 + 2.0 * min(seconds, 1.0), 0, 0, 0.2, 0.0, -2.0 * (seconds < 1.0),
-            round(474000000 + north / 111_320.0 * 1e7), 85000000), now)
-        self.told_ns = now
+    def tell(self, now, silent, leader_silent):
+        while self.told_ns + PERIOD <= now:
+            self.told_ns += PERIOD
+            time = (self.told_ns - START) * 1e-9
+            if not silent[0] < time < silent[1]:
+                climb = -2.0 * (time < 1.0)
+                self.motion.take(told(0.2 * time, 2.0 * min(time, 1.0), math.pi / 4,
+                                      (0.2, 0.0, climb)), self.told_ns)
+        self.ahead.origin = self.motion.origin
+        while self.led_ns + PERIOD + LATE * (self.led_ns > START) <= now:
+            self.led_ns += PERIOD
+            time = (self.led_ns - START) * 1e-9
+            if not leader_silent[0] < time < leader_silent[1]:
+                self.ahead.take(told(2.0 + 0.3 * time, 2.0, velocity=(0.3, 0.0, 0.0)),
+                                self.led_ns)
 
-    def fly(self, seconds, engaged=False, silent=(math.inf, math.inf)):
+    def fly(self, seconds, engaged=False, silent=NEVER, leader_silent=NEVER):
         """Fly on; nothing is told from one moment of the flight to another, s."""
         end = self.flight.time_ns + round(seconds * 1e9)
         while self.flight.time_ns < end:
-            while self.told_ns < START + self.flight.time_ns + STEP_NS:
-                self.told_ns += 20_000_000
-                if not silent[0] < (self.told_ns - START) * 1e-9 < silent[1]:
-                    self.tell(self.told_ns)
+            self.tell(START + self.flight.time_ns + STEP_NS + PERIOD, silent, leader_silent)
             self.odometry += [(stamp, state) for stamp, state in self.flight.after_step(engaged)]
+            self.distances.append(self.flight.distance)
             frame = self.flight.look(self.flight.time_ns)
             if frame is not None:
                 self.frames.append(frame)
@@ -135,3 +159,33 @@ def test_where_no_poses_come_no_image_and_no_odometry_is_invented(camera):
         others = times[(times < 1.0) | (times > 1.8)]
         assert np.count_nonzero(np.diff(others) > 1.5 * spacing) == 1
     assert flown.flight.skipped_images >= 23  # of 0.8 s
+
+
+def test_a_leader_elsewhere_is_where_it_says_and_the_scenarios_does_not_fly(camera):
+    flown = Elsewhere(camera, led=True).fly(1.5)
+    assert flown.distances[-1] == pytest.approx(2.15, abs=0.02)
+    flown.vehicle.offboard = True  # nothing is placed before the follower then
+    flown.fly(1.0, engaged=True)
+    assert flown.flight.time == pytest.approx(0.99, abs=0.02)
+    for frame in flown.frames:
+        north = 2.0 + 0.3 * frame.stamp_ns * 1e-9
+        assert frame.leader.position == pytest.approx([0.0, north, 2.0], abs=0.012)  # 1e-7 deg
+        assert quaternion_to_matrix(frame.leader.quaternion) @ frame.leader.linear == (
+            pytest.approx([0.0, 0.3, 0.0], abs=1e-6))
+        assert frame.usable
+        # Nothing that the image shows was yet to be told.
+        assert START + frame.stamp_ns + round(0.5e9 * SENSOR.exposure) <= flown.ahead.newest
+    assert len(flown.frames) >= 73 and flown.flight.skipped_images == 0
+
+
+def test_where_the_leaders_poses_stall_there_is_no_image_and_no_distance_but_odometry(camera):
+    flown = Elsewhere(camera, led=True).fly(3.0, leader_silent=(1.0, 1.8))
+    images = np.array([frame.stamp_ns for frame in flown.frames]) * 1e-9
+    assert not np.any((images > 1.02) & (images < 1.8))
+    assert np.count_nonzero(np.diff(images) > 1.5 / 30) == 1
+    assert 22 <= flown.flight.skipped_images <= 25  # of 0.8 s
+    assert np.diff([stamp for stamp, _ in flown.odometry]) == pytest.approx(STEP_NS)
+    times = np.arange(1, len(flown.distances) + 1) * STEP_NS * 1e-9
+    lost = times[np.isnan(flown.distances)]
+    assert lost.min() == pytest.approx(1.15, abs=0.03) and lost.max() < 1.82
+    assert flown.distances[-1] == pytest.approx(2.3, abs=0.02)

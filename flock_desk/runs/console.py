@@ -1,0 +1,87 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Commands on the console: their errors and exit codes, progress, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import sys
+import time
+
+from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
+from flock_follower.live_line import LiveLine
+
+
+def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int:
+    """
+    Run a command and return its exit code; an error is one line on stderr.
+
+    :param refused: the exit code of an error: a wrong file, an option, a machine that is too busy.
+    :param hint: where to look for more, if the error is not a wrong value.
+    """
+    below = '\n' if sys.stderr.isatty() else ''  # the live line
+    try:
+        return command()
+    except TooBusyError as error:
+        print(f'\ntoo busy: {error}', file=sys.stderr)
+        return TOO_BUSY_EXIT_CODE
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        more = '' if isinstance(error, ValueError) else hint
+        print(f'{below}error: {explained(error)}{more}', file=sys.stderr)
+        return refused
+    except KeyboardInterrupt:
+        print(f'{below}interrupted', file=sys.stderr)
+        return 130
+
+
+def explained(error: Exception) -> str:
+    """Return an error in one line, that of a file with the file's name."""
+    if isinstance(error, OSError) and error.filename:
+        return f'{error.filename}: {error.strerror}'
+    return ' '.join(str(error).split())
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> list[str]:
+    """Return rows as lines of columns two apart, the first ``left`` of them flush left."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    return ['  '.join(cell.ljust(width) if n < left else cell.rjust(width)
+                      for n, (cell, width) in enumerate(zip(row, widths))).rstrip()
+            for row in rows]
+
+
+class Progress:
+    """The progress through a number of jobs of equal weight, on stderr: [2/3] NAME: 50 %."""
+
+    def __init__(self, jobs: int) -> None:
+        self._jobs, self._number, self._name = jobs, 0, ''
+        self._line = LiveLine(sys.stderr)
+
+    def start(self, name: str) -> None:
+        """Begin the next job, the one before being done."""
+        self._number, self._name = self._number + 1, name
+        self._line.due(time.monotonic())
+        self._line.show(f'[{self._number}/{self._jobs}] {name}')
+
+    def share(self, share: float) -> None:
+        """Show that a share, 0 to 1, of the present job is done, if it is time for a line."""
+        if self._line.due(time.monotonic()):
+            percent = 100.0 * (self._number - 1 + share) / self._jobs
+            self._line.show(f'[{self._number}/{self._jobs}] {self._name}: {percent:.0f} %')
+
+    def finish(self) -> None:
+        """End the last job."""
+        self._line.show('done')
+        self._line.end()

@@ -1,0 +1,392 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A flight through the real nodes, read from its files: a replayed one, and one of a scenario.
+
+`fly` leaves the last flight in its folder, earlier ones by scenario below it. A flight is complete
+once its summary is written; one that failed before does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+from dataclasses import dataclass, field
+import fcntl
+import json
+import math
+from pathlib import Path
+import shutil
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_desk.runs.frame_errors import FrameErrors, Table
+from flock_desk.scenarios.scenario import Scenario
+from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.geometry import Array, quaternion_to_matrix, Transform
+from flock_follower.messages import (
+    from_odometry,
+    from_trajectory,
+    NANOSECONDS,
+    OdometryState,
+    stamp_to_nanoseconds,
+)
+from flock_follower.odometry.reader import OdometrySource
+from flock_follower.perception.markers import MarkedNeighbor
+from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.planner.params import PlannerParams
+
+LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
+EARLIER = 'earlier'
+PICTURE = 'picture.jpg'
+_RECORD = 'record'
+_FILES = ('flight.npz', 'report.html', PICTURE, 'summary.json')
+
+
+class Received(NamedTuple):
+    """A recorded message and when it was received, s on the monotonic clock."""
+
+    time: float
+    message: Any
+
+
+@dataclass(frozen=True, eq=False)
+class FlightRecord:
+    """
+    A flight; times in s from its beginning, vectors in odom or a frame like it without drift.
+
+    ``table`` is that of ``frame_errors``, n images; ``leader`` and ``follower`` (n, 3) are the
+    true positions, m, at these. ``distance`` holds true distances, m, as often as they are known.
+    ``setpoints`` (k, 3), m/s^2, were on the wire at ``setpoint_times`` (k,); the vehicle flew
+    ``velocities`` (m, 3), m/s, at ``velocity_times`` (m,). ``states`` are the planner's, and
+    ``diagnostics`` the arrays published, each with its time. ``command_times`` are those for which
+    the planner commanded, s on the bag's clock.
+    """
+
+    duration: float
+    params: PlannerParams
+    table: Table
+    leader: Array
+    follower: Array
+    distance: Array
+    setpoint_times: Array
+    setpoints: Array
+    velocity_times: Array
+    velocities: Array
+    states: list[tuple[float, str]]
+    diagnostics: list[tuple[float, Any]]
+    command_times: Array = field(default_factory=lambda: np.empty(0))
+
+    def values(self, node: str, key: str) -> list[tuple[float, str]]:
+        """Return the values of a key in a node's diagnostics, with their times."""
+        return [(t, pair.value) for t, array in self.diagnostics for status in array.status
+                if status.name == node for pair in status.values if pair.key == key]
+
+    def value(self, node: str, key: str, time: float, otherwise: float = math.nan) -> float:
+        """Return the last value of a key up to a time, s."""
+        before = [value for t, value in self.values(node, key) if t <= time]
+        return float(before[-1]) if before else otherwise
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LiveRecord(FlightRecord):
+    """
+    A flight of a scenario, in the odom frame without drift.
+
+    An image of the table counts as one with the leader in view if the simulator says that the
+    leader can be seen and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the
+    scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
+    """
+
+    scenario: Scenario
+    log: dict[str, Any]
+
+    @property
+    def external(self) -> bool:
+        """Return whether an external autopilot flew the follower."""
+        return bool(str(self.log['pose_source']))
+
+    @property
+    def pace(self) -> float:
+        """Return the rate of the external autopilot's clock by ours; NaN if it is unknown."""
+        ours, theirs = self.log['clock'].T
+        return (float((theirs[-1] - theirs[0]) / (ours[-1] - ours[0])) if len(ours) > 1
+                else math.nan)
+
+    @property
+    def leader_speed(self) -> Array:
+        """Return the leader's speed at each image, m/s."""
+        return np.linalg.norm(self.log['leader_velocity'], axis=1)
+
+    @property
+    def time_in_band_share(self) -> float:
+        """Return the share of the time for which the true distance was inside the band."""
+        law = self.scenario.flight
+        return float(np.mean((self.distance > math.sqrt(law.d0))
+                             & (self.distance < math.sqrt(law.d1))))
+
+    @property
+    def blind(self) -> list[tuple[float, float]]:
+        """Return from when to when images could not show the leader, or place it, s."""
+        times, hidden = self.table['time'], self.table['visible'] == 0.0
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
+        return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
+                for begin, end in zip(edges[::2], edges[1::2])]
+
+
+def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
+    """
+    Return a replayed flight; its time begins with the bag's first image.
+
+    :param out: the folder of the record and the log of the embedded autopilot.
+    :param params: that it was flown with.
+    :raises BagError: if a record cannot be read.
+    :raises RuntimeError: if a node published nothing.
+    """
+    record = read_record(out / _RECORD)
+    if missing := {'/neighbors', '/planner/state', '/command/trajectory',
+                   '/diagnostics'} - set(record):
+        raise RuntimeError(f'nothing was published on {", ".join(sorted(missing))}')
+    commands = record['/command/trajectory']
+    received = np.array([t for t, _ in commands])
+    ticks = np.array([tick_time(message) for _, message in commands])
+    with open_bag(bag) as opened:
+        images, odometry, true_own, true_leader = (
+            [deserialize(m.data, m.msgtype) for m in opened.messages([topic])]
+            for topic in ('/image_raw/compressed', '/odom', '/truth/odom', '/truth/neighbors'))
+    stamps = np.array([stamp_to_nanoseconds(image.header.stamp) for image in images])
+    source = OdometrySource()  # as the nodes read it
+    own = [state for message in odometry
+           if (state := source.take(message, stamp_to_nanoseconds(message.header.stamp)))]
+    # Its leader is in view in every image.
+    table, leader, follower = compared(
+        estimates(record['/neighbors']), own, [*map(from_odometry, true_own)],
+        [*map(from_odometry, true_leader)], stamps, np.ones(len(stamps)), int(stamps[0]))
+    # The bag's clock relative to the monotonic one of the logs.
+    origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
+    with np.load(out / 'autopilot.npz') as file:
+        log = dict(file)
+    flown, sent = ((log[name] >= received[0]) & (log[name] <= received[-1])
+                   for name in ('state_time', 'setpoint_time'))
+    return FlightRecord(
+        duration=float(table['time'][-1]), params=params, table=table, leader=leader,
+        follower=follower, distance=table['true_distance'][np.isfinite(table['true_distance'])],
+        setpoint_times=log['setpoint_time'][sent] - origin,
+        setpoints=log['setpoint_acceleration'][sent],
+        velocity_times=log['state_time'][flown] - origin, velocities=log['velocity'][flown],
+        states=[(t - origin, m.data) for t, m in record['/planner/state']],
+        diagnostics=[(t - origin, m) for t, m in record['/diagnostics']], command_times=ticks)
+
+
+def tick_time(message: Any) -> float:
+    """Return the time for which a command holds, s: its stamp plus its point's time from start."""
+    command = from_trajectory(message, message.header.frame_id)
+    return (command.stamp + command.ahead) / NANOSECONDS
+
+
+def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord:
+    """
+    Return the flight of a scenario that `fly` recorded in a folder.
+
+    :param namespace: of its nodes; others publish their diagnostics on the same topic.
+    :raises BagError: if its record cannot be read.
+    :raises RuntimeError: if the scenario never began, or no image was made.
+    """
+    with np.load(out / 'flight.npz') as file:
+        log = dict(file)
+    began, ended = float(log['began']), float(log['ended'])
+    if not math.isfinite(began):
+        raise RuntimeError('the scenario never began: no offboard mode, or not engaged')
+    epoch = int(log['epoch_ns']) + round((began - float(log['start'])) * 1e9)
+
+    def flown(times: Any, begin: float = began, end: float = ended) -> Any:
+        return (times >= begin) & (times <= end)
+
+    shown = flown(log['image_stamp'], epoch, epoch + round((ended - began) * 1e9))
+    if not shown.any():
+        raise RuntimeError('not one image was rendered in time: the machine is too busy')
+    state_flown = flown(log['state_time'])
+    log['clock'] = log['clock'][flown(log['clock'][:, 0])]
+    for name in log:
+        if name.startswith(('image_', 'follower_', 'leader_')):
+            log[name] = log[name][shown]
+        elif name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
+            log[name] = log[name][state_flown]
+    record = read_record(out / _RECORD)
+    if str(log['pose_source']):
+        commands = record.get('/command/trajectory', [])
+        log['setpoint_time'] = np.array([command.time for command in commands])
+        log['setpoint_acceleration'] = np.reshape(
+            [from_trajectory(command.message, 'odom').acceleration for command in commands],
+            (-1, 3))
+    sent = flown(log['setpoint_time'])
+    table, leader, follower = compared(
+        estimates(record.get('/neighbors', [])), _states(log, 'odom', log['odom_stamp']),
+        _states(log, 'follower', log['image_stamp']),
+        _states(log, LEADER_NAME, log['image_stamp']),
+        log['image_stamp'], log['image_usable'].astype(float), epoch)
+    return LiveRecord(
+        duration=ended - began, params=scenario.flight.planner(True), table=table, leader=leader,
+        follower=follower, distance=log['distance'][flown(log['distance_time'])],
+        setpoint_times=log['setpoint_time'][sent] - began,
+        setpoints=log['setpoint_acceleration'][sent],
+        velocity_times=log['state_time'] - began, velocities=log['velocity'],
+        states=[(float(t) - began, str(s))
+                for t, s in zip(log['planner_time'], log['planner_state'])],
+        diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
+        scenario=scenario, log=log)
+
+
+def _of(array: Any, namespace: str) -> Any:
+    """Return a DiagnosticArray with the statuses of a namespace, under the nodes' own names."""
+    if namespace:
+        array.status = [status for status in array.status
+                        if status.name.startswith(f'{namespace}/')]
+        for status in array.status:
+            status.name = status.name.removeprefix(f'{namespace}/')
+    return array
+
+
+def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryState]:
+    unknown = np.zeros((6, 6))
+    return [OdometryState(int(stamp), 'odom', name, position, quaternion, velocity, np.zeros(3),
+                          unknown, unknown, np.eye(3))
+            for stamp, position, quaternion, velocity in zip(stamps, *(
+                log[f'{name}_{what}'] for what in ('position', 'quaternion', 'velocity')))]
+
+
+def read_record(path: Path) -> dict[str, list[Received]]:
+    """
+    Return what the recorder wrote, by topic.
+
+    :raises BagError: if it cannot be read.
+    """
+    record: dict[str, list[Received]] = {}
+    with open_bag(path) as bag:
+        for m in bag.messages():
+            record.setdefault(m.topic, []).append(
+                Received(m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
+    return record
+
+
+def estimates(messages: Sequence[Received]) -> dict[int, dict[str, Estimate]]:
+    """
+    Return the estimates that messages of ``neighbors`` hold, by stamp, ns, and name.
+
+    What a message does not hold is zero.
+    """
+    found: dict[int, dict[str, Estimate]] = {}
+    for _, message in messages:
+        state = from_odometry(message)
+        rotation, covariance = quaternion_to_matrix(state.quaternion), np.zeros((15, 15))
+        covariance[:3, :3] = state.pose_covariance[:3, :3]
+        covariance[3:6, 3:6] = state.velocity_covariance
+        found.setdefault(state.stamp, {})[state.child] = Estimate(
+            state.stamp / NANOSECONDS, state.position, state.velocity, rotation,
+            rotation @ state.angular_velocity, np.zeros(3), covariance)
+    return found
+
+
+def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[OdometryState],
+             true_own: Sequence[OdometryState], true_leader: Sequence[OdometryState],
+             stamps: NDArray[np.int64], visible: Array,
+             start: int) -> tuple[Table, Array, Array]:
+    """
+    Return the table of ``frame_errors`` and the true positions (n, 3) of leader and follower.
+
+    The consistency of velocities is left unknown (NaN): the covariance in a message is of the
+    twist in the leader's body, and holds the error of the leader's attitude, too.
+
+    :param stamps: (n,) of the images, ns.
+    :param visible: (n,), 1 if the truth has the leader in view.
+    :param start: the time of zero in the table, ns.
+    """
+    errors = FrameErrors(
+        [MarkedNeighbor(LEADER_NAME, ())], Transform(np.eye(3), np.zeros(3)), start)
+    for take, states in ((errors.odometry, own), (errors.true_odometry, true_own),
+                         (errors.true_neighbor, true_leader)):
+        for state in states:
+            take(state._replace(child=LEADER_NAME))
+    for stamp in stamps.tolist():
+        errors.frame(stamp, found.get(stamp, {}), {})
+    table = {**errors.table(LEADER_NAME), 'visible': visible,
+             'nees_velocity': np.full(len(stamps), np.nan)}
+    return table, _positions(true_leader, stamps), _positions(true_own, stamps)
+
+
+def _positions(states: Sequence[OdometryState], stamps: NDArray[np.int64]) -> Array:
+    """Return the positions (n, 3) at stamps, linear between states."""
+    times = np.array([s.stamp for s in states]) - stamps[0]
+    positions = np.array([s.position for s in states])
+    return np.stack([np.interp(stamps - stamps[0], times, column) for column in positions.T],
+                    axis=1)
+
+
+def scenario_flown(folder: Path) -> str:
+    """Return the name of the scenario of the flight in a folder, '' if none is complete."""
+    try:
+        summary = json.loads((folder / 'summary.json').read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return ''
+    name = summary.get('scenario') if isinstance(summary, dict) else None
+    return name if isinstance(name, str) else ''
+
+
+def last_flight(folder: Path, scenario: str) -> Path | None:
+    """Return the folder below that of `fly` of the last complete flight of a scenario, if any."""
+    return next((place for place in (folder, folder / EARLIER / scenario)
+                 if scenario_flown(place) == scenario), None)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """
+    Keep a folder, which is made, from a second flight inside the block.
+
+    :raises RuntimeError: if another flight is writing to it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / '.lock', 'w', encoding='ascii') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RuntimeError(f'another flight writes to {folder}: give --output') from error
+        yield
+
+
+def clear(folder: Path) -> None:
+    """Remove the record, the logs and the results of an earlier flight, and nothing else."""
+    shutil.rmtree(folder / _RECORD, ignore_errors=True)
+    for path in (*(folder / name for name in _FILES), *folder.glob('*.log')):
+        path.unlink(missing_ok=True)
+
+
+def set_aside(folder: Path) -> None:
+    """
+    Move the complete flight in a folder to the earlier ones, in place of that of its scenario.
+
+    :raises OSError: if it cannot be moved.
+    """
+    scenario = scenario_flown(folder)
+    if not scenario or Path(scenario).name != scenario:
+        return  # nothing there, or not written by `fly`
+    place = folder / EARLIER / scenario
+    clear(place)
+    place.mkdir(parents=True, exist_ok=True)
+    for name in (_RECORD, *_FILES):  # the summary last: an incomplete flight does not count
+        if (folder / name).exists():
+            (folder / name).replace(place / name)

@@ -1,0 +1,188 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""`make fly` through the real nodes: an embedded autopilot, and one that runs already."""
+
+import base64
+import json
+import math
+from pathlib import Path
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk.fly import main
+from flock_desk.runs.processes import free_udp_port
+from flock_desk.vehicles.equipment import GROUND_AMSL
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros]
+AUTOPILOT = str(Path(__file__).parents[1] / 'faulty_autopilot.py')
+
+
+def test_a_flight_is_safe_and_its_report_complete(tmp_path):
+    main(['--scenario', 'hover', '--duration', '4', '--output', str(tmp_path)])
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    # Whatever else this machine is doing: nothing unsafe is sent or flown, and it follows.
+    assert summary['duration_s'] == pytest.approx(4.0, abs=0.02)
+    assert summary['time_in_band_share'] == 1.0
+    assert summary['setpoints']['acceleration_max_m_s2'] <= 2.5
+    assert summary['speed_max_m_s'] <= 0.55
+    assert summary['setpoints']['sent'] > 40 and summary['frames'] * summary['recall'] > 20
+    assert summary['position_rms_m'] < 0.05 and summary['failed_processes'] == 0
+    assert {'simulator', 'planner'} <= set(summary['cpu_cores']) or not Path('/proc').exists()
+    log = np.load(tmp_path / 'flight.npz')
+    assert set(log['mode'][log['state_time'] >= log['began']]) == {'OFFBOARD'}
+    for name in ('relative_pose', 'planner', 'mavlink_bridge', 'recorder'):
+        assert 'Traceback' not in (tmp_path / f'{name}.log').read_text()
+    page = (tmp_path / 'report.html').read_text()
+    assert 'http' not in re.sub(r'base64,[^"]*', '', page)  # it needs nothing from elsewhere
+    pictures = re.findall(r'data:image/(png|jpeg);base64,([^"]+)', page)
+    assert [kind for kind, _ in pictures][:3] == ['png', 'png', 'jpeg']
+    assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
+    assert '<code>time_in_band_share</code>' in page
+    assert (tmp_path / 'picture.jpg').read_bytes()[:2] == b'\xff\xd8'
+
+
+@pytest.fixture
+def running():
+    """Start embedded autopilots, and end them."""
+    started = []
+
+    def start(*arguments):
+        started.append(subprocess.Popen(
+            [sys.executable, AUTOPILOT, *arguments],
+            start_new_session=True))
+        return started[-1]
+    yield start
+    for child in started:
+        child.kill()
+        child.wait()
+
+
+class HoveringLeader:
+    """The truth of a second PX4: it hovers, facing ``yaw`` (deg, ENU), ahead of the first."""
+
+    def __init__(self, port, yaw, distance, height):
+        c, s = (f(math.radians(yaw)) for f in (math.cos, math.sin))
+        half = 0.5 * math.radians(90.0 - yaw)
+        self._messages = [
+            mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3),
+            mavlink.MAVLink_hil_state_quaternion_message(
+                0, [math.cos(half), 0, 0, math.sin(half)], 0, 0, 0,
+                round((47.397742 + distance * s / 111_320.0) * 1e7),
+                round((8.545594 + distance * c / (
+                    111_320.0 * math.cos(math.radians(47.397742)))) * 1e7),
+                round((GROUND_AMSL + height) * 1e3), *[0] * 8)]
+        self._port, self._ended = port, threading.Event()
+        self._thread = threading.Thread(target=self._tell)
+
+    def _tell(self):
+        codec = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            while not self._ended.wait(0.02):
+                for message in self._messages:
+                    line.sendto(message.pack(codec), ('127.0.0.1', self._port))
+
+    def __enter__(self):
+        self._thread.start()
+
+    def __exit__(self, *_):
+        self._ended.set()
+        self._thread.join()
+
+
+def test_a_flight_from_the_ground_and_back_behind_the_vehicle_of_a_second_autopilot(
+        running, tmp_path):
+    port, truth, leader = (free_udp_port() for _ in range(3))
+    log, out = tmp_path / 'vehicle.npz', tmp_path / 'out'
+    autopilot = running(
+        '--start', 'landed', '--yaw', '60', '--connect', f'127.0.0.1:{port}',
+        '--truth', f'127.0.0.1:{truth}', '--log', str(log), '--param', 'COM_OF_LOSS_T=0.5',
+        '--param', 'EKF2_EV_CTRL=15', '--param', 'EKF2_GPS_CTRL=0')
+    with HoveringLeader(leader, 60.0, 1.6, 2.5):
+        main(['--scenario', 'fast_leader', '--duration', '4', '--output', str(out),
+              '--autopilot', f'udp:127.0.0.1:{port}', '--truth', f'udpin:127.0.0.1:{truth}',
+              '--leader-truth', f'udp:127.0.0.1:{leader}', '--forward-odometry'])
+    # Whatever else this machine is doing: it followed safely, and the report is there.
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['external']['pose_from'] == 'HIL_STATE_QUATERNION'
+    assert summary['external']['leader_from'] == 'HIL_STATE_QUATERNION'
+    assert summary['external']['pace'] == pytest.approx(1.0, abs=0.2)
+    assert summary['leader_speed_max_m_s'] == 0.0 and not summary['leader_faster_than_v_max']
+    assert summary['duration_s'] == pytest.approx(4.0, abs=0.05)
+    assert summary['true_distance_m']['min'] > 1.0 and summary['true_distance_m']['max'] < 2.83
+    assert summary['distance_rms_m'] < 0.02 and summary['speed_max_m_s'] <= 0.55
+    assert summary['frames'] * summary['recall'] > 20 and summary['failed_processes'] == 0
+    assert (out / 'report.html').stat().st_size > 100_000
+    received = np.load(out / 'flight.npz')
+    place = 1.6 * np.array([0.5, math.sqrt(0.75)])
+    assert received['leader_position'] == pytest.approx(
+        np.tile([*place, 2.5], (len(received['leader_position']), 1)), abs=0.02)
+    assert autopilot.poll() is None  # it is the user's: it runs on
+    autopilot.terminate()
+    autopilot.wait(10.0)
+    # The truth received is the vehicle's motion, from the ground and back to it.
+    flown = np.load(log)
+    for axis in range(3):
+        there = np.interp(received['state_time'], flown['state_time'], flown['position'][:, axis])
+        assert np.abs(there - received['position'][:, axis]).max() < 0.15
+    assert flown['position'][:, 2].max() > 2.0 and flown['position'][-1, 2] < 0.05
+    assert not flown['armed'][-1] and len(flown['odometry_time']) > 100
+
+
+def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_report(
+        running, tmp_path, capfd):
+    port, truth = free_udp_port(), free_udp_port()
+    # Setpoints begin while offboard is asked for; the scenario 1.5 s later.
+    switch = {'kind': 'pilot', 'at': 8.0, 'after': 'setpoint', 'mode': 'POSCTL'}
+    running('--start', 'landed', '--connect', f'127.0.0.1:{port}', '--truth',
+            f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5', '--fault', json.dumps(switch))
+    out, began = tmp_path / 'out', time.monotonic()
+    assert main(['--scenario', 'hover', '--output', str(out),
+                 '--autopilot', f'udp:127.0.0.1:{port}',
+                 '--truth', f'udpin:127.0.0.1:{truth}']) == 1
+    assert time.monotonic() - began < 60.0  # as long as the scenario alone
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['duration_s'] < 10.0 and summary['failed_processes'] == 0
+    why = summary['external']['ended_early']
+    assert why.startswith('TAKEN_OVER: ')
+    told = capfd.readouterr()
+    assert f'the bridge has ended the flight: {why}' in told.out
+    assert f'warning: the flight ended after {summary["duration_s"]:.1f} s: {why}' in told.err
+    assert 'FAILED: duration_s' in told.err
+    assert why in (out / 'report.html').read_text()
+
+
+def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
+    log = tmp_path / 'nowhere' / 'flight.npz'
+    script = (
+        'import sys; sys.argv = ["flock_follower/simulator", *sys.argv[1:]]\n'
+        'from flock_desk.closed_loop.real_time_flight import RealTimeFlight\n'
+        'RealTimeFlight.time = property(lambda self: 1e9)  # flown already\n'
+        'from flock_desk.simulator_node import main; sys.exit(main())')
+    ended = subprocess.run(
+        [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',
+         '-p', f'connection:=127.0.0.1:{free_udp_port()}'],
+        capture_output=True, text=True, timeout=40.0)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1] == f'error: {log}: No such file or directory'
+    assert 'Traceback' not in ended.stderr
