@@ -15,9 +15,11 @@
 """
 The law alone, with numpy: three agents of the paper agree on a velocity, and keep their distance.
 
-    python examples/law_alone.py law_alone.png
+    python examples/law_alone.py [PICTURE]    # build/law_alone.png
 """
 
+from pathlib import Path
+import signal
 import sys
 
 from matplotlib.figure import Figure
@@ -25,6 +27,7 @@ import numpy as np
 
 from flock_follower.flocking import accelerations, FlockingParams, lyapunov
 
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback
 DT, DURATION = 0.01, 20.0  # s
 # d0 and d1 bound the squared distance: 1 to 2.25 m^2 is 1 to 1.5 m.
 params = FlockingParams(K=1.0, sigma=1.0, beta=0.5, theta=2.0, d0=1.0, d1=2.25)
@@ -56,4 +59,6 @@ for i, j in ((0, 1), (0, 2), (1, 2)):
 apart.set(title='distances', xlabel='time [s]', ylabel='[m]')
 above.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0))
 apart.legend()
-figure.savefig(sys.argv[1] if len(sys.argv) > 1 else 'law_alone.png', dpi=120)
+picture = Path(sys.argv[1] if len(sys.argv) > 1 else 'build/law_alone.png')
+picture.parent.mkdir(parents=True, exist_ok=True)
+figure.savefig(picture, dpi=120)

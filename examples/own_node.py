@@ -21,6 +21,7 @@ The planner in a node of your own, for a vehicle that takes accelerations in ano
 
 from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
 import rclpy.node
 from rclpy.qos import qos_profile_sensor_data as sensor_qos
 
@@ -55,5 +56,8 @@ class OwnNode(rclpy.node.Node):
             self.commands.publish(Vector3(**dict(zip('xyz', command.acceleration))))
 
 
-rclpy.init()
-rclpy.spin(OwnNode())
+try:
+    rclpy.init()
+    rclpy.spin(OwnNode())
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass

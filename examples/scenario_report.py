@@ -19,6 +19,7 @@ A scenario of your own, flown ten times in lock step, and its report: no ROS, so
 """
 
 from pathlib import Path
+import signal
 import sys
 
 from matplotlib.figure import Figure
@@ -31,6 +32,7 @@ from flock_desk.runs.report import announce, Chapter, Illustration, write_report
 from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario_file import parse
 
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback
 SCENARIO = """
 summary: the leader climbs as it goes, and hides for a second
 duration: 20

@@ -51,6 +51,7 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
+from flock_follower.whole_file import whole_file
 
 # The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
 # faster than the 0.5 m/s of a first flight.
@@ -109,7 +110,8 @@ def _demonstrate(out: Path) -> int:
 def _pictures(flight: FlightRecord, picture: Path) -> Sequence[Chapter]:
     from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
     plotted = PlottedFlight.of(flight)
-    picture.write_bytes(flight_picture(plotted, TITLE))
+    with whole_file(picture) as file:
+        file.write(flight_picture(plotted, TITLE))
     return chapters(plotted)
 
 

@@ -41,6 +41,7 @@ from flock_desk.runs.marker_pages import (
     SIZES,
 )
 from flock_follower.perception.markers import dictionary_size, SIDE_LENGTHS
+from flock_follower.whole_file import whole_file
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -71,7 +72,8 @@ def _write(options: argparse.Namespace) -> int:
     page = choose_page(options.page, prints[0])
     pages = [draw(each, page) for each in prints]
     title_ids, title_sizes = (', '.join(f'{n:g}' for n in given) for given in (ids, sizes))
-    options.output.write_bytes(pdf(pages, f'{dictionary} {title_ids}, {title_sizes} m'))
+    with whole_file(options.output) as file:
+        file.write(pdf(pages, f'{dictionary} {title_ids}, {title_sizes} m'))
     hint = '' if options.panel or page == 'A4' else (
         f'; A4 holds up to {largest_on_a4(dictionary)} m')
     print(f'{options.output}: page {page}, {pages[0].width:g} x {pages[0].height:g} mm{hint}',

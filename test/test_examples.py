@@ -45,14 +45,14 @@ def test_they_are_short() -> None:
     pages = sorted(EXAMPLES.glob('*.[py]*'))
     assert [page.stem for page in pages] == [
         'bag_in_ci', 'bag_in_ci', 'law_alone', 'own_node', 'scenario_report']
-    assert all(len(page.read_text().splitlines()) < 60 for page in pages)
+    assert all(len(page.read_text().splitlines()) < 65 for page in pages)
 
 
 def test_the_law_alone_draws_a_flock_that_agrees(tmp_path: Path) -> None:
     ended = run('law_alone.py', folder=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith('speeds [0.1075 0.1075 0.1075] m/s')  # as the paper's
-    assert (tmp_path / 'law_alone.png').read_bytes().startswith(b'\x89PNG')
+    assert (tmp_path / 'build' / 'law_alone.png').read_bytes().startswith(b'\x89PNG')
 
 
 def test_a_scenario_is_flown_and_reported(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ from flock_desk.runs.plots import with_gaps
 from flock_desk.runs.record import LiveRecord
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each where there is no colour.
@@ -80,7 +81,8 @@ def save(figure: Figure, path: Path) -> str:
     """Write a figure in every kind, beside each other, and return the names in one."""
     with styled():
         for kind in KINDS:
-            figure.savefig(path.with_suffix(f'.{kind}'), dpi=300, metadata=_METADATA[kind])
+            with whole_file(path.with_suffix(f'.{kind}')) as file:
+                figure.savefig(file, format=kind, dpi=300, metadata=_METADATA[kind])
     return f'{path.name}.' + '/.'.join(KINDS)
 
 

@@ -187,7 +187,7 @@ class Replay(FlockNode):
         named = self._names_in('wait_for')
         awaited = self.bag.select(named) if named else self._topics
         deadline = time.monotonic() + timeout
-        while lonely := [topic for topic, output in self._outputs.items()
+        while lonely := [output.topic_name for topic, output in self._outputs.items()
                          if topic in awaited and output.get_subscription_count() == 0]:
             if time.monotonic() >= deadline:
                 if timeout > 0.0:

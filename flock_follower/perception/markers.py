@@ -53,6 +53,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+import difflib
 from functools import lru_cache
 import math
 from pathlib import Path
@@ -371,11 +372,13 @@ def _check_keys(where: str, entry: Any, keys: set[str],
     place = where or 'the document'
     if not isinstance(entry, Mapping):
         raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
+    for unknown in sorted(str(key) for key in set(entry) - keys - {*optional}):
+        known = sorted({*keys, *optional})
+        near = difflib.get_close_matches(unknown, known, n=1)
+        raise ValueError(f'{place} has an unknown key {unknown}: ' + (
+            f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
     for key in sorted(keys - set(entry)):
         raise ValueError(f'{place} lacks {key}')
-    for unknown in sorted(str(key) for key in set(entry) - keys - {*optional}):
-        raise ValueError(f'{place} has an unknown key {unknown}: must be one of '
-                         f'{", ".join(sorted({*keys, *optional}))}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:
