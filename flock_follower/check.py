@@ -20,7 +20,7 @@ autopilot's messages through the bridge. ``check BAG`` reads a recording, withou
 what is missing for ``evaluate``. Each line names a property, its measured value and the value it
 should have; the line below a fault says what to do.
 
-A line that begins with ``?`` is one that could not be measured, and why.
+A line that begins with ``?`` names a property that could not be measured, and why.
 
 Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, or if
 something essential was not measured, 2 for a wrong bag, file or option, or without ROS.
@@ -70,16 +70,16 @@ def main(args: Sequence[str] | None = None) -> int:
         'or a recording, before anything flies. It changes nothing.')
     parser.add_argument('bag', type=Path, nargs='?', metavar='BAG',
                         help='.mcap, .db3, .bag or ROS 2 bag folder; none: the running system')
-    parser.add_argument('--config', type=Path, help='ROS 2 parameter file: with a bag those that '
-                        'it is looked at with (default: those flown, of a recording of the black '
-                        'box, else config/follower.yaml of this package); '
-                        'of the running nodes it is told where they run with others')
+    parser.add_argument('--config', type=Path, help='ROS 2 parameter file: a bag is checked with '
+                        'its values (default: those flown, of a recording of the black box, else '
+                        'config/follower.yaml of this package); running nodes are compared with '
+                        'it')
     parser.add_argument('--namespace', default='', help='of the nodes and topics')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='one of our topics by another name, as odom:=/camera/odom/sample; '
                         'may be repeated')
     parser.add_argument('--camera', default='', metavar='NAME', help='of several cameras the one '
-                        'to look at (default: the first)')
+                        'to check (default: the first)')
     parser.add_argument('--seconds', type=float, default=SECONDS,
                         help='how long to listen (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
@@ -109,17 +109,17 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
     """
-    Return what is seen of the bag, or of the running system, and what the rules find in it.
+    Return the observations of the bag, or of the running system, and the findings in them.
 
     :raises ValueError: for a bag, file or option that is wrong. :raises OSError: likewise.
-    :raises ModuleNotFoundError: where there is no ROS to listen with.
+    :raises ModuleNotFoundError: ROS is not installed.
     """
     remaps = parse_remaps(options.remap)
     if not re.fullmatch(r'[\w/]*', options.namespace):
         raise ValueError(f'--namespace {options.namespace}: must be letters, digits, _ and /')
     if options.bag is None:
         if options.config:
-            given(options.config, '')  # what is wrong with it is better said at once
+            given(options.config, '')  # a fault in the file is reported before listening
         # Only here: a recording is judged without ROS.
         from flock_follower.nodes.observer import observe
         if sys.stderr.isatty():
@@ -140,22 +140,23 @@ def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:
 
 
 def table(seen: Observations, findings: Sequence[Finding], colours: bool = False) -> str:
-    """Return the findings for people, at most ``COLUMNS`` wide, and the verdict."""
+    """Return the findings as a table, at most ``COLUMNS`` wide, and the verdict."""
     lines: list[str] = []
     for finding in findings:
         lines += _rows(finding, colours)
-    count = {level: sum(f.level == level for f in findings) for level in _LEVELS}
-    good = ready(findings)
-    verdict = (('ready to fly' if seen.live else 'usable') if good
-               else ('not ready to fly' if seen.live else 'not usable as it is'))
-    told = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
-        ('error', count[ERROR]), ('warning', count[WARNING])))
+    levels = [finding.level for finding in findings]
+    if ready(findings):
+        verdict = 'ready to fly' if seen.live else 'usable'
+    else:
+        verdict = 'not ready to fly' if seen.live else 'not usable as it is'
+    counts = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
+        ('error', levels.count(ERROR)), ('warning', levels.count(WARNING))))
     unknown = [finding.what for finding in findings if finding.level == UNMEASURED]
     needed = still_needed(findings)
-    told += f', {count[OK]} ok, {len(unknown)} not measured'
+    counts += f', {levels.count(OK)} ok, {len(unknown)} not measured'
     if unknown:
-        told += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
-    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {told}', COLUMNS)])
+        counts += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
+    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {counts}', COLUMNS)])
 
 
 def _rows(finding: Finding, colours: bool) -> list[str]:

@@ -21,10 +21,10 @@ one in ``flights``. Computing takes no time, neither does passing messages on: a
 the planner at the moment its image, or the odometry that image waited for, came; a command
 reaches the control at the tick.
 
-The planner ticks every ``period``, and where images cease; the control sends every
-1 / ``stream_rate``. Both begin one interval after the first event. Where followers talk, what was
-received reaches the planner just before its tick, and own messages go out then. What falls on the
-same nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
+The planner ticks every ``period``, and when images cease; the control sends every
+1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
+reach the planner just before its tick, and own messages are sent then. Events of the
+same nanosecond happen in this order: an image that has waited in vain for odometry, the planner's
 tick, the control's cycle, the event.
 """
 
@@ -143,14 +143,14 @@ class Follower:
     :param control: what may go out, and what it is; None while the bridge is dead.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
-    :param perceiver: None where neighbours come from elsewhere.
+    :param perceiver: None if neighbors come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
     :param camera_rpy: how the camera is mounted, rad, as the planner knows it; of several, each
         by its name.
-    :param sharing: what it tells other followers and hears of them; None: it does neither.
-    :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
-    :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
+    :param sharing: messages to and from other followers; None without them.
+    :param autopilot_velocity: whether odometry replaces the autopilot's own estimate, too.
+    :param cpu_time: a clock of CPU time, s; only the reported times depend on it.
     """
 
     def __init__(self, planner: PlannerLoop, params: PlannerParams, control: Gate,
@@ -188,14 +188,14 @@ class Follower:
         self.planner.engage(wanted)
 
     def permit(self, time: int, event: Event) -> None:
-        """Take what was asked of the bridge, or what became of it; see ``permission``."""
+        """Take a request to the bridge, or its result; see ``permission``."""
         self.advance(time)
         if self.control is not None:
             self.control.permit(event)
             self._tell_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
-        """Take what the autopilot says of the vehicle."""
+        """Take the status of the vehicle."""
         self.advance(time)
         if self.control is not None:
             self.control.see(status, self._seconds(), airborne)
@@ -282,12 +282,12 @@ class Follower:
             self._listener.rejected('invalid neighbors', str(error))
 
     def frame(self, time: int, stamp: int) -> None:
-        """Take that the image of a stamp, ns, was processed, with a neighbour in it or not."""
+        """Take the stamp of a processed image, ns, with a neighbor in it or not."""
         self.advance(time)
         self._see_frame(stamp)
 
     def word(self, time: int, state: OdometryState) -> None:
-        """Take what another vehicle told; see ``sharing``."""
+        """Take a message of another vehicle; see ``sharing``."""
         self.advance(time)
         if self.sharing is not None:
             self.sharing.take_word(state, time)
@@ -307,8 +307,8 @@ class Follower:
 
     def finish(self) -> None:
         """Process the images that still wait, without odometry: no more will come."""
-        while (overdue := self._overdue()) is not None:
-            self._now = max(self._now, self._start_plus(overdue))
+        while (waited := self._waited()) is not None:
+            self._now = max(self._now, waited)
             self._process_due()
 
     # What is due.
@@ -317,21 +317,23 @@ class Follower:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
-    def _overdue(self) -> float | None:
-        return None if self.perceiver is None else self.perceiver.overdue
+    def _waited(self) -> int | None:
+        """Return when the oldest image has waited in vain for odometry, None without one."""
+        overdue = None if self.perceiver is None else self.perceiver.overdue
+        # Rounded up: by then the image has waited long enough in seconds, too.
+        return None if overdue is None else (
+            (self._start or 0) + math.ceil(overdue * NANOSECONDS) + 1)
 
     def _run_until(self, time: int) -> None:
         while True:
-            overdue = self._overdue()
-            waited = time + 1 if overdue is None else self._start_plus(overdue)
-            silence = time + 1 if self._silence is None else self._silence
-            next_time = min(waited, silence, self._next_tick, self._next_cycle)
+            times = [self._waited(), self._silence, self._next_tick, self._next_cycle]
+            next_time = min(each for each in times if each is not None)
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
-            if next_time == waited:
+            if next_time == times[0]:
                 self._process_due()
-            elif next_time == silence:
+            elif next_time == times[1]:
                 self._silence = None
                 self._tick()
             elif next_time == self._next_tick:
@@ -341,10 +343,6 @@ class Follower:
                 self._next_cycle += self._cycle
                 if self.control is not None:
                     self._send(self.control)
-
-    def _start_plus(self, seconds: float) -> int:
-        # Rounded up: by then the image has waited long enough in seconds, too.
-        return (self._start or 0) + math.ceil(seconds * NANOSECONDS) + 1
 
     def _process_due(self) -> None:
         perceiver = self.perceiver

@@ -28,12 +28,7 @@ from warped_marker import WarpedMarker
 from flock_follower.bags.bag import serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
-from flock_follower.geometry import (
-    Array,
-    quaternion_from_rpy,
-    R_FLU_OPTICAL,
-    Transform,
-)
+from flock_follower.geometry import quaternion_from_rpy, R_FLU_OPTICAL, Transform
 from flock_follower.messages import ODOMETRY, odometry, set_stamp
 
 START = 1_700_000_000_000_000_000
@@ -54,13 +49,8 @@ def carried(time: float) -> Transform:
         0.12 * np.sin(1.7 * time), 0.1 * np.sin(2.3 * time + 0.5), 0.17 * np.sin(1.3 * time)))
 
 
-def walked(time: float) -> Array:
-    """Return how far (3,), m, a marker that does not stand still has gone by then."""
-    return np.array([0.12 * np.sin(0.9 * time), 0.08 * np.sin(1.4 * time), 0.0])
-
-
-def write_carried(path: Path, seconds: float = 5.0, moving: bool = False) -> Path:
-    """Write the bag; ``moving``: the marker does not stand still."""
+def write_carried(path: Path, seconds: float = 5.0) -> Path:
+    """Write the bag."""
     marker = WarpedMarker('DICT_4X4_50', 0, SIDE_LENGTH, focal=300.0)
     rng = np.random.default_rng(3)
     with BagWriter(path) as writer:
@@ -68,7 +58,7 @@ def write_carried(path: Path, seconds: float = 5.0, moving: bool = False) -> Pat
             time = n / ODOMETRY_RATE
             _write_odometry(writer, time, rng)
             if n % (ODOMETRY_RATE // IMAGE_RATE) == 3:
-                _write_image(writer, marker, time + 0.003, n, moving)
+                _write_image(writer, marker, time + 0.003, n)
     return path
 
 
@@ -87,11 +77,8 @@ def _write_odometry(writer: BagWriter, time: float, rng: np.random.Generator) ->
     writer.write('/odom', ODOMETRY, stamp + 2_000_000, serialize(message, ODOMETRY))
 
 
-def _write_image(writer: BagWriter, marker: WarpedMarker, time: float, seed: int,
-                 moving: bool) -> None:
-    place = Transform(T_ODOM_MARKER.rotation,
-                      T_ODOM_MARKER.translation + moving * walked(time))
-    pixels = marker.image([(carried(time) @ T_BASE_CAMERA).inverse() @ place], seed)
+def _write_image(writer: BagWriter, marker: WarpedMarker, time: float, seed: int) -> None:
+    pixels = marker.image([(carried(time) @ T_BASE_CAMERA).inverse() @ T_ODOM_MARKER], seed)
     stamp, camera = START + round(time * 1e9), marker.camera
     info = empty('sensor_msgs/msg/CameraInfo')
     image = empty('sensor_msgs/msg/Image')

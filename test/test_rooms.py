@@ -55,7 +55,7 @@ ROOMS = {
     'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
+    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink yaml'),
     'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
               'planner support visualization', 'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.

@@ -37,8 +37,8 @@ class BagWriter:
 
     The bytes written depend only on the calls made and the directory's name, never on a clock, so
     a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
-    but the last chunk of 1 MiB is kept and marked incomplete (see ``bags.integrity``). If nothing
-    was written, nothing is left.
+    but the last chunk of 1 MiB is kept and marked incomplete, see ``bags.description``. An empty
+    bag is deleted.
 
     :param path: directory to create; it must not exist.
     :param latched: topics recorded as transient local; all others are reliable and volatile.

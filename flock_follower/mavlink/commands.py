@@ -125,7 +125,8 @@ def arm(value: bool, streaming: bool = False) -> Goal:
     Return the goal of arming or disarming; disarming in the air is refused by autopilots.
 
     After a landing ArduPilot stays in LAND and PX4 returns to OFFBOARD, in which they do not arm
-    (PX4 does while ``streaming`` setpoints): another mode first.
+    (PX4 does while ``streaming`` setpoints), or to AUTO.TAKEOFF, in which PX4 climbs as soon as it
+    is armed: another mode first.
     """
     def armable(vehicle: Vehicle) -> Goal | None:
         mode, dialect = vehicle.status.mode, vehicle.dialect

@@ -69,7 +69,7 @@ class Dialect:
     arming_modes: tuple[str, ...]
     """Modes in which it arms, requested in turn if it does not arm in the present one."""
     unarmable_modes: tuple[str, ...]
-    """Modes in which a flight may leave it, and in which it does not arm."""
+    """Modes in which a flight may leave it, and in which it does not arm, or flies once armed."""
     land: str
     """The mode that lands at the present place."""
     takeoff_modes: tuple[str, ...]
@@ -118,7 +118,7 @@ class Dialect:
                 or f'mode {main}.{sub}')
 
     def arming_mode(self, mode: str) -> str:
-        """Return the mode that a vehicle is armed in: another one if it does not arm in this."""
+        """Return the mode that ``arm`` arms in: another one if this one is not to be armed in."""
         return self.arming_modes[0] if mode in self.unarmable_modes else mode
 
     def set_mode_parameters(self, name: str) -> tuple[float, ...]:
@@ -163,7 +163,8 @@ PX4: Final[Dialect] = Dialect(
         ('AUTO.FOLLOW_TARGET', 4, 8), ('AUTO.PRECLAND', 4, 9))}),
     sub_modes=True, offboard='OFFBOARD', hold='AUTO.LOITER', hold_instead=('POSCTL', 'AUTO.LAND'),
     arming_modes=('AUTO.LOITER', 'POSCTL'),
-    unarmable_modes=('OFFBOARD', 'AUTO.LAND', 'AUTO.RTL'), land='AUTO.LAND',
+    # It arms in AUTO.TAKEOFF, and climbs at once.
+    unarmable_modes=('OFFBOARD', 'AUTO.LAND', 'AUTO.RTL', 'AUTO.TAKEOFF'), land='AUTO.LAND',
     takeoff_modes=('AUTO.TAKEOFF', 'AUTO.LOITER'), takeoff_above_sea=True,
     minimum_takeoff='MIS_TAKEOFF_ALT', setpoints_end_takeoff=False,
     stream_before_offboard=1.5,  # 1 s, with a margin for delays

@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -71,9 +72,10 @@ class View(NamedTuple):
         turning: Array = self.rotation.dot(self.own.angular_velocity)
         return turning
 
-    def expected(self, estimate: Estimate | None) -> Transform | None:
-        """Return ``T_camera_body`` of a neighbour, where its state is known."""
-        return None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
+    def prior(self, estimate: Estimate | None) -> PosePrior:
+        """Return what is expected of a neighbour's pose, given its state, if that is known."""
+        pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
+        return PosePrior(pose, self.T_smooth_camera.rotation[2])
 
     def moving(self, sight: Array) -> Array:
         """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
@@ -145,7 +147,6 @@ STEP = 1e-9
 NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
 SILENT = 0.5
-Place = Callable[[str], Transform | None]
 
 
 class Sought(NamedTuple):
@@ -169,11 +170,6 @@ class Look(NamedTuple):
     sought: Sought
 
 
-class _SeenBy(NamedTuple):
-    camera: MountedCamera
-    time: float
-
-
 class CameraSchedule:
     """
     Shares out who is looked for where.
@@ -188,7 +184,8 @@ class CameraSchedule:
         self.shared = len(cameras) > 1
         """Whether there is anything to share out."""
         names = tuple(n.name for n in neighbors)
-        self._all = Sought(names, names, len(names))
+        self.everybody = Sought(names, names, len(names))
+        """All are looked for everywhere."""
         # Middles and normals on the body, (n, 3).
         self._markers = {n.name: (np.array([m.T_body_marker.translation for m in n.markers]),
                                   np.array([m.T_body_marker.rotation[:, 2] for m in n.markers]))
@@ -197,7 +194,7 @@ class CameraSchedule:
 
     def restart(self) -> None:
         """Forget who saw whom."""
-        self._seen: dict[str, _SeenBy] = {}
+        self._seen: dict[str, tuple[MountedCamera, float]] = {}
         self._bases: dict[str, float] = {}
 
     def time(self, name: str, camera: MountedCamera, moment: float) -> float:
@@ -206,38 +203,35 @@ class CameraSchedule:
             return moment
         base = self._bases.get(name)
         time = moment if base is None else moment + (camera.time_offset.applied - base)
-        seen = self._seen.get(name)
-        if seen is not None and seen.camera is not camera and abs(time - seen.time) < TOGETHER:
-            return seen.time + STEP  # taken at once: one after the other for the filter
+        last, seen = self._seen.get(name, (camera, time))
+        if last is not camera and abs(time - seen) < TOGETHER:
+            return seen + STEP  # taken at once: one after the other for the filter
         return time
 
     def by_odometry(self, name: str, stamp: float) -> float:
         """Return a stamp, s, by the clock of the odometry as that of a neighbour's filter."""
         time = stamp - self._bases.get(name, self._cameras[0].time_offset.applied)
-        seen = self._seen.get(name)
-        return time if seen is None or abs(time - seen.time) > 2.0 * STEP else seen.time
+        _, seen = self._seen.get(name, (None, time))
+        return time if abs(time - seen) > 2.0 * STEP else seen
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""
         if not self.shared:
             return
         self._bases.setdefault(name, camera.time_offset.applied)
-        self._seen[name] = _SeenBy(camera, time)
+        self._seen[name] = camera, time
         camera.measured[name] = time
 
     def changed(self, camera: MountedCamera) -> None:
         """Take that a camera's time offset has just changed: what it saw stays in its clock."""
         offset = camera.time_offset
-        for name, seen in self._seen.items():
-            if seen.camera is camera:
+        for name, (last, _) in self._seen.items():
+            if last is camera:
                 self._bases[name] = offset.applied - (offset.before - self._bases[name])
 
-    def everybody(self) -> Sought:
-        """Return that all are looked for everywhere."""
-        return self._all
-
     def sought(self, camera: MountedCamera, stamp: float, model: CameraModel,
-               times: Mapping[str, float], place: Place) -> Sought:
+               times: Mapping[str, float],
+               place: Callable[[str], Transform | None]) -> Sought:
         """
         Return whom to look for in an image of a stamp, s.
 
@@ -246,14 +240,14 @@ class CameraSchedule:
         """
         near, anywhere = [], []
         for name, time in times.items():
-            seen = self._seen.get(name)
-            age = np.inf if seen is None or seen.camera is camera else time - seen.time
+            last, seen = self._seen.get(name, (camera, time))
+            age = math.inf if last is camera else time - seen
             if -SILENT < age < 0.0:
                 continue  # the other one's image is newer
             tracked = 0.0 <= age <= FRESH
-            again = not 0.0 <= stamp - camera.vain.get(name, -np.inf) < SEARCH_PERIOD - 1e-3
+            again = not 0.0 <= stamp - camera.vain.get(name, -math.inf) < SEARCH_PERIOD - 1e-3
             if (again or not tracked) and (
-                    0.0 <= time - camera.measured.get(name, -np.inf) <= FRESH
+                    0.0 <= time - camera.measured.get(name, -math.inf) <= FRESH
                     or self.in_view(name, model, place(name))):
                 near.append(name)
             if not tracked:
@@ -297,9 +291,7 @@ class CameraSchedule:
 
 def _waited(searched: float | None, stamp: float) -> float:
     """Return since when images were not searched, s; infinite where never."""
-    if searched is None or stamp < searched:
-        return np.inf
-    return stamp - searched
+    return math.inf if searched is None or stamp < searched else stamp - searched
 
 
 @lru_cache(maxsize=16)

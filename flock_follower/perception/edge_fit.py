@@ -174,8 +174,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], smear: float) -> EdgeFit | None:
     """Return the fit that ends with a step, None where that leaves a direction open."""
-    counts = lines.model.across.sum(axis=1)
-    if not (last.weights.dot(lines.model.bloom) < -_EITHER * counts).all():
+    if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
     covariance = normal_covariance(last.information)
     if covariance is None:

@@ -38,7 +38,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.print_model import EdgeModel, median
+from flock_follower.perception.print_model import DERIVATIVES, EdgeModel, median
 
 #: How much more uncertain, in variance, all unknowns together may be than each would be alone.
 #: For good fits of rendered markers it is at most 5e3; at 1e16 nothing is left but rounding.
@@ -74,7 +74,7 @@ def normal_covariance(information: Array) -> Array | None:
 #: px between samples of a profile: least, and most; but as a share of the cell more may be needed.
 SPACING = (0.3, 1.2)
 WIDEST = 0.1
-_HALF = 4  # samples either side that a peak is looked for, and of the kernel
+_HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
 _REACH = 2 * _HALF  # likewise of a profile
 _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
@@ -237,7 +237,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
 
     peak = slope.argmax(axis=1)
     within = _WITHIN[peak]
-    index = (2 * _HALF + 1) * np.arange(len(peak)) + within
+    index = model.begins + within
     values = slope.ravel()
     before, top, after = values[index - 1], values[index], values[index + 1]
     bend = np.minimum(before - 2.0 * top + after, -1e-3)

@@ -244,7 +244,8 @@ class Hypotheses:
         last = self.believed.newest
         self._lost = None if candidate.beside or last is None else last.position
         before = self.believed.continued(self.params.max_gap)
-        self.believed.take_over(candidate.track)
+        self.believed.reset()
+        self.believed.newest = candidate.track.newest
         self._motion, candidate.motion = candidate.motion, self._motion
         candidate.track, candidate.alone = before, 0
         if not candidate.beside:

@@ -190,7 +190,8 @@ class NeighborFilter:
         """Forget the neighbour."""
         self.step: Step | None = None
         """How the newest measurement was taken in; None where it was not, or began the track."""
-        self._estimate: Estimate | None = None
+        self.newest: Estimate | None = None
+        """The state at the newest measurement; None if there is no track."""
         self._predicted: Estimate | None = None  # from that, to where it was last asked for
         self._turned = 0  # measurements in a row whose attitude was not believed
         self._surprises: dict[str, Array] = {}
@@ -203,7 +204,7 @@ class NeighborFilter:
 
         The filter itself is not altered. A stamp before the newest measurement gives None.
         """
-        now = self._estimate
+        now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
         if stamp == now.stamp:
@@ -214,33 +215,28 @@ class NeighborFilter:
 
     def place(self, stamp: float) -> Transform | None:
         """Return about where :meth:`predict` expects the body, for far less."""
-        now = self._estimate
+        now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
         return Transform(now.rotation, now.position + (stamp - now.stamp) * now.velocity)
 
     def near(self, stamp: float) -> Estimate | None:
         """Return the state at a stamp, s, a little before or after the newest measurement."""
-        now = self._estimate
+        now = self.newest
         if now is None or stamp == now.stamp:
             return now
         return now.moved(stamp, *self._transition(stamp - now.stamp))
 
-    @property
-    def newest(self) -> Estimate | None:
-        """Return the state at the newest measurement, or None where there is no track."""
-        return self._estimate
-
     def continued(self, max_gap: float) -> NeighborFilter:
         """Return another filter that goes on from where this one is, over gaps up to so many s."""
         other = NeighborFilter(replace(self.params, max_gap=max_gap))
-        other.walk, other._estimate = self.walk, self._estimate
+        other.walk, other.newest = self.walk, self.newest
         return other
 
     def shift(self, error: Array) -> None:
         """Add an error state (15,), the cause of which was found elsewhere."""
-        if self._estimate is not None:
-            self._estimate = self._estimate.corrected(error, self._estimate.covariance)
+        if self.newest is not None:
+            self.newest = self.newest.corrected(error, self.newest.covariance)
             self._predicted = None
 
     def _transition(self, dt: float) -> tuple[Array, Array, Array]:
@@ -251,11 +247,6 @@ class NeighborFilter:
             self._steps[dt] = transition(dt, self.params)
         linear, whole, noise = self._steps[dt]
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
-
-    def take_over(self, other: NeighborFilter) -> None:
-        """Go on from where another filter is."""
-        self.reset()
-        self._estimate = other._estimate
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
                covariance: Array, reach: float = math.inf) -> UpdateOutcome:
@@ -268,7 +259,7 @@ class NeighborFilter:
         :param reach: how far from the newest estimate the body can be by now, m.
         """
         self.step = None
-        now = self._estimate
+        now = self.newest
         if now is not None and stamp <= now.stamp:
             if now.stamp - stamp <= MAX_JUMP:
                 return UpdateOutcome.LATE
@@ -306,7 +297,7 @@ class NeighborFilter:
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
         self._predicted, self._line = None, _CENTRE
-        self._estimate = expected.corrected(gain.T.dot(innovation), corrected)
+        self.newest = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
@@ -355,7 +346,7 @@ class NeighborFilter:
         :param own_position: where it was measured (3,), m, in odom.
         :param variance: of the distance, m^2.
         """
-        now, expected = self._estimate, self.predict(stamp)
+        now, expected = self.newest, self.predict(stamp)
         if now is None or expected is None or stamp == now.stamp:
             late = now is not None and stamp <= now.stamp
             return UpdateOutcome.LATE if late else UpdateOutcome.LOST
@@ -389,7 +380,7 @@ class NeighborFilter:
         covariance = bounded_across(covariance[None], along[None], np.array([length]),
                                     self.params.initial_speed)[0]
         self.step, self._predicted, self._line = None, None, along
-        self._estimate = expected.corrected(innovation * gain, covariance)
+        self.newest = expected.corrected(innovation * gain, covariance)
         surprising = widened[0] != 1.0 or careful[0] != 1.0
         return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED
 
@@ -417,7 +408,7 @@ class NeighborFilter:
                 for column in (VELOCITY, ACCELERATION):
                     full[row, column] = moving.covariance[row, column]
         full[RATE, RATE] = INITIAL_RATE**2 * np.eye(3)
-        self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
+        self.newest = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                   acceleration, full)
         return UpdateOutcome.STARTED
 

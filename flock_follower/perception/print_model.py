@@ -265,6 +265,8 @@ def median(values: Any) -> float:
 _END = 0.4  # cells kept clear of the ends of a run
 _BORDER_POINTS = 10  # along each outer edge
 _INNER_SPACING = 0.6  # cells
+#: Of brightness across an edge, taken of every one.
+DERIVATIVES = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,21 +296,27 @@ class EdgeModel:
     bloom: Array = field(init=False)
     #: Which edges are across either axis: (2, n).
     across: Any = field(init=False)
+    #: How many edges are across either axis: (2,).
+    counts: Array = field(init=False)
     #: An edge of either axis; the narrowest room across either, m.
     examples: tuple[int, int] = field(init=False)
     narrowest: tuple[float, float] = field(init=False)
     #: The mean of the points is this times them: (n,).
     shares: Array = field(init=False)
+    #: Where the derivatives of each edge begin, of :data:`DERIVATIVES` each.
+    begins: Any = field(init=False)
     _parts: dict[bytes, EdgeModel] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Derive what depends on the edges' directions."""
         object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
         object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
+        object.__setattr__(self, 'counts', self.across.sum(axis=1).astype(float))
         object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
         object.__setattr__(self, 'narrowest', tuple(
             float(self.room[one].min(initial=np.inf)) for one in self.across))
         object.__setattr__(self, 'shares', np.full(len(self), 1.0 / max(len(self), 1)))
+        object.__setattr__(self, 'begins', DERIVATIVES * np.arange(len(self)))
 
     def __len__(self) -> int:
         """Return the number of edge points."""

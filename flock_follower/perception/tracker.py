@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 import math
 
 import numpy as np
@@ -49,14 +48,13 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import (
     CameraSchedule,
     Look,
-    Place,
     straightened,
     View,
 )
 from flock_follower.perception.hypotheses import Hypotheses
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Detections, NeighborConfig
-from flock_follower.perception.measurement import likeliest, Measurement, PosePrior
+from flock_follower.perception.markers import Detections, Marker, NeighborConfig
+from flock_follower.perception.measurement import likeliest, Measurement
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -158,7 +156,7 @@ class Tracker:
         self._schedule.restart()
         self._offsets.restart()
         self.ranging.restart()
-        self._planned: Look | None = None
+        self._planned: Look | Missing | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take the own state; return whether time jumped back and everything restarted."""
@@ -190,8 +188,7 @@ class Tracker:
         """
         if len(self.cameras) == 1:
             return True
-        look = self._plan(stamp, model, camera)
-        self._planned = look if isinstance(look, Look) else None
+        look = self._planned = self._plan(stamp, model, camera)
         return isinstance(look, Missing) or bool(look.sought.near) or (
             bool(look.sought.anywhere) and self._schedule.search_due(look.camera, stamp)
         ) or self._schedule.sweep_due(look.camera, stamp)
@@ -205,15 +202,13 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
-        sighting = Sighting()
         look, self._planned = self._planned, None
-        if look is None or (look.stamp, look.model, look.camera) != (
+        if not isinstance(look, Look) or (look.stamp, look.model, look.camera) != (
                 stamp, model, self.cameras[camera]):
-            planned = self._plan(stamp, model, camera)
-            if isinstance(planned, Missing):
-                sighting.rejections.append((planned.value, ''))
-                return sighting
-            look = planned
+            look = self._plan(stamp, model, camera)
+        if isinstance(look, Missing):
+            return Sighting(rejections=[(look.value, '')])
+        sighting = Sighting()
         model.check_image(image.shape[1], image.shape[0])
         measured, others = self._track(image, look)
         sighting.stage = 'track'
@@ -233,7 +228,7 @@ class Tracker:
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
         """Return the expected content of an image, or why nothing is known."""
-        camera, sought = self.cameras[name], self._schedule.everybody()
+        camera, sought = self.cameras[name], self._schedule.everybody
         times = {name: self._schedule.time(name, camera, stamp + delay)
                  for name, delay in camera.delays.items()}
         if self._schedule.shared:
@@ -241,39 +236,35 @@ class Tracker:
             if missing is not None:
                 return missing
             sought = self._schedule.sought(
-                camera, stamp, model, times, self._place(stamp, camera, times))
-        views: dict[float, View] = {}
-        expected: dict[str, PosePrior] = {}
+                camera, stamp, model, times,
+                lambda name: self._place(name, times[name], stamp, camera))
+        look = Look(stamp, camera, model, {}, {}, sought)
         for name, delay in camera.delays.items():
-            if name not in sought.near and name not in sought.anywhere:
-                continue
-            view = views.get(delay) or self._view(stamp, camera, delay)
-            if isinstance(view, Missing):
-                return view
-            views[delay] = view
-            expected[name] = _expected(self._filters[name], times[name], view)
-        return Look(stamp, camera, model, views, expected, sought)
+            if name in sought.near or name in sought.anywhere:
+                view = self._view(look, delay)
+                if isinstance(view, Missing):
+                    return view
+                look.expected[name] = view.prior(self._filters[name].predict(times[name]))
+        return look
 
-    def _place(self, stamp: float, camera: MountedCamera, times: Mapping[str, float]) -> Place:
-        """Return a function from a name to where it is in an image, ``T_camera_body`` or None."""
-        @cache
-        def to_camera() -> Transform | None:
-            own = self._odometry.at(stamp + camera.time_offset.applied)
-            return None if isinstance(own, Missing) else (
-                own.smooth_pose @ camera.T_body_camera).inverse()
+    def _place(self, name: str, time: float, stamp: float,
+               camera: MountedCamera) -> Transform | None:
+        """Return about where a neighbour is in an image, ``T_camera_body``, if that is known."""
+        body = self._filters[name].place(time)
+        own = self._odometry.at(stamp + camera.time_offset.applied)
+        if body is None or isinstance(own, Missing):
+            return None
+        return (own.smooth_pose @ camera.T_body_camera).inverse() @ body
 
-        def place(name: str) -> Transform | None:
-            body, seen_from = self._filters[name].place(times[name]), to_camera()
-            return None if body is None or seen_from is None else seen_from @ body
-
-        return place
-
-    def _view(self, stamp: float, camera: MountedCamera, delay: float) -> View | Missing:
-        """Return the view so long, s, after an image's stamp."""
-        own = self._odometry.at(stamp + camera.time_offset.applied + delay)
-        if isinstance(own, Missing):
-            return own
-        return View.of(self._odometry.steadied(own), camera.T_body_camera, delay)
+    def _view(self, look: Look, delay: float) -> View | Missing:
+        """Return the view of an image's camera so long, s, after the image's stamp."""
+        if delay not in look.views:
+            own = self._odometry.at(look.stamp + look.camera.time_offset.applied + delay)
+            if isinstance(own, Missing):
+                return own
+            look.views[delay] = View.of(
+                self._odometry.steadied(own), look.camera.T_body_camera, delay)
+        return look.views[delay]
 
     def _estimate(self, name: str, track_filter: NeighborFilter, look: Look,
                   view: View) -> Estimate:
@@ -310,49 +301,45 @@ class Tracker:
                 camera.unchecked[name] = MIRRORED_EVERY - 1
         for name, hypotheses in self._hypotheses.items():
             delay = camera.delays[name]
-            view = look.views.get(delay) or self._view(look.stamp, camera, delay)
+            time = self._schedule.time(name, camera, look.stamp + delay)
             for candidate in hypotheses.candidates:
-                expected = PosePrior() if isinstance(view, Missing) else _expected(
-                    candidate.track, self._schedule.time(name, camera, look.stamp + delay), view)
+                view = self._view(look, delay)
+                if isinstance(view, Missing):
+                    continue
+                expected = view.prior(candidate.track.predict(time))
                 if self._schedule.in_view(name, look.model, expected.pose):
                     measurement = track(image, look.model, self._targets[name], expected, None,
                                         True)
-                    if measurement is not None and not self._known(
-                            measurement.T_camera_body, name, found, others):
+                    if measurement is not None and not self._known(measurement, found, others):
                         others.append(measurement)
         return found, others
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate that is not believed."""
-        name, hypotheses = measurement.name, self._hypotheses[measurement.name]
-        if not hypotheses.candidates:
+        name, camera = measurement.name, look.camera
+        if not self._hypotheses[name].candidates:
             return False
-        delay = look.camera.delays[name]
-        view = look.views[delay]
-        return hypotheses.whose(
-            self._schedule.time(name, look.camera, look.stamp + delay),
-            (view.T_smooth_camera @ measurement.T_camera_body).translation) is not None
+        place = look.views[camera.delays[name]].T_smooth_camera @ measurement.T_camera_body
+        return self._hypotheses[name].whose(
+            self._schedule.time(name, camera, look.stamp + camera.delays[name]),
+            place.translation) is not None
 
-    def _known(self, T_camera_body: Transform, name: str, measured: Mapping[str, Measurement],
+    def _known(self, measurement: Measurement, measured: Mapping[str, Measurement],
                others: Iterable[Measurement]) -> bool:
-        """Return whether a body of a name is at a place that was measured in this image."""
+        """Return whether a body was measured before, at the same place in the same image."""
+        name, place = measurement.name, measurement.T_camera_body.translation
         side = max(m.side_length for m in self._targets[name].neighbor.markers)
-        before = [each for each in (measured.get(name), *others) if each and each.name == name]
-        return any(math.dist(each.T_camera_body.translation, T_camera_body.translation) < side
-                   for each in before)
+        return any(math.dist(each.T_camera_body.translation, place) < side
+                   for each in _of(name, measured, others))
 
-    def _shown(self, corners: Array, name: str, index: int, look: Look,
+    def _shown(self, corners: Array, name: str, marker: Marker, look: Look,
                measured: Mapping[str, Measurement], others: Iterable[Measurement]) -> bool:
         """Return whether corners (4, 2), px, are of a marker that was measured in this image."""
-        marker = self._targets[name].neighbor.markers[index]
         size = 0.5 * float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)))
-        for each in (measured.get(name), *others):
-            if each is not None and each.name == name:
-                middle = look.model.project((each.T_camera_body @ marker.T_body_marker)
-                                            .translation[None])[0]
-                if math.dist(middle, corners.mean(axis=0)) < size:
-                    return True
-        return False
+        middles = [look.model.project((each.T_camera_body @ marker.T_body_marker)
+                                      .translation[None])[0]
+                   for each in _of(name, measured, others)]
+        return any(math.dist(middle, corners.mean(axis=0)) < size for middle in middles)
 
     def _detect(self, image: GrayImage, look: Look, measured: dict[str, Measurement],
                 others: list[Measurement], sighting: Sighting) -> None:
@@ -394,15 +381,14 @@ class Tracker:
                 continue
             neighbor, marker = self._by_marker[marker_id]
             name = neighbor.name
-            index = neighbor.markers.index(marker)
-            if name not in look.expected or self._shown(corners, name, index, look, measured,
+            if name not in look.expected or self._shown(corners, name, marker, look, measured,
                                                         others):
                 continue
-            measurement = locate(image, look.model, self._targets[name], index, corners,
-                                 look.expected[name])
+            measurement = locate(image, look.model, self._targets[name],
+                                 neighbor.markers.index(marker), corners, look.expected[name])
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
-            elif not self._known(measurement.T_camera_body, name, measured, others):
+            elif not self._known(measurement, measured, others):
                 measurement = measurement._replace(stage=stage)
                 if self._of_candidate(look, measurement):
                     others.append(measurement)
@@ -413,7 +399,7 @@ class Tracker:
                 measured[name] = likeliest(several, look.expected[name].pose)
                 look.camera.unchecked[name] = 0
             for each in several:
-                if not self._known(each.T_camera_body, name, measured, others):
+                if not self._known(each, measured, others):
                     others.append(each)
 
     def _update(self, look: Look, measurement: Measurement, sighting: Sighting,
@@ -425,7 +411,7 @@ class Tracker:
         """
         name, camera = measurement.name, look.camera
         delay = camera.exposed(look.model, measurement)
-        view = look.views.get(delay) or self._view(look.stamp, camera, delay)
+        view = self._view(look, delay)
         if isinstance(view, Missing):
             return
         time = self._schedule.time(name, camera, look.stamp + delay)
@@ -475,7 +461,7 @@ class Tracker:
             self._schedule.changed(each)
 
 
-def _expected(track_filter: NeighborFilter, time: float, view: View) -> PosePrior:
-    """Return the pose that a track predicts for a time, s, in a view."""
-    return PosePrior(view.expected(track_filter.predict(time)),
-                     view.T_smooth_camera.rotation[2])
+def _of(name: str, measured: Mapping[str, Measurement],
+        others: Iterable[Measurement]) -> list[Measurement]:
+    """Return what was measured of a neighbour in this image, and of its candidates."""
+    return [each for each in (measured.get(name), *others) if each and each.name == name]

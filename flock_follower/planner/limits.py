@@ -15,8 +15,8 @@
 """
 Limits of acceleration and speed, and braking.
 
-Every function here returns a finite vector inside its limit for any float input whatsoever, and
-returns its input bit for bit where no limit binds. Limits act on the length of the vector, never
+Every function here returns a finite vector inside its limit for any float input, and its input
+bit for bit if no limit binds. Limits act on the length of the vector, never
 on its axes one by one, so a limited command still points where it was meant to.
 """
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the planner does between two ticks: gather what came, and make one command of it."""
+"""Inputs of the planner between two ticks, and one command per tick."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ REMEMBERED = 20
 
 class PlannerLoop:
     """
-    Gathers what comes, and hands it to one step of the core per tick.
+    Gathers inputs, and passes them to one step of the core per tick.
 
-    It is active while it is engaged and the bridge says that it flies the commands. ``memory`` is
-    what the last step left; ``missed`` counts the ticks that did not come in time.
+    It is active while it is engaged and the bridge reports that it flies the commands. ``memory``
+    is the state that the last step left; ``missed`` counts the ticks that did not come in time.
 
-    :param require_bridge: whether the bridge has to say so; else engaging is enough.
+    :param require_bridge: whether the bridge has to report that; else engaging is enough.
     """
 
     def __init__(self, require_bridge: bool = True) -> None:
@@ -81,9 +81,9 @@ class PlannerLoop:
 
     def engage(self, wanted: bool) -> None:
         """
-        Begin to want commands, or end it.
+        Request commands, or end the request.
 
-        To repeat it changes nothing, except that it commands again after it had given up.
+        A repeated request changes nothing, except after the planner had given up.
         """
         self.engaged, self._disengaged_by = wanted, ''
         self._interrupted |= not wanted or self.memory.given_up
@@ -91,13 +91,13 @@ class PlannerLoop:
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
         """
-        Take, and return, what the bridge says of itself; see ``activation``.
+        Take, and return, the state that the bridge reports; see ``modes``.
 
         A pilot who takes over disengages it: it commands again only once it is engaged anew.
 
-        :param silence: time, s, for which it had said nothing before.
+        :param silence: time since the message before, s.
         """
-        # If it says now that it does not fly, the next tick or the next word finds it waiting.
+        # If it does not fly now, the next tick or the next message finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
         if self._require_bridge and self.engaged and self._bridge.word == TAKEN_OVER and (
@@ -109,9 +109,9 @@ class PlannerLoop:
 
     def waiting(self, bridge_age: float = math.inf) -> str:
         """
-        Return what it waits for, or would if engaged, before it is active, or ''.
+        Return why it cannot become active, if engaged, or ''.
 
-        :param bridge_age: time since the bridge was last heard, s, by a clock that never stops.
+        :param bridge_age: time since the last message of the bridge, s, by a steady clock.
         """
         if not self._require_bridge:
             return ''
@@ -134,11 +134,11 @@ class PlannerLoop:
         """
         Take a neighbour's state.
 
-        :param heard: whether another vehicle told of it, instead of the own eyes.
+        :param heard: whether another vehicle reported it; else the own camera sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:
-            return  # nothing flies without odometry, and step() says so
+            return  # without odometry nothing flies: step() reports that
         if neighbor.frame != self._frame:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')

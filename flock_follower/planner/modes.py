@@ -33,7 +33,7 @@ let it drift off. Without fresh odometry no state gives a command. In COAST and 
 of the way of whom it no longer sees, a little. From SEARCH and HOLD it follows by itself until
 ``resume_timeout``. After that the state stays, and no command is given until it is engaged anew.
 
-Whether somebody flies the planner's commands: what the bridge says on ``mavlink_bridge/state``.
+Whether the planner's commands are flown: the text of ``mavlink_bridge/state``.
 
 Its text is a word and, after a colon, the reason::
 
@@ -46,7 +46,7 @@ Its text is a word and, after a colon, the reason::
 The bridge sends it where it changes, and at 2 Hz: a bridge that died would else leave ``ACTIVE``
 on the latched topic for ever. Nothing here reads a clock.
 
-What becomes of stamps and ages when the system clock is set, as by NTP or by hand.
+Stamps and ages when the system clock is set, as by NTP or by hand.
 
 A message's stamp is of the system clock, which may jump; the monotonic clock never does. Nothing
 here reads a clock: whoever does reads both at the same time, and passes them on.
@@ -65,7 +65,7 @@ from flock_follower.planner.params import PlannerParams
 
 
 class State(str, enum.Enum):
-    """What the planner does; see above."""
+    """State of the planner; see above."""
 
     IDLE = 'IDLE'
     SEARCH = 'SEARCH'
@@ -157,7 +157,7 @@ class BridgeState(NamedTuple):
 
 
 def parse(text: str) -> BridgeState:
-    """Return what a message says; an unknown word, or none, counts as ``INACTIVE``."""
+    """Return the state in a message; an unknown word, or none, counts as ``INACTIVE``."""
     word, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
         r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
     if word not in WORDS:
@@ -167,7 +167,7 @@ def parse(text: str) -> BridgeState:
 
 def believed(said: BridgeState | None, age: float) -> BridgeState:
     """
-    Return what to believe of the bridge.
+    Return the state of the bridge, which counts as absent after a silence.
 
     :param said: its last message, None without one.
     :param age: how long ago that was, s, by a clock that neither stops nor jumps.
@@ -189,7 +189,7 @@ BEFORE_STEP = 'stamped before the system clock was set'
 
 class ClockWatch:
     """
-    Finds steps of the system clock, and tells which messages were stamped before the last one.
+    Finds steps of the system clock, and messages that were stamped before the last one.
 
     ``shift`` is by how much the clock was set so far, ns: a stamp less the shift is a time of a
     clock that goes on evenly.

@@ -14,8 +14,7 @@
 
 """Bags of every format: what is written is read, ROS 1 becomes ROS 2, damage is one line."""
 
-import errno
-import os
+import contextlib
 from pathlib import Path
 import random
 import shutil
@@ -140,13 +139,6 @@ def test_what_is_written_is_read_from_the_folder_and_from_the_bare_file(tmp_path
             assert deserialize(messages[0].data, STRING).data == 'hover'
 
 
-def test_sqlite3_is_read_from_the_folder_and_from_the_bare_file(tmp_path):
-    folder = write_sqlite3(tmp_path / 'bag', 20)
-    for path in (folder, storage_file(folder)):
-        texts = [deserialize(message.data, STRING).data for message in read_all(path)]
-        assert texts == [f'number {i} ' * 40 for i in range(20)]
-
-
 def test_stamps_may_go_back(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         for stamp in (5, 3, 9):
@@ -231,22 +223,6 @@ def test_a_disk_that_is_full_when_the_bag_is_closed_is_told_whatever_fails(tmp_p
             assert bag.incomplete and bag.message_count > 1000
 
 
-def test_a_swallowed_failure_is_told_again_and_at_the_end(tmp_path, monkeypatch):
-    writer = BagWriter(tmp_path / 'bag')
-    large = string('x' * 2**20)  # a chunk: written at once
-    writer.write('a', STRING, START, large)
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(writer._file, 'write', full)
-    for _ in range(2):
-        with pytest.raises(BagError, match='No space left on device'):
-            writer.write('a', STRING, START + 1, large)
-        monkeypatch.undo()
-    with pytest.raises(BagError, match='No space left on device'):
-        writer.close()
-
-
 @pytest.mark.ros
 def test_a_recording_that_was_killed_is_no_whole_bag(tmp_path):
     script = ('import os, sys; from flock_follower.bags.writer import BagWriter\n'
@@ -292,19 +268,7 @@ def test_the_old_tf_message_becomes_tf2s(tmp_path):
             example(typestore(), 'tf2_msgs/msg/TFMessage'), 'tf2_msgs/msg/TFMessage')
 
 
-def test_ros1_camera_info_keeps_its_matrices_under_their_new_names(tmp_path):
-    noetic = get_typestore(Stores.ROS1_NOETIC)
-    info = example(noetic, 'sensor_msgs/msg/CameraInfo')
-    [message] = read_all(write_rosbag1(
-        tmp_path / 'old.bag', [('sensor_msgs/msg/CameraInfo', info)], noetic))
-    new = deserialize(message.data, message.msgtype)
-    for name in 'dkrp':
-        np.testing.assert_array_equal(getattr(new, name), getattr(info, name.upper()))
-    assert new.header.stamp.sec == info.header.stamp.sec
-    assert not hasattr(new.header, 'seq')
-
-
-@pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
+@pytest.mark.parametrize('compression', ['BZ2', 'LZ4'])
 def test_compressed_rosbag1_is_read(tmp_path, compression):
     noetic = get_typestore(Stores.ROS1_NOETIC)
     texts = [f'text {i}' for i in range(50)]
@@ -456,14 +420,6 @@ def test_bytes_damaged_in_the_middle_never_raise_anything_else(tmp_path):
         assert noticed == 25, file.name
 
 
-def test_a_single_flipped_bit_in_a_written_mcap_is_noticed(tmp_path):
-    file = storage_file(write_strings(tmp_path / 'bag'))
-    damaged = bytearray(file.read_bytes())
-    damaged[len(damaged) // 3] ^= 1
-    file.write_bytes(damaged)
-    assert 'checksum' in error_of(file).lower()
-
-
 @pytest.mark.parametrize(('name', 'infos', 'height'), [
     ('ubiq_aruco_images.bag', 15, 960), ('ubiq_aruco_marker.bag', 1, 720)])
 def test_real_ros1_bags_hold_a_jpeg_and_its_camera_info(name, infos, height):
@@ -483,3 +439,19 @@ def test_real_ros1_bags_hold_a_jpeg_and_its_camera_info(name, infos, height):
             assert (info.width, info.height) == (1280, height)
             assert info.distortion_model == 'plumb_bob' and len(info.d) == 5
             assert info.k[8] == 1.0 and 1000 < info.k[0] < 1300
+
+
+def test_damaged_messages_raise_a_bag_error_and_pixels_are_not_copied():
+    rng = np.random.default_rng(1)
+    for msgtype in ('nav_msgs/msg/Odometry', 'sensor_msgs/msg/Image'):
+        good = serialize(example(typestore(), msgtype), msgtype)
+        for kept in (0, 3, 11, 40, -1):
+            with pytest.raises(BagError, match=f'^{msgtype}: corrupt message'):
+                deserialize(good[:kept], msgtype)
+        for _ in range(100):
+            data = bytearray(good)
+            for at in rng.integers(0, 40, size=3):
+                data[at] = rng.integers(256)
+            with contextlib.suppress(BagError):
+                deserialize(bytes(data), msgtype)
+    assert np.shares_memory(deserialize(good, msgtype).data, np.frombuffer(good, np.uint8))

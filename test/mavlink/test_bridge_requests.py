@@ -172,6 +172,21 @@ def test_the_mode_that_arm_leaves_first_speaks_against_nothing():
     assert flight.ask('arm', True).success
 
 
+def test_arming_after_a_take_off_that_was_ended_by_a_landing_does_not_climb():
+    """PX4 is in AUTO.TAKEOFF again, and takes off as soon as it is armed."""
+    flight = Flight(start='landed')
+    flight.fly(2.0)
+    assert flight.ask('arm', True).success
+    flight.bridge.requests.takeoff(2.5, flight.now)
+    flight.fly_until(lambda: flight.vehicle.position[2] > 0.8, 10.0)
+    assert flight.ask('land').success
+    flight.fly_until(lambda: not flight.controller.armed, 30.0)
+    flight.fly(1.5)  # until a HEARTBEAT shows it
+    assert flight.mode == 'AUTO.TAKEOFF' and flight.ask('arm', True).success
+    flight.fly(4.0)
+    assert flight.mode == 'AUTO.LOITER' and flight.vehicle.position[2] < 0.1
+
+
 @pytest.mark.parametrize(('system', 'component', 'believed'), [
     (255, 190, False), (1, 190, False), (0, 0, True), (1, 191, True)])
 def test_only_answers_to_us_are_believed(system, component, believed):

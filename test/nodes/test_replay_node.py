@@ -282,7 +282,7 @@ def test_statements_and_commands_of_the_recorded_system_are_played_only_if_named
     code, out, err = finish(process)
     assert code == 0
     assert 'replayed 1 messages of 1 topics' in out
-    assert 'not played unless named: /rosout, /drone1/command/trajectory' in err
+    assert 'not played unless named: /drone1/command/trajectory, /rosout' in err
 
 
 def test_ros1_topics_of_unknown_type_are_named_and_left_out(tmp_path, ear, replay):

@@ -52,14 +52,14 @@ def rms(off: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-@pytest.mark.parametrize('rate', [10.0, 30.0, 200.0, 500.0])
-@pytest.mark.parametrize(('noise', 'most'), [(0.0, 0.005), (0.001, 0.035), (0.003, 0.055)])
+@pytest.mark.parametrize('rate', [10.0, 200.0])
+@pytest.mark.parametrize(('noise', 'most'), [(0.0, 0.005), (0.003, 0.055)])
 def test_the_velocity_is_found_at_any_rate(rate: float, noise: float, most: float) -> None:
     assert rms(errors(rate, noise)[0]) < most
 
 
-@pytest.mark.parametrize('rate', [10.0, 20.0, 100.0])
-@pytest.mark.parametrize('step', [0.05, 0.2, 1.0])
+@pytest.mark.parametrize('rate', [10.0, 100.0])
+@pytest.mark.parametrize('step', [0.05, 1.0])
 def test_a_step_of_the_position_is_no_motion(rate: float, step: float) -> None:
     without, _ = errors(rate, 0.002)
     off, _ = errors(rate, 0.002, step)

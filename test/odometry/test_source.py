@@ -32,7 +32,6 @@ from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
-    quaternion_to_rotation_vector,
 )
 from flock_follower.messages import odometry, OdometryState, set_quaternion, set_vector
 from flock_follower.odometry.reader import OdometrySource, SourceParams
@@ -77,11 +76,9 @@ def read(source: OdometrySource, kind: Source, seconds: float, rate: float = RAT
 
 
 @pytest.mark.parametrize('kind', [
-    Source(), Source(imu=True), Source(twist='odom'), Source(imu=True, twist='odom'),
-    Source(twist='none', rates=False), Source(rates=False),
+    Source(imu=True), Source(twist='odom'), Source(twist='none', rates=False),
     Source(imu=True, twist='odom', rates=False, covariances=False)], ids=str)
-@pytest.mark.parametrize('rate', [
-    10.0, 30.0, 200.0, pytest.param(500.0, marks=pytest.mark.sweep)])
+@pytest.mark.parametrize('rate', [10.0, 200.0])
 def test_every_source_tells_the_motion_of_base_link(kind: Source, rate: float) -> None:
     source = OdometrySource(IMU if kind.imu else None)
     off = []
@@ -95,22 +92,12 @@ def test_every_source_tells_the_motion_of_base_link(kind: Source, rate: float) -
             np.testing.assert_allclose(state.angular_velocity, rates, atol=0.03)
     assert np.sqrt(np.mean(np.square(off))) < 0.03
     assert np.abs(off).max() < 0.1
+    assert source.twist.found == kind.twist and kind.twist in source.twist.describe
 
 
-@pytest.mark.parametrize(('kind', 'found'), [
-    (Source(), 'child'), (Source(twist='odom'), 'odom'), (Source(twist='none'), 'none'),
-    (Source(imu=True), 'child'), (Source(imu=True, twist='odom'), 'odom')], ids=str)
-def test_the_frame_of_the_twist_is_found(kind: Source, found: str) -> None:
-    source = OdometrySource(IMU if kind.imu else None)
-    read(source, kind, 6.0)
-    assert source.twist.found == found
-    assert found in source.twist.describe
-
-
-@pytest.mark.parametrize('rate', [30.0, 200.0])
-def test_where_rates_cease_they_are_derived_from_there_on(rate: float) -> None:
+def test_where_rates_cease_they_are_derived_from_there_on() -> None:
     source = OdometrySource()
-    for t in np.arange(0.0, 4.0, 1.0 / rate).tolist():
+    for t in np.arange(0.0, 4.0, 0.01).tolist():
         state = source.take(rewrite(Source(rates=t < 2.0))(message(t), t), START + round(t * 1e9))
         assert state is not None
         assert ('angular velocity' in source.missing) is (t >= 2.0)
@@ -151,7 +138,7 @@ def first_second(kind: Source, start: float, rate: float, seconds: float = 1.0, 
 
 
 @pytest.mark.parametrize('rate', [30.0, 200.0])
-@pytest.mark.parametrize('kind', [Source(), Source(twist='odom')], ids=str)
+@pytest.mark.parametrize('kind', [Source(twist='odom')], ids=str)
 def test_the_likelier_reading_is_used_from_the_first_window_on(kind: Source, rate: float) -> None:
     _, states = first_second(kind, 2.0, rate, 1.0)
     for t, state in states[round(0.65 * rate):]:
@@ -172,8 +159,8 @@ def test_it_starts_from_the_child_frame_where_the_reading_does_not_matter() -> N
 @pytest.mark.parametrize('kind', [
     Source(twist='odom'), Source(imu=True, twist='odom', rates=False, covariances=False),
     Source(twist='none', rates=False)], ids=str)
-@pytest.mark.parametrize('rate', [10.0, 30.0, 200.0])
-@pytest.mark.parametrize('start', [0.0, 2.0, 5.0])
+@pytest.mark.parametrize('rate', [10.0, 200.0])
+@pytest.mark.parametrize('start', [0.0, 2.0])
 def test_a_wrong_start_is_small_soon_over_and_admitted(kind: Source, rate: float,
                                                        start: float) -> None:
     source, states = first_second(kind, start, rate, 1.6)
@@ -188,7 +175,7 @@ def test_a_wrong_start_is_small_soon_over_and_admitted(kind: Source, rate: float
             assert source.twist.found == kind.twist
 
 
-@pytest.mark.parametrize('twist', ['child', 'odom'])
+@pytest.mark.parametrize('twist', ['odom'])
 def test_processes_that_start_at_other_times_read_the_same(twist: str) -> None:
     """Planner and bridge each read odom for themselves: one restarts, one misses messages."""
     readers = [first_second(Source(twist=twist), start, rate, 8.0 - start)
@@ -337,11 +324,3 @@ def test_wrong_parameters_are_named() -> None:
                          ({'twist_frame': 'body'}, 'twist_frame')):
         with pytest.raises(ValueError, match=words):
             replace(SourceParams(), **wrong)
-
-
-def test_rates_are_derived_in_the_body() -> None:
-    source = OdometrySource()
-    *_, (t, state) = read(source, Source(rates=False), 4.0)
-    np.testing.assert_allclose(state.angular_velocity, motion(t)[3], atol=0.02)
-    turned = quaternion_to_rotation_vector(state.quaternion)
-    assert np.isfinite(turned).all()

@@ -50,7 +50,7 @@ def flown(seconds: float, twist: str, noise: float = 0.0, steps: Array | None = 
     return watched, when
 
 
-@pytest.mark.parametrize('rate', [4.0, 10.0, 30.0, 200.0])
+@pytest.mark.parametrize('rate', [4.0, 200.0])
 @pytest.mark.parametrize('twist', [CHILD, ODOM])
 def test_it_is_found_soon_at_any_rate(twist: str, rate: float) -> None:
     watched, when = flown(10.0, twist, 0.01, rate=rate)
@@ -70,14 +70,14 @@ def test_evidence_adds_up_before_a_frame_is_found() -> None:
 
 
 @pytest.mark.parametrize('twist', [CHILD, ODOM])
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 def test_steps_of_the_position_contradict_nothing(twist: str, seed: int) -> None:
     # As in a real flight, whose filter corrected itself by 1 to 29 cm at a time.
     watched, _ = flown(300.0, twist, 0.005, np.array([0.05, 0.1, 0.3]), seed=seed)
     assert watched.frame == twist
 
 
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 def test_noise_of_one_at_rest_decides_nothing(seed: int) -> None:
     watched, _ = flown(600.0, CHILD, 0.01, speed=0.0, seed=seed)
     assert watched.found == ''

@@ -32,7 +32,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import edge_fit, edges
+from flock_follower.perception import edges
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit
 from flock_follower.perception.edges import Found, Lines
@@ -236,12 +236,3 @@ def test_whatever_edges_are_seen_a_covariance_is_definite(monkeypatch: pytest.Mo
             np.linalg.cholesky(found.covariance)
             assert np.linalg.norm(error(found, HERE)[:3]) < 0.2
     assert 10 < refused < 140
-
-
-def test_equations_without_a_solution_are_a_failed_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert fit(SHOWN, CAMERA, MODEL, HERE) is not None
-    with monkeypatch.context() as patch:
-        patch.setattr(edge_fit, 'solve_normal', lambda matrix, moment: None)
-        assert fit(SHOWN, CAMERA, MODEL, HERE) is None
-    monkeypatch.setattr(edge_fit, 'normal_covariance', lambda matrix: None)
-    assert fit(SHOWN, CAMERA, MODEL, HERE) is None

@@ -23,7 +23,6 @@ from flock_follower.geometry import Array, Transform
 from flock_follower.perception.hypotheses import (
     Candidate,
     Hypotheses,
-    MOST,
     PATIENCE,
     SLACK,
     Taken,
@@ -209,20 +208,6 @@ def test_a_print_seen_in_turns_with_the_leader_does_not_take_its_place() -> None
         course.see(START + np.array([0.0, 0.34, 0.0]))  # within reach
         course.see(START)
         np.testing.assert_allclose(course.believed.position, START, atol=0.05)
-
-
-def test_so_many_candidates_at_most_and_the_false_ones_go_first() -> None:
-    course = Course()
-    walls = [WALL + k * np.array([0.0, 0.8, 0.0]) for k in range(MOST)]
-    course.watch(1.0, *walls[:-1])
-    for k in range(5):
-        course.see(course.leader, WALL + np.array([1.0, 0.0, k]))
-    course.watch(0.5, *walls)
-    assert len(course.tracks.candidates) == MOST
-    assert {each.number for each in course.tracks.candidates} == {1, 2, 3}
-    places = sorted(float(each.track.newest.position[1]) for each in course.tracks.candidates
-                    if each.track.newest is not None)
-    np.testing.assert_allclose(places, [wall[1] for wall in walls], atol=0.05)
 
 
 def test_a_jump_back_in_time_forgets_all() -> None:

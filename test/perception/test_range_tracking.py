@@ -28,7 +28,6 @@ from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.perception import range_tracking
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
-from flock_follower.perception.neighbor_motion import bounded_across, turned_along
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
 
 NOISE = np.diag([0.002, 0.002, 0.002, 0.02, 0.02, 0.02]) ** 2
@@ -202,44 +201,6 @@ def test_a_distance_corrects_what_is_along_the_line_only() -> None:
     assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LATE
     assert tracker.update_range(9.0, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LOST
     assert NeighborFilter().update_range(0.0, 2.0, np.zeros(3), 0.01) is UpdateOutcome.LOST
-
-
-def covariances(count: int, size: int) -> Array:
-    roots = np.random.default_rng(0).normal(size=(count, size, size))
-    return roots @ roots.transpose(0, 2, 1)
-
-
-@pytest.mark.parametrize('size', [9, 15])
-def test_what_is_known_along_the_line_turns_with_the_line(size: int) -> None:
-    lines = np.random.default_rng(1).normal(size=(2, 20, 3))
-    lines[1] = lines[0] + 0.5 * lines[1]  # as it turns from one range to the next, or more
-    before, now = lines / np.linalg.norm(lines, axis=2, keepdims=True)
-    given = covariances(20, size)
-    found = turned_along(given, before, now)
-    for part in (slice(0, 3), slice(3, 6), slice(size - 3, size)):
-        for line, covariance, other, turned in zip(before, given, now, found):
-            assert other @ turned[part, part] @ other == pytest.approx(
-                line @ covariance[part, part] @ line)
-    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(given), rtol=1e-6)
-    np.testing.assert_array_equal(turned_along(given, 0.0 * before, now), given)
-
-
-@pytest.mark.parametrize('size', [9, 15])
-def test_across_nobody_is_farther_than_away_nor_faster_than_told(size: int) -> None:
-    line = np.random.default_rng(2).normal(size=(20, 3))
-    line /= np.linalg.norm(line, axis=1)[:, None]
-    given = 9.0 * covariances(20, size)
-    found = bounded_across(given, line, np.full(20, 2.0), 1.0)
-    for part, most in ((slice(0, 3), 2.0), (slice(3, 6), 1.0)):
-        for along, before, after in zip(line, given, found):
-            radial = along @ after[part, part] @ along
-            assert radial == pytest.approx(along @ before[part, part] @ along)
-            across = 0.5 * (np.trace(after[part, part]) - radial)
-            least = 0.5 * (np.trace(before[part, part]) - radial)
-            assert across == pytest.approx(min(most ** 2, least))
-    assert np.linalg.eigvalsh(found).min() > -1e-9
-    np.testing.assert_allclose(bounded_across(1e-4 * given, line, np.full(20, 2.0), 1.0),
-                               1e-4 * given)
 
 
 def test_an_antenna_beside_the_body_counts_where_the_attitude_is_known() -> None:

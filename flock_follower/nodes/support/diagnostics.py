@@ -39,7 +39,6 @@ ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
 NONE_SENDING = 'none sending'
-UNNAMED = '(no name yet)'  # a publisher that is seen before its node is
 Problem = tuple[bytes, str]
 
 
@@ -58,7 +57,7 @@ def rivals(node: Node, topic: str, doing: str, level: bytes = ERROR) -> Problem 
 
 def publishers(node: Node, topic: str) -> list[str]:
     """Return the full name of the node of each publisher, also if killed up to 20 s ago."""
-    return [UNNAMED if 'UNKNOWN' in end.node_name else
+    return ['(no name yet)' if 'UNKNOWN' in end.node_name else
             f'{end.node_namespace.rstrip("/")}/{end.node_name}'
             for end in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
 

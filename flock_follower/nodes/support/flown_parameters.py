@@ -16,16 +16,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from array import array
+from collections.abc import Callable, Collection
 from functools import partial
-import json
-import math
 from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
+import yaml
 
 from flock_follower.checks.topic_names import full_name
 from flock_follower.parameters.files import FLOWN
@@ -68,9 +68,9 @@ class FlownParameters:
         self._clients[name].get_parameters(names, partial(self._take_values, name, names))
 
     def _take_values(self, name: str, names: list[str], future: Any) -> None:
-        self._values[name] = {
-            key: parameter_value_to_python(value)
-            for key, value in zip(names, future.result().values)}
+        values = map(parameter_value_to_python, future.result().values)
+        self._values[name] = {key: list(value) if isinstance(value, array) else value
+                              for key, value in zip(names, values)}
         self._tell()
 
     def _tell(self) -> None:
@@ -92,24 +92,6 @@ class FlownParameters:
             told[name.rsplit('/', 1)[-1]] = own
         for file, text in files.items():
             self._note(file, text)
-        self._note(FLOWN, ''.join(_lines(told)))
-
-
-def _lines(nodes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    yield '# The parameters flown, as the nodes had them last.\n'
-    for node, values in nodes.items():
-        yield f'{node}:\n  ros__parameters:\n'
-        for name, value in sorted(values.items()):
-            yield f'    {name}: {_yaml(value)}\n'
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return '.nan' if math.isnan(value) else '.inf' if value > 0.0 else '-.inf'
-        mantissa, e, exponent = repr(value).partition('e')
-        # YAML takes 1e-05 for a word.
-        return mantissa + ('.0' if e and '.' not in mantissa else '') + e + exponent
-    if isinstance(value, (bool, int, str)):
-        return json.dumps(value)
-    return f'[{", ".join(map(_yaml, value))}]'
+        self._note(FLOWN, '# The parameters flown, as the nodes had them last.\n' + yaml.safe_dump(
+            {node: {'ros__parameters': values} for node, values in told.items()},
+            default_flow_style=False, allow_unicode=True))

@@ -1,0 +1,147 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The queue of images: what waits, for how long, and what is dropped with which reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from marker_images import DICTIONARY, make_camera, render, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.bags.message_types import empty
+from flock_follower.geometry import IDENTITY_QUATERNION, Transform
+from flock_follower.messages import OdometryState
+from flock_follower.odometry.buffer import Missing
+from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
+from flock_follower.perception.pending_images import (
+    INVALID_IMAGE,
+    MOST_PENDING,
+    NO_CAMERA,
+    Perceiver,
+    Processed,
+)
+from flock_follower.perception.tracker import camera_mounting, Tracker
+
+CAMERA = make_camera()
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))
+MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+LEADER = Transform(np.eye(3), np.array([2.2, 0.1, 0.1]))
+PIXELS = render(CAMERA, {0: MOUNTING.inverse() @ LEADER @ TAIL}, rays=3)
+
+
+class Queue:
+    """A perceiver, and messages to it at a time in s."""
+
+    def __init__(self, calibrated: bool = True) -> None:
+        self.perceiver = Perceiver(Tracker(NeighborConfig(DICTIONARY, (
+            MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),)), MOUNTING), max_wait=0.3)
+        if calibrated:
+            self.calibrate(CAMERA.matrix)
+
+    def calibrate(self, K: Any) -> None:
+        info = empty('sensor_msgs/msg/CameraInfo')
+        info.width, info.height, info.distortion_model = 640, 480, CAMERA.model
+        info.k, info.d = np.ravel(K), CAMERA.distortion
+        self.perceiver.take_camera_info(info)
+
+    def odometry(self, *stamps: float) -> bool:
+        return [self.perceiver.take_odometry(OdometryState(
+            round(1e9 * stamp), 'odom', 'base_link', np.zeros(3), IDENTITY_QUATERNION, np.zeros(3),
+            np.zeros(3), np.eye(6), np.eye(6), np.eye(3))) for stamp in stamps][-1]
+
+    def image(self, stamp: float, now: float = 0.0, encoding: str = 'mono8') -> bool:
+        """Return whether another image was dropped for this one."""
+        image = empty('sensor_msgs/msg/Image')
+        image.height, image.width, image.step, image.encoding = 480, 640, 640, encoding
+        image.data = PIXELS.ravel()
+        return self.perceiver.take_image(image, round(1e9 * stamp), now) is not None
+
+    def processed(self, now: float) -> list[Processed]:
+        found = []
+        while (one := self.perceiver.process(now)) is not None:
+            found.append(one)
+        return found
+
+    def reasons(self, now: float) -> list[str]:
+        return [reason for one in self.processed(now) for reason, _ in one.sighting.rejections]
+
+
+def test_an_image_waits_until_odometry_has_reached_its_stamp() -> None:
+    queue = Queue()
+    queue.odometry(0.0)
+    queue.image(0.012)
+    queue.odometry(0.010)
+    assert queue.processed(0.1) == [] and queue.perceiver.overdue == pytest.approx(0.3)
+    queue.odometry(0.015)
+    (one,) = queue.processed(0.1)
+    assert one.usable and one.image.stamp_ns == 12_000_000 and queue.perceiver.overdue is None
+    np.testing.assert_allclose(one.sighting.estimates['leader'].position, LEADER.translation,
+                               atol=0.02)
+
+
+def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time() -> None:
+    queue = Queue()
+    queue.odometry(0.0)
+    queue.image(0.025)
+    queue.image(0.1)
+    near, far = queue.processed(0.31)
+    assert 'leader' in near.sighting.estimates  # 25 ms are extrapolated
+    assert [reason for reason, _ in far.sighting.rejections] == [Missing.TOO_NEW.value]
+    assert not far.usable
+
+
+def test_an_image_from_the_future_holds_nobody_up_and_the_oldest_is_dropped_first() -> None:
+    queue = Queue()
+    queue.odometry(0.0, 0.02)
+    queue.image(5.0)
+    queue.image(0.01)
+    assert [one.image.stamp_ns for one in queue.processed(0.0)] == [10_000_000]
+    assert [queue.image(1.0 + 0.001 * k) for k in range(MOST_PENDING)] == (
+        [False] * (MOST_PENDING - 1) + [True])
+
+
+def test_an_image_waits_for_a_usable_calibration_and_then_is_dropped_with_the_reason() -> None:
+    queue = Queue(calibrated=False)
+    queue.odometry(0.0)
+    queue.image(0.0)
+    assert queue.processed(0.1) == []
+    queue.calibrate(CAMERA.matrix)
+    assert [one.usable for one in queue.processed(0.1)] == [True]
+    with pytest.raises(ValueError, match='not calibrated'):
+        queue.calibrate(np.zeros(9))
+    queue.image(0.0)
+    (one,) = queue.processed(0.4)
+    assert one.sighting.rejections[0][0] == NO_CAMERA and one.pixels is None and not one.usable
+    assert 'not calibrated' in one.sighting.rejections[0][1]
+
+
+def test_what_cannot_be_decoded_or_has_no_odometry_is_dropped_with_the_reason() -> None:
+    queue = Queue()
+    queue.image(0.0)
+    assert queue.reasons(1.0) == [Missing.EMPTY.value]
+    queue.odometry(0.0)
+    queue.image(0.0, encoding='theora')
+    assert queue.reasons(1.0) == [INVALID_IMAGE]
+
+
+def test_time_that_jumps_back_forgets_what_waits() -> None:
+    queue = Queue()
+    queue.odometry(100.0)
+    queue.image(100.1)
+    assert queue.odometry(0.0)
+    assert queue.processed(9.0) == [] and queue.perceiver.overdue is None
