@@ -90,7 +90,7 @@ class MavlinkVehicle:
             self.controller.set_origin()
             return [mavlink.MAVLink_gps_global_origin_message(
                 message.latitude, message.longitude, message.altitude, self._boot_ms(now) * 1000)]
-        elif kind in ('COMMAND_LONG', 'COMMAND_INT'):
+        elif kind == 'COMMAND_LONG':
             return self._command(message, now)
         return []
 
@@ -155,8 +155,7 @@ class MavlinkVehicle:
         if command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
             return [controller.arm(message.param1 > 0.5, message.param2 == FORCE, now)]
         if command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            altitude = message.z if message.get_type() == 'COMMAND_INT' else message.param7
-            return [controller.take_off(altitude, now)]
+            return [controller.take_off(message.param7, now)]
         if command in controller.PROFILE.commands:
             return [controller.change_mode(controller.PROFILE.commands[command], now)]
         if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
