@@ -80,6 +80,8 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
                        help='send it the odometry, for flight without GPS')
     parser.add_argument('--output', type=Path, default=Path('build/fly'),
                         help='folder for report and logs (%(default)s)')
+    parser.add_argument('--moving', type=Path, metavar='FILE',
+                        help='also write a moving picture of the flight, an animated WebP')
     options = parser.parse_args(args)
     try:
         SEEDS.check('--seed', options.seed)
@@ -92,6 +94,8 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
         parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
     if options.autopilot and options.followers > 1:
         parser.error('--followers: not with --autopilot')
+    if options.moving and options.followers > 1:
+        parser.error('--moving: not with --followers')
     return options
 
 
@@ -116,7 +120,12 @@ def _fly(options: argparse.Namespace) -> int:
             clear(options.output / namespace)
         cores, exit_codes = fly(scenario, options.scenario, options.seed, duration,
                                 options.output, external, options.followers)
-        return conclude(scenario, options.output, options.followers, cores, exit_codes)
+        code = conclude(scenario, options.output, options.followers, cores, exit_codes)
+        if options.moving:
+            from flock_desk.runs.moving import moving_picture
+            with whole_file(options.moving) as file:
+                file.write(moving_picture(read_flown(scenario, options.output)))
+        return code
 
 
 def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, float],

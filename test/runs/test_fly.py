@@ -367,6 +367,7 @@ def test_a_port_that_another_program_has_is_named(tmp_path, capsys):
     (['--duration', '-3'], '--duration = -3.0: must be a number in [0, 3600] s'),
     (['--followers', '0'], '--followers = 0: must be an integer in [1, 8]'),
     (['--followers', '2', '--autopilot', 'udp:127.0.0.1:14540'], 'not with --autopilot'),
+    (['--followers', '2', '--moving', 'fly.webp'], '--moving: not with --followers'),
     (['--truth', 'tcp:127.0.0.1:5762'], 'only with --autopilot'),
     (['--forward-odometry'], 'only with --autopilot'),
     (['--leader-truth', 'udp:127.0.0.1:19411'], 'only with --autopilot')])
