@@ -4,7 +4,7 @@
 #   make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes on 4 cores)
 #   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # Change it
-#   make test      run the test suite (about 25 minutes on two cores)
+#   make test      run the test suite (about six minutes on two cores)
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
@@ -27,7 +27,7 @@
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
 #   make mutation  mutate gate, envelope, permission, activation, guard and filter, and list the mistakes that their tests would miss (45 minutes)
-#   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (10 minutes); ONLY=stale
+#   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (three minutes); ONLY=stale
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
 #   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)

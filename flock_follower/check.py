@@ -31,6 +31,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 import json
+import os
 from pathlib import Path
 import re
 import sys
@@ -38,6 +39,7 @@ import textwrap
 from typing import Any
 
 from flock_follower.bags.bag import BagError
+from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import (
     ERROR,
@@ -50,7 +52,8 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.checks.topic_names import full_name, parse_remaps
+from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
 from flock_follower.resources import resource
 
@@ -83,11 +86,16 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--seconds', type=float, default=SECONDS,
                         help='how long to listen (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
+    parser.add_argument('--report', type=Path, metavar='FILE', help='also write a zip file for a '
+                        'bug report: versions, findings, parameters, diagnostics, the last minute '
+                        'of BAG or of the newest recording')
     options = parser.parse_args(args)
     if not 1.0 <= options.seconds <= MOST_SECONDS:
         parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
     try:
         seen, findings = _observe(options)
+        if options.report:
+            _report(options, seen, findings)
     except BagError as error:
         return _refuse(error)
     except OSError as error:
@@ -130,6 +138,16 @@ def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
     flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
     values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     return check_bag(options.bag, values, options.camera, options.namespace, remaps)
+
+
+def _report(options: argparse.Namespace, seen: Observations,
+            findings: Sequence[Finding]) -> None:
+    values = seen.parameters.get(full_name(options.namespace, 'black_box'), {})
+    recording = options.bag or newest_recording(folder(
+        {'record_folder': '', **values}, os.environ.get('ROS_HOME', ''), options.namespace))
+    write_report(options.report, seen, table(seen, findings), as_json(seen, findings), recording)
+    print(f'{options.report}: {options.report.stat().st_size / 1e6:.1f} MB, recording: '
+          f'{recording or "none found"}', file=sys.stderr)
 
 
 def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:

@@ -16,9 +16,11 @@
 
 from bridge_flight import BOTH, EAST, Flight
 from faulty_autopilot import Fault
+from memory_line import MemoryLine
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.permission import Phase
 
 pytestmark = pytest.mark.slow
@@ -69,6 +71,44 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
     assert flight.bridge.telemetry.status.mode == flight.modes.offboard
     assert not flight.setpoints(flight.now - 0.05)
+
+
+def test_a_switch_away_and_back_in_messages_that_arrive_together_is_seen():
+    flight = Flight().follow(1.0)
+    codec = mavlink.MAVLink(None, 1, 1)
+    flight.wire.arrived += [
+        mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode]).pack(codec)
+        for mode in ('POSCTL', 'OFFBOARD')]
+    flight.fly(0.05)
+    assert flight.bridge.state(flight.now) == 'TAKEN_OVER: offboard was left for POSCTL'
+
+
+def test_a_switch_away_and_back_that_was_not_received_leaves_it_braking():
+    flight = Flight(faults=[Fault('drop', 4.5, 6.0, 'sent')]).follow(3.0)
+    for mode in ('POSCTL', 'OFFBOARD'):
+        flight.controller.pilot_switches(mode)
+        flight.fly(2.0)
+    flight.fly(11.5 - flight.now)
+    assert flight.kinds(10) == {'brake'}
+    assert 'the pilot may have taken over' in flight.bridge.state(flight.now)
+    assert flight.ask('offboard', True).success
+    flight.fly(1.0)
+    assert 'command' in flight.kinds(10)
+
+
+def test_the_mode_of_a_px4_without_current_mode_is_that_of_its_heartbeat():
+    flight = Flight(faults=[Fault('drop', 0.0, 99.0, 'sent', message='CURRENT_MODE')]).follow(1.0)
+    flight.controller.pilot_switches('AUTO.LOITER')
+    flight.fly(1.1)
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
+
+
+def test_a_line_that_delivers_late_gets_no_setpoint_while_nothing_is_received():
+    wire = MemoryLine()
+    wire.delivers_late = True
+    flight = Flight(wire=wire, faults=[Fault('drop', 4.0, 4.0, 'sent')]).follow(4.5)
+    assert not flight.setpoints(flight.now - 0.5)
+    assert flight.mode != 'OFFBOARD'  # PX4's own failsafe acts
 
 
 @BOTH

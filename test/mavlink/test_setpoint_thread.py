@@ -44,7 +44,10 @@ class Bridge:
         return [now for called, now in self.calls if called == name]
 
     def wait_for(self, name, more):
-        count, end = len(self.times(name)) + more, time.monotonic() + DEADLINE
+        self.wait_until(name, len(self.times(name)) + more)
+
+    def wait_until(self, name, count):
+        end = time.monotonic() + DEADLINE
         while len(self.times(name)) < count:
             assert time.monotonic() < end, self.calls
             time.sleep(0.001)
@@ -105,7 +108,7 @@ def make_stream():
 def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream):
     bridge, stream, told = make_stream(NEVER)
     bridge.theirs.send(b'x')
-    bridge.wait_for('receive', 1)
+    bridge.wait_until('receive', 1)
     threads = []
     for action in (lambda: threads.append(threading.current_thread().name), lambda: 1 / 0,
                    lambda: bridge.note('forward')):

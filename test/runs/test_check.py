@@ -20,6 +20,7 @@ from collections.abc import Callable
 import json
 from pathlib import Path
 from typing import Any
+import zipfile
 
 from bag_excerpts import Change, edited, excerpt
 from carried_camera import SIDE_LENGTH, write_carried
@@ -28,10 +29,11 @@ import numpy as np
 import pytest
 from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
-from flock_follower.bags.bag import serialize
+from flock_follower.bags.bag import open_bag, serialize
 from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.message_types import empty
 from flock_follower.check import COLUMNS, main
+from flock_follower.checks.bug_report import newest_recording
 from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 
@@ -47,6 +49,40 @@ def checked(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     assert set(printed) == {'ready', 'bag', 'seconds', 'findings'}
     assert printed['ready'] is (code == 0)
     return code, {finding['what']: finding for finding in printed['findings']}
+
+
+def test_a_report_holds_what_a_bug_report_needs(
+        capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / 'report.zip'
+    code, findings = checked(capsys, SAMPLE, '--report', path)
+    assert code == 0
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / 'found')
+    found = tmp_path / 'found'
+    assert f'numpy {np.__version__}\n' in (found / 'versions.txt').read_text()
+    assert (found / 'check.txt').read_text().strip().splitlines()[-1].startswith('usable')
+    reported = json.loads((found / 'check.json').read_text())['findings']
+    assert {finding['what'] for finding in reported} == set(findings)
+    assert json.loads((found / 'diagnostics.json').read_text()) == {}
+    with open_bag(found / 'recording' / 'last_minute') as part, open_bag(SAMPLE) as bag:
+        assert part.message_count == bag.message_count  # 12 s: all of it
+
+
+def test_a_report_that_cannot_be_written_is_refused_by_its_name(
+        capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / 'missing' / 'report.zip'
+    assert main([str(SAMPLE), '--report', str(path)]) == 2
+    assert capsys.readouterr().err == f'error: {path}: No such file or directory\n'
+
+
+def test_the_newest_recording_is_the_one_of_the_largest_number(tmp_path: Path) -> None:
+    assert newest_recording(tmp_path) is None
+    for name in ('0001_b', '0003_a', '0002_c', '0004_empty'):
+        (tmp_path / name).mkdir()
+        if name != '0004_empty':
+            (tmp_path / name / 'x.mcap').touch()
+    newest = newest_recording(tmp_path)
+    assert newest is not None and newest.name == '0003_a'
 
 
 def of(topic: str, edit: Callable[[Any], None]) -> Change:

@@ -1,0 +1,94 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One file for a bug report: versions, findings, parameters, diagnostics, the last minute."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+import json
+from pathlib import Path
+import platform
+import tempfile
+from typing import Any, Final
+import zipfile
+
+from flock_follower.bags.bag import BagError, open_bag
+from flock_follower.bags.writer import BagWriter
+from flock_follower.checks.observations import Observations
+from flock_follower.whole_file import whole_file
+
+PACKAGES: Final[tuple[str, ...]] = (
+    'flock_follower', 'numpy', 'opencv-python-headless', 'opencv-python', 'pymavlink', 'rosbags',
+    'rclpy', 'ros-jazzy-rclpy')
+LAST: Final[int] = 60_000_000_000  # ns of the recording
+#: Files beside a recording that explain it.
+BESIDE: Final[tuple[str, ...]] = ('parameters.yaml', 'neighbors.yaml')
+
+
+def write_report(path: Path, seen: Observations, table: str, findings: Mapping[str, Any],
+                 recording: Path | None) -> None:
+    """
+    Write a zip file.
+
+    :param table: the findings as ``check`` prints them; ``findings``: as JSON.
+    :param recording: of which the last 60 s are included; None: there is none.
+    :raises OSError: naming the file, if it cannot be written.
+    """
+    with whole_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr('versions.txt', versions())
+        archive.writestr('check.txt', f'{table}\n')
+        for name, content in (('check.json', findings), ('parameters.json', seen.parameters),
+                              ('diagnostics.json', {
+                                  node: asdict(told) for node, told in seen.told.items()})):
+            archive.writestr(name, json.dumps(content, indent=1, default=str))
+        if recording is not None:
+            _add_recording(archive, recording)
+
+
+def versions() -> str:
+    """Return the versions of Python, the system and the packages, one per line."""
+    lines = [f'Python {platform.python_version()}', platform.platform()]
+    for package in PACKAGES:
+        try:
+            lines.append(f'{package} {version(package)}')
+        except PackageNotFoundError:
+            lines.append(f'{package} not installed')
+    return '\n'.join([*lines, ''])
+
+
+def newest_recording(folder: Path) -> Path | None:
+    """Return the newest recording of the black box in a folder; None if there is none."""
+    recordings = [path for path in folder.glob('*_*') if any(path.glob('*.mcap'))]
+    return max(recordings, key=lambda path: path.name, default=None)
+
+
+def _add_recording(archive: zipfile.ZipFile, recording: Path) -> None:
+    """Add the last minute as a bag, or the reason why it cannot be read."""
+    beside = recording if recording.is_dir() else recording.parent
+    for name in BESIDE:
+        if (beside / name).is_file():
+            archive.write(beside / name, f'recording/{name}')
+    with tempfile.TemporaryDirectory() as scratch:
+        excerpt = Path(scratch) / 'last_minute'
+        try:
+            with open_bag(recording) as bag, BagWriter(excerpt) as part:
+                for message in bag.messages(start_ns=bag.end_ns - LAST, stop_ns=bag.end_ns + 1):
+                    part.write(*message)
+        except BagError as error:
+            archive.writestr('recording/error.txt', f'{error}\n')
+        for file in sorted(excerpt.glob('*')):
+            archive.write(file, f'recording/last_minute/{file.name}')
