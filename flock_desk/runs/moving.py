@@ -54,7 +54,7 @@ def moving_picture(record: LiveRecord) -> bytes:
     shown = axes['seen'].imshow(np.zeros((camera.camera.height, camera.camera.width)),
                                 cmap='gray', vmin=0, vmax=255)
     outline, = axes['seen'].plot([], [], color=FOLLOWER, linewidth=2)
-    axes['seen'].set(title="the follower's camera; outline: estimated marker", xticks=[], yticks=[])
+    axes['seen'].set(title="the follower's camera; outline: the estimate", xticks=[], yticks=[])
     tracks = []
     for name, colour, path in (('leader', LEADER, record.leader),
                                ('follower', FOLLOWER, record.follower)):

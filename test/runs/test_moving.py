@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip('matplotlib')
-from PIL import Image  # noqa: E402
+from PIL import Image
 
-from flock_desk.runs.frame_errors import COLUMNS  # noqa: E402
-from flock_desk.runs.moving import moving_picture  # noqa: E402
+from flock_desk.runs.frame_errors import COLUMNS
+from flock_desk.runs.moving import moving_picture
 
 
 def test_it_has_eight_pictures_each_second_also_without_an_estimate():
@@ -33,7 +33,7 @@ def test_it_has_eight_pictures_each_second_also_without_an_estimate():
     table |= {'time': times, 'true_distance': np.full(31, 2.0), 'visible': np.ones(31)}
     table['position_x'][:15] = np.nan
     follower = np.outer(times, [0.3, 0.1, 0.0])
-    leader, level = follower + [2.0, 0.0, 0.0], np.tile([0.0, 0.0, 0.0, 1.0], (31, 1))
+    leader, level = follower + np.array([2.0, 0.0, 0.0]), np.tile([0.0, 0.0, 0.0, 1.0], (31, 1))
     record = SimpleNamespace(
         table=table, leader=leader, follower=follower,
         params=SimpleNamespace(law=SimpleNamespace(d0=1.0, d1=8.0)),
