@@ -179,21 +179,21 @@ def test_an_invalid_message_is_counted_under_its_topic_and_logged_once(bench):
 
 
 @pytest.mark.parametrize(('publish', 'expected'), [
-    (None, 'no /odom for 9 s: no publisher'),
+    (None, 'no /silent/odom for 9 s: no publisher'),
     (String, 'published as std_msgs/msg/String, wanted nav_msgs/msg/Odometry'),
     (Odometry, 'QoS mismatch with elsewhere')])
 def test_the_silence_of_a_required_input_is_explained(bench, publish, expected):
-    node = bench(FlockNode, 'tested')
-    node.subscribe(Odometry, 'odom', oops, QoSProfile(depth=1))
+    node = bench(FlockNode, 'tested')  # a topic that no node of an earlier test has
+    node.subscribe(Odometry, 'silent/odom', oops, QoSProfile(depth=1))
     node.subscribe(Odometry, 'optional', oops, QoSProfile(depth=1), required=False)
     context = rclpy.Context()  # DDS has one type for each topic of a participant
     rclpy.init(context=context)
     elsewhere = rclpy.create_node('elsewhere', context=context)
     if publish is not None:
         elsewhere.create_publisher(
-            publish, 'odom', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+            publish, 'silent/odom', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
         bench.until(lambda: [end.node_name for end in node.get_publishers_info_by_topic(
-            '/odom')] == ['elsewhere'], 'the publisher')
+            '/silent/odom')] == ['elsewhere'], 'the publisher')
     assert node.diagnostics.problems(time.monotonic() + 1.0) == []
     ((level, message),) = node.diagnostics.problems(time.monotonic() + 9.0)
     assert level == ERROR and expected in message
