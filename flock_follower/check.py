@@ -145,7 +145,11 @@ def _report(options: argparse.Namespace, seen: Observations,
     values = seen.parameters.get(full_name(options.namespace, 'black_box'), {})
     recording = options.bag or newest_recording(folder(
         {'record_folder': '', **values}, os.environ.get('ROS_HOME', ''), options.namespace))
-    write_report(options.report, seen, table(seen, findings), as_json(seen, findings), recording)
+    try:
+        write_report(options.report, seen, table(seen, findings), as_json(seen, findings),
+                     recording)
+    except OSError as error:
+        raise ValueError(f'--report {options.report}: {error.strerror or error}') from error
     print(f'{options.report}: {options.report.stat().st_size / 1e6:.1f} MB, recording: '
           f'{recording or "none found"}', file=sys.stderr)
 

@@ -46,7 +46,8 @@ from flock_follower.bags.description import (
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.schedule import NANOSECONDS
 
-_NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
+#: The name of the folder of a recording; the group is its number.
+NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
 _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
 _STEP = NANOSECONDS  # by which a clock may go back within a recording ...
 _FORWARD = 10.0  # s: ... and ahead, of a computer that gets the time from the network
@@ -200,7 +201,7 @@ class FlightRecording:
 
     def _recordings(self) -> list[Path]:
         return sorted((path for path in self.folder.iterdir()
-                       if _NAME.fullmatch(path.name) and path.is_dir()),
+                       if NAME.fullmatch(path.name) and path.is_dir()),
                       key=lambda path: int(path.name.partition('_')[0]))
 
     def _make_room(self, now: float) -> None:

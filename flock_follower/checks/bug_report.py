@@ -27,6 +27,8 @@ from typing import Any, Final
 import zipfile
 
 from flock_follower.bags.bag import BagError, open_bag
+from flock_follower.bags.message_types import typestore
+from flock_follower.bags.recording import NAME
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.observations import Observations
 from flock_follower.whole_file import whole_file
@@ -72,23 +74,33 @@ def versions() -> str:
 
 def newest_recording(folder: Path) -> Path | None:
     """Return the newest recording of the black box in a folder; None if there is none."""
-    recordings = [path for path in folder.glob('*_*') if any(path.glob('*.mcap'))]
-    return max(recordings, key=lambda path: path.name, default=None)
+    numbers = {path: int(name[1]) for path in folder.glob('*_*')
+               if (name := NAME.fullmatch(path.name)) and any(path.glob('*.mcap'))}
+    return max(numbers, key=numbers.__getitem__, default=None)
 
 
 def _add_recording(archive: zipfile.ZipFile, recording: Path) -> None:
-    """Add the last minute as a bag, or the reason why it cannot be read."""
+    """Add the last minute as a bag; what cannot be read of it, and why, is in error.txt."""
     beside = recording if recording.is_dir() else recording.parent
     for name in BESIDE:
         if (beside / name).is_file():
             archive.write(beside / name, f'recording/{name}')
     with tempfile.TemporaryDirectory() as scratch:
-        excerpt = Path(scratch) / 'last_minute'
+        excerpt, problems = Path(scratch) / 'last_minute', []
         try:
-            with open_bag(recording) as bag, BagWriter(excerpt) as part:
-                for message in bag.messages(start_ns=bag.end_ns - LAST, stop_ns=bag.end_ns + 1):
-                    part.write(*message)
+            with open_bag(recording) as bag:
+                known = {name: topic for name, topic in bag.topics.items()
+                         if topic.msgtype in typestore().types}
+                problems += [f'{name}: {reason}' for name, reason in bag.skipped.items()]
+                problems += [f'{name}: unknown message type {bag.topics[name].msgtype}'
+                             for name in bag.topics.keys() - known]
+                with BagWriter(excerpt, [name for name in known if known[name].latched]) as part:
+                    for message in bag.messages(known, bag.end_ns - LAST, bag.end_ns + 1):
+                        if message.topic in known:  # without any name the bag yields all
+                            part.write(*message)
         except BagError as error:
-            archive.writestr('recording/error.txt', f'{error}\n')
+            problems.append(str(error))
+        if problems:
+            archive.writestr('recording/error.txt', '\n'.join([*sorted(problems), '']))
         for file in sorted(excerpt.glob('*')):
             archive.write(file, f'recording/last_minute/{file.name}')

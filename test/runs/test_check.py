@@ -29,11 +29,14 @@ import numpy as np
 import pytest
 from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
+from flock_follower.bags import mcap_file
 from flock_follower.bags.bag import open_bag, serialize
 from flock_follower.bags.description import mark_incomplete
+from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
 from flock_follower.check import COLUMNS, main
-from flock_follower.checks.bug_report import newest_recording
+from flock_follower.checks.bug_report import newest_recording, write_report
+from flock_follower.checks.observations import Observations
 from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 
@@ -72,17 +75,37 @@ def test_a_report_that_cannot_be_written_is_refused_by_its_name(
         capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / 'missing' / 'report.zip'
     assert main([str(SAMPLE), '--report', str(path)]) == 2
-    assert capsys.readouterr().err == f'error: {path}: No such file or directory\n'
+    assert capsys.readouterr().err == f'error: --report {path}: No such file or directory\n'
 
 
 def test_the_newest_recording_is_the_one_of_the_largest_number(tmp_path: Path) -> None:
     assert newest_recording(tmp_path) is None
-    for name in ('0001_b', '0003_a', '0002_c', '0004_empty'):
+    names = [f'{number}_20260101T000000Z' for number in ('0001', '9999', '10000', '10001')]
+    for name in (*names, 'old_flights'):
         (tmp_path / name).mkdir()
-        if name != '0004_empty':
+        if name != names[-1]:  # that of a recording without a file
             (tmp_path / name / 'x.mcap').touch()
-    newest = newest_recording(tmp_path)
-    assert newest is not None and newest.name == '0003_a'
+    assert newest_recording(tmp_path) == tmp_path / names[2]
+
+
+def test_an_unknown_message_type_leaves_the_rest_of_the_recording_in_the_report(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    foreign, data = RecordedTopic('/fmu', 'px4_msgs/msg/Foo'), b'\0\1\0\0' + bytes(8)
+    known = RecordedTopic('/pose', POSE)
+    with monkeypatch.context() as patch:
+        patch.setattr(mcap_file, 'definition', lambda _: 'uint64 timestamp')
+        file = McapFile(tmp_path / 'bag.mcap')
+        file.write([TakenMessage(known, second * 1_000_000_000, serialize(empty(POSE), POSE))
+                    for second in range(100)] + [TakenMessage(foreign, 99_000_000_000, data)])
+        file.close()
+    write_report(tmp_path / 'report.zip', Observations(), '', {}, file.path)
+    with zipfile.ZipFile(tmp_path / 'report.zip') as archive:
+        archive.extractall(tmp_path)
+    assert (tmp_path / 'recording' / 'error.txt').read_text() == (
+        '/fmu: unknown message type px4_msgs/msg/Foo\n')
+    with open_bag(tmp_path / 'recording' / 'last_minute') as part:
+        assert (part.topics.keys(), part.duration_ns) == ({'/pose'}, 60_000_000_000)
+        assert not part.incomplete
 
 
 def of(topic: str, edit: Callable[[Any], None]) -> Change:
