@@ -74,8 +74,12 @@ def test_a_report_holds_what_a_bug_report_needs(
 def test_a_report_that_cannot_be_written_is_refused_by_its_name(
         capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / 'missing' / 'report.zip'
-    assert main([str(SAMPLE), '--report', str(path)]) == 2
-    assert capsys.readouterr().err == f'error: --report {path}: No such file or directory\n'
+    with pytest.raises(SystemExit, match='2'):  # before anything is read
+        main([str(SAMPLE), '--report', str(path)])
+    assert capsys.readouterr().err.endswith(
+        f'error: --report = {path}: must be a file in a folder that exists\n')
+    assert main([str(SAMPLE), '--report', str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith(f'error: --report {tmp_path}: ')
 
 
 def test_the_newest_recording_is_the_one_of_the_largest_number(tmp_path: Path) -> None:
