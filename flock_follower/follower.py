@@ -275,9 +275,9 @@ class Follower:
             self.sharing.take_seen(state)
         self._take_neighbor(state)
 
-    def _take_neighbor(self, state: OdometryState, heard: bool = False) -> None:
+    def _take_neighbor(self, state: OdometryState, received: bool = False) -> None:
         try:
-            self.planner.take_neighbor(state, heard)
+            self.planner.take_neighbor(state, received)
         except ValueError as error:
             self._listener.rejected('invalid neighbors', str(error))
 
@@ -382,7 +382,7 @@ class Follower:
     def _tick(self) -> None:
         if self.sharing is not None:
             for state in self.sharing.neighbors(self._now):
-                self._take_neighbor(state, heard=True)
+                self._take_neighbor(state, received=True)
             if words := self.sharing.words(self._now):
                 self._listener.words(self._now, words)
             for event in self.sharing.told():

@@ -15,9 +15,9 @@
 """
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
-Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
-``neighbors/acceleration``, ``neighbors/heard`` (what other vehicles tell of their neighbours, and
-of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
+Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if published ``camera_info``,
+``neighbors/acceleration``, ``neighbors/heard`` (neighbour states received from other vehicles)
+and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
 steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
@@ -215,7 +215,7 @@ class Planner(FlockNode):
 
     def _take_heard(self, message: Odometry, arrival: int) -> None:
         if self._fresh('neighbors/heard', message.header.stamp):
-            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), heard=True)
+            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), received=True)
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
         if self._fresh('neighbors/acceleration', message.header.stamp):
@@ -330,7 +330,7 @@ class Planner(FlockNode):
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
         for each in decision.known:
             values[f'{each.name}_is'] = ', '.join([
-                each.who.role, 'heard' if each.heard else 'seen',
+                each.member.role, 'heard' if each.received else 'seen',
                 *(['edge'] if each.name in decision.edges else [])])
 
     def _tick_problem(self, now: float) -> Problem | None:
