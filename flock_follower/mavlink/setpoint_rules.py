@@ -246,18 +246,18 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                         axis, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
-    believed = known.braking_velocity(limits)
-    if believed is None:
+    estimated = known.braking_velocity(limits)
+    if estimated is None:
         kind = NONE if known.blind(limits) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
-    wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin)
+    nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         climb = HEIGHT_FREQUENCY * (
             HEIGHT_FREQUENCY * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
-            wanted[2] = climb
+            nominal[2] = climb
             against = against + np.array([0.0, 0.0, _bounded(offset)])
-    safe = _limited(full, wanted, against, believed, place, None, offset)
+    safe = _limited(full, nominal, against, estimated, place, None, offset)
     return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
 
 
@@ -270,8 +270,8 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     velocity = judge.fresh_velocity(limits)
     if velocity is None:
         never = math.isinf(judge.velocity_age)
-        told = f'velocity from {known.source}'
-        return None, f'no {told}' if never else f'{told} stale'
+        source = f'velocity from {known.source}'
+        return None, f'no {source}' if never else f'{source} stale'
     if disagreement := known.contradiction(limits):
         return None, disagreement
     if unplaced:
@@ -297,16 +297,16 @@ def _direction(axis: ArrayLike | None) -> Array | None:
     return vector if unit else None
 
 
-def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity,
+def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Velocity,
              place: Location, axis: Array | None, offset: float) -> LimitedCommand:
     """
-    Return the acceleration within limits and envelope that is nearest to ``wanted + against``.
+    Return the acceleration within limits and envelope that is nearest to ``nominal + against``.
 
-    ``against`` offsets a disturbance. The limits hold for ``wanted``, which is how the vehicle
+    ``against`` offsets a disturbance. The limits hold for ``nominal``, which is how the vehicle
     accelerates if the disturbance is as estimated, and for the sum, if there is none.
     """
     horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
-    safe = limit_command(wanted, v, limits.a_max, limits.v_max, horizon, axis)
+    safe = limit_command(nominal, v, limits.a_max, limits.v_max, horizon, axis)
     if against.any():
         total = limit_command(safe.acceleration + against, v, limits.a_max, limits.v_max, horizon,
                               axis)
