@@ -193,10 +193,10 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
     if known is not None:
         x, y, _ = (known.position - me.position).tolist()
-        away = math.hypot(x, y)
-        if away > 1e-6:
-            towards = np.array([x, y, 0.0]) / away
-            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
+        apart = math.hypot(x, y)
+        if apart > 1e-6:
+            towards = np.array([x, y, 0.0]) / apart
+            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(apart, distance)
     variance = float(along @ n.position_covariance @ along)
     # As measured; until the command acts only the own motion on the line backwards changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))

@@ -114,13 +114,13 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+        approach, leaving = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
                           for v in (n.velocity, me.velocity))
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
-        away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
-        if math.hypot(level, z) < CLOSE + radii_sum and away > APPROACH_NOISE:
-            rest = min(rest, math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0)))
+        leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
+        if math.hypot(level, z) < CLOSE + radii_sum and leaving > APPROACH_NOISE:
+            rest = min(rest, math.sqrt(max(params.fastest ** 2 - leaving ** 2, 0.0)))
     # The height between has priority over the rest of v_max.
     return max(least, min(-rest, most)), min(most, max(rest, least))
 
@@ -134,11 +134,11 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
                                Edges(-math.inf, params.range_max), params.guarding)
         bounds += [each._replace(reason=FENCE) for each in inside if each.reason == COHESION]
     if lost is not None:
-        away = LEVEL * (position - lost.origin)
-        distance = math.hypot(*away.tolist())
+        offset = LEVEL * (position - lost.origin)
+        distance = math.hypot(*offset.tolist())
         if distance > 1e-6:
             left = retreat(lost, params) - distance
-            bounds.append(stop(away / distance, left, velocity, params))
+            bounds.append(stop(offset / distance, left, velocity, params))
         left = lost.free - params.guarding.m - float(lost.towards @ position)
         bounds.append(stop(lost.towards, left, velocity, params))
     return bounds

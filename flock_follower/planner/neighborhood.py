@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.flock import neighbor_graph
-from flock_follower.flock.neighbor_graph import attended, HELD
+from flock_follower.flock.neighbor_graph import graph_law, HELD
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
@@ -208,7 +208,7 @@ def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
     else:
         share = np.array([neighbors.shares[n.name] for n in flock])
         others = np.array([n.member.role == AVOID for n in flock])
-        law = attended(offsets, differences, share, others, params.law, params.a_max)
+        law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
     if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
         return law, None  # too near already: at once

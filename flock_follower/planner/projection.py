@@ -66,12 +66,12 @@ class Discs(NamedTuple):
         towards = goal / abs(goal) if far else goal - centre
         for here, here_radius, there, there_radius in (
                 (centre, radius, other, other_radius), (other, other_radius, centre, radius)):
-            away = abs(goal - here)
+            distance = abs(goal - here)
             if far:
                 point = here + here_radius * towards
             else:
-                point = goal if away <= here_radius else (
-                    here + (goal - here) * (here_radius / away))
+                point = goal if distance <= here_radius else (
+                    here + (goal - here) * (here_radius / distance))
             if abs(point - there) <= there_radius + TOLERANCE:
                 return point
         return self._on_rim(towards)

@@ -52,7 +52,7 @@ START = 1_700_000_000 * 10**9  # ns
 TICK = 100_000_000  # ns
 
 
-@pytest.mark.parametrize(('text', 'word', 'reason'), [
+@pytest.mark.parametrize(('text', 'name', 'reason'), [
     ('ACTIVE', 'ACTIVE', ''),
     ('ACTIVE: ', 'ACTIVE', ''),
     ('ACTIVE:flying', 'ACTIVE', 'flying'),
@@ -82,7 +82,7 @@ def test_any_text_is_read_as_one_of_the_words(text: str) -> None:
     assert (state.name != ACTIVE) or text.split(':')[0].split()[0] == 'ACTIVE'
 
 
-@pytest.mark.parametrize(('said', 'age', 'word'), [
+@pytest.mark.parametrize(('reported', 'age', 'name'), [
     (None, 0.0, NO_AUTOPILOT), (None, math.inf, NO_AUTOPILOT),
     (BridgeState(ACTIVE), 0.0, ACTIVE), (BridgeState(ACTIVE), SILENCE, ACTIVE),
     (BridgeState(ACTIVE), 1.001, NO_AUTOPILOT), (BridgeState(ACTIVE), math.inf, NO_AUTOPILOT),
@@ -125,10 +125,10 @@ class Flight:
                 empty, self.now, 'odom', 'leader', (distance, 0.0, self.height),
                 IDENTITY_QUATERNION, (speed, 0.0, 0.0))))
 
-    def tick(self, hears: bool = True) -> tuple[Decision, Command | None]:
+    def tick(self, receives: bool = True) -> tuple[Decision, Command | None]:
         """Pass a tenth of a second, in which the bridge repeats itself, or falls silent."""
         self.now += TICK
-        self.silent = 0.0 if hears and math.isfinite(self.silent) else self.silent + 0.1
+        self.silent = 0.0 if receives and math.isfinite(self.silent) else self.silent + 0.1
         self.sense()
         return self.loop.tick(self.now, PARAMS, self.silent)
 
@@ -316,7 +316,7 @@ def test_no_command_comes_unless_engaged_and_active_and_fresh(
             silent += 0.7
         else:
             silent += 0.1
-            decision, command = flight.tick(hears=False)
+            decision, command = flight.tick(receives=False)
             active = engaged and name == 'ACTIVE' and silent <= SILENCE
             assert (command is not None) == active == (decision.state is not State.IDLE)
             if active and anew:

@@ -322,7 +322,7 @@ def test_a_change_of_parameters_and_seeing_again_make_no_jump() -> None:
     stronger = replace(params, law=replace(params.law, K=3.0))
     memory, before = fly(10, params, Memory())
     memory, after = fly(10, params, memory, 11, stronger)
-    jumps = np.linalg.norm(np.diff(np.vstack([before[-1:], after]), far=0), far=1)
+    jumps = np.linalg.norm(np.diff(np.vstack([before[-1:], after]), axis=0), axis=1)
     assert jumps[:5] == pytest.approx(np.linalg.norm(after[-1] - before[-1]) / 5)
     assert jumps[5:] == pytest.approx(0.0)
     for tick in range(21, 30):  # unseen for long enough to coast

@@ -52,9 +52,9 @@ def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, 
         [sys.executable, '-m', 'flock_follower.check', '--json', *arguments],
         env=environment, capture_output=True, text=True, timeout=DEADLINE)
     assert ended.stderr == ''
-    told = json.loads(ended.stdout)
+    reported = json.loads(ended.stdout)
     found: dict[str, list[Any]] = {}
-    for finding in told['findings']:
+    for finding in reported['findings']:
         found.setdefault(finding['what'], []).append(finding)
     return ended.returncode, found
 
