@@ -23,9 +23,9 @@ odometry, both along odom's axes, and s the ratio of the distance seen to the tr
     y = c - s q - turn x y - ...    (least squares; c is s times the position of the marker)
 
 A leader that moves can look the same: if it goes ahead by half of the follower's way, it looks
-like a marker whose configured size is too small. Relative positions alone cannot tell. So a result
-is given only if a single s explains nearly all changes of y, and the marker keeps its attitude, as
-it does if it stands on the ground and the camera is carried before it.
+like a marker whose configured size is too small. Relative positions alone cannot distinguish the
+two cases. So a result is given only if a single s explains nearly all changes of y, and the marker
+keeps its attitude, as it does if it stands on the ground and the camera is carried before it.
 """
 
 from __future__ import annotations

@@ -152,10 +152,10 @@ class Sharing:
         name = sender_of(state.frame)
         if not name:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
-                                f'NAME{FRAME}, NAME being the vehicle that tells')
+                                f'NAME{FRAME}, where NAME is the sending vehicle')
         if name == self.name:
             if _key(state) not in self._echoes:  # else an own message that came back
-                self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
+                self._refuse('somebody uses my name', f'{name} sends {state.child[:70]!r}')
             return None
         sender = self.senders.get(name)
         if refused := refusal(state, received):
@@ -175,9 +175,9 @@ class Sharing:
         """Take a valid message of a sender."""
         of_itself, before = state.child == sender.name, sender.states.get(state.child)
         if before is not None and state.stamp <= before.stamp:
-            return self._refuse('word out of order', f'{sender.name} tells of {state.child}')
+            return self._refuse('word out of order', f'{sender.name} sends {state.child}')
         if before is None and len(sender.states) >= SEEN_MAX:
-            return self._refuse('too many vehicles', f'{sender.name} tells of {state.child}')
+            return self._refuse('too many vehicles', f'{sender.name} sends {state.child}')
         leap = '' if before is None else leapt(before, state)
         if of_itself:
             if leap:

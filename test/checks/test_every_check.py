@@ -310,7 +310,7 @@ def time_of_day(seen: Observed) -> None:
 
 
 @fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
-       'but the topic says rectified', 'rectified:=true')
+       'but the topic is marked as rectified', 'rectified:=true')
 def rectified(seen: Observed) -> None:
     seen.topics['/image_rect'] = lose(seen, 'image_raw')
     seen.names['image_raw'] = '/image_rect'

@@ -164,7 +164,7 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
         near.take_own(own(now))
         apart.take_message(state(stamp=now, position=(8 * (k % 2), 0, 1)), now)
         near.take_message(state(stamp=now, position=(0.1 * (k % 2), 0, 1)), now)
-    assert near.status(now)[0].why.startswith('talks at 20 Hz')
+    assert near.status(now)[0].why.startswith('sends at 20 Hz')
     assert apart.status(now)[0].why.startswith('leapt 3 times')
     for sharing in (apart, near):
         assert 'not listened to for a while' in reasons(sharing)
