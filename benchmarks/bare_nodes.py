@@ -117,14 +117,14 @@ class BareBridge(Node):
             MultiDOFJointTrajectory, 'bare/command/trajectory', nothing, NEWEST)
         self._odometry = self.create_publisher(Odometry, 'bare/mavlink/odom', 10)
         self._states = self.create_publisher(String, 'bare/mavlink_bridge/state', 1)
-        self.create_timer(STATE, self._tell)
+        self.create_timer(STATE, self._publish_state)
 
     def _take_odom(self, message: Odometry) -> None:
         self._count += 1
         if self._count % EVERY == 0:
             self._odometry.publish(message)
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         self._states.publish(String(data='ACTIVE'))
 
 

@@ -173,15 +173,15 @@ def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> S
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings: a busy machine, a flight cut short."""
-    told = []
+    warnings = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
     if skipped > BUSY:
-        told.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
+        warnings.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
                     'rendered in time, which the follower feels as a camera that stops; fly again '
                     'when it is idle')
     if early := (summary['external'] or {}).get('ended_early'):
-        told.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
-    return told
+        warnings.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
+    return warnings
 
 
 if __name__ == '__main__':

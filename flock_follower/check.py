@@ -105,8 +105,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _refuse(error)
     except ModuleNotFoundError as error:
-        return _refuse(f'{error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-                       'package that package.xml names?')
+        return _refuse(f'{error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+                       'package in package.xml')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130

@@ -49,7 +49,7 @@ TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
-LIFT = 'lift'
+THRUST_BIAS = 'lift'
 #: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
 #: be it. It is kept clear of, and never followed.
 DUPLICATE = '/duplicate'
@@ -300,13 +300,13 @@ class Command(NamedTuple):
     """rad."""
     yaw_rate: float = 0.0
     """rad/s, anticlockwise."""
-    away: Array | None = None
+    separation_axis: Array | None = None
     """Unit vector (3,) away from a neighbour that would come too near: the part of the
     acceleration along it is cut last. None where nobody does."""
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
-    lift: float = 0.0
+    thrust_bias: float = 0.0
     """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
 
     def ages(self, now: int) -> tuple[float, float]:
@@ -319,9 +319,9 @@ def trajectory(make: Make, command: Command) -> Any:
     """
     Return a command as a MultiDOFJointTrajectory of one point.
 
-    Position and velocity are NaN: they are not commanded. A joint 'separation' has ``away`` as
-    its acceleration, a joint 'lift' has ``lift`` upwards; whoever knows the first joint only does
-    not see them.
+    Position and velocity are NaN: they are not commanded. The acceleration of a joint 'separation'
+    is ``separation_axis``, that of a joint 'lift' is ``thrust_bias`` upwards. A receiver of only
+    the first joint ignores both.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
@@ -337,9 +337,9 @@ def trajectory(make: Make, command: Command) -> Any:
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
     point.transforms, point.velocities, point.accelerations = (
         [transform], [velocity], [acceleration])
-    more = [] if command.away is None else [(SEPARATION, command.away)]
-    if command.lift:
-        more.append((LIFT, np.array([0.0, 0.0, command.lift])))
+    more = [] if command.separation_axis is None else [(SEPARATION, command.separation_axis)]
+    if command.thrust_bias:
+        more.append((THRUST_BIAS, np.array([0.0, 0.0, command.thrust_bias])))
     for name, vector in more:
         beside = make('geometry_msgs/msg/Twist')
         set_vector(beside.linear, vector)
@@ -368,13 +368,13 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     q = point.transforms[0].rotation
     more = {name: to_array(beside.linear) for name, beside in zip(
         message.joint_names[1:], point.accelerations[1:])}
-    away = _direction(more[SEPARATION]) if SEPARATION in more else None
-    lift = float(more[LIFT][2]) if LIFT in more else 0.0
+    separation_axis = _direction(more[SEPARATION]) if SEPARATION in more else None
+    thrust_bias = float(more[THRUST_BIAS][2]) if THRUST_BIAS in more else 0.0
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
-        point.velocities[0].angular.z if point.velocities else 0.0, away, frame,
+        point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,
         read_stamp(message.header.stamp), read_stamp(point.time_from_start),
-        lift if math.isfinite(lift) else 0.0)
+        thrust_bias if math.isfinite(thrust_bias) else 0.0)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files that are whole or not there: what a full disk cuts short is not left under its name."""
+"""Atomic file writes: if the disk is full, no partial file remains under the final name."""
 
 from __future__ import annotations
 

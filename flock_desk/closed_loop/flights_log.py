@@ -15,8 +15,8 @@
 """
 Records simulated flights from engaging on: every planner tick, and the extremes between ticks.
 
-Every follower is a row, see ``world``. A lone one follows the leader. In a flock each follows the
-edges of its planner; before the first of them, the vehicle that it begins behind.
+Each array has one row per follower, see ``world``. A single follower follows the leader. In a
+flock each follows the edges of its planner; before the first edge, the vehicle ahead of its start.
 """
 
 from __future__ import annotations

@@ -241,7 +241,7 @@ class _Recorder(Listener):
         if self.own is not None:
             self.own.events[reason] += 1
             if reason == INVALID_ODOMETRY:
-                self.own.lost, self.own.why = self.own.lost + 1, detail
+                self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self._start) / NANOSECONDS

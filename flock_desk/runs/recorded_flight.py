@@ -97,7 +97,7 @@ class RecordedFlight:
         except ValueError as error:
             self._listener.rejected(INVALID_ODOMETRY, str(error))
             return
-        for event in self.source.told():
+        for event in self.source.new_events():
             self._listener.rejected(*event)
         if state is not None:
             self.follower.odometry(time, state)

@@ -310,7 +310,7 @@ def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
 
 
 def _problems(flight: LiveRecord) -> dict[str, int]:
-    """Return how often each node reported which problem in the scenario, without its numbers."""
+    """Return the count of each problem reported by each node; numbers in its text are masked."""
     reported = Counter(
         f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
         for t, array in flight.diagnostics if 0.0 < t <= flight.duration

@@ -71,8 +71,8 @@ def turn_rate(heading: Any, offset: Array) -> Any:
     :param heading: theirs (...), rad.
     :param offset: their positions minus those of the followers (..., 3), m.
     """
-    away = np.arctan2(offset[..., 1], offset[..., 0])
-    error = (away - heading + math.pi) % (2.0 * math.pi) - math.pi
+    direction = np.arctan2(offset[..., 1], offset[..., 0])
+    error = (direction - heading + math.pi) % (2.0 * math.pi) - math.pi
     return np.clip(TURN_GAIN * error, -TURN_RATE, TURN_RATE)
 
 

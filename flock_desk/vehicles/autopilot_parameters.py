@@ -16,8 +16,8 @@
 The parameters of the embedded autopilot, served the way PX4 and ArduPilot each serve them.
 
 PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself: who mixes them up
-reads 1 as 1.4e-45.
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself. A decoder that uses
+the wrong encoding reads 1 as 1.4e-45.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ class FlightController(ABC):
         """Return whether the estimate of the position is valid."""
 
     @abstractmethod
-    def tells_position(self, now: float) -> bool:
+    def reports_position(self, now: float) -> bool:
         """Return whether it sends LOCAL_POSITION_NED."""
 
     @abstractmethod

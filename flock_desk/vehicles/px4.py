@@ -53,7 +53,7 @@ from flock_desk.vehicles.vehicle import GRAVITY
 from flock_follower.geometry import Array
 
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
-AIDING_TIMEOUT: Final[float] = 0.55
+FUSION_TIMEOUT: Final[float] = 0.55
 _SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
 _ALWAYS, _HORIZONTAL, _AIDED, _ABSOLUTE, _AT_REST = 0x65, 0xA, 0x100, 0x210, 0x80
 #: What is flown after the loss of the stream, by COM_OBL_RC_ACT: the first that can be.
@@ -62,7 +62,7 @@ _LOST_STREAM: Final[Mapping[int, tuple[str, ...]]] = {
 _CLIMB_MAX: Final[float] = 3.0  # m/s, MPC_Z_VEL_MAX_UP
 _RAMP_START: Final[float] = -GRAVITY / 4.0
 _DESCENT: Final[float] = 0.275  # m/s; a faster commanded descent counts as a landing
-_LIFTING: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
+_FLYING_THRUST: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
 _LANDING_TIME: Final[float] = 1.0  # s, LNDMC_TRIG_TIME
 REPORT_PERIOD: Final[float] = 2.0  # s between reports of changes, at least
 _EVENT, _EVENT_CRC = 410, 160
@@ -140,7 +140,7 @@ class Px4(FlightController):
         patience = self.parameters['EKF2_NOAID_TOUT'] * 1e-6 + PX4.oldest_vision
         return self.estimator.ready(now) and self.estimator.vision_age(now) <= patience
 
-    def tells_position(self, now: float) -> bool:
+    def reports_position(self, now: float) -> bool:
         """Return whether it sends LOCAL_POSITION_NED: valid or not."""
         return self.estimator.started(now)
 
@@ -149,7 +149,7 @@ class Px4(FlightController):
         flags = _ALWAYS | (_AT_REST if self._landed else 0)
         if self.position_known(now):
             flags |= _HORIZONTAL
-        if self.estimator.ready(now) and self.estimator.vision_age(now) <= AIDING_TIMEOUT:
+        if self.estimator.ready(now) and self.estimator.vision_age(now) <= FUSION_TIMEOUT:
             flags |= _AIDED | (_ABSOLUTE if self.has_origin else 0)
         return flags
 
@@ -287,7 +287,7 @@ class Px4(FlightController):
         """Follow the land detector; ``thrust``, m/s^2, is what is commanded."""
         rests = self.vehicle.landed and self._descends and not self._landed
         self._resting_for = self._resting_for + dt if rests else 0.0
-        self._landed = (not self.armed or (self._landed and thrust <= _LIFTING)
+        self._landed = (not self.armed or (self._landed and thrust <= _FLYING_THRUST)
                         or self._resting_for >= _LANDING_TIME)
 
     @property

@@ -117,7 +117,7 @@ class Quadrotor:
         """
         landed = self.landed
         self._before = self.axis, self.yaw, dt
-        thrust, tilt = self._wanted(np.asarray(acceleration, dtype=float))
+        thrust, tilt = self._nominal(np.asarray(acceleration, dtype=float))
         if not powered:
             thrust = np.zeros_like(thrust)
         tilt = np.where(landed[..., None], _UP, tilt)
@@ -130,7 +130,7 @@ class Quadrotor:
         self.yaw = _wrapped(self.yaw + np.where(landed, 0.0, rate * dt))
         self._move(dt, powered, landed, np.asarray(wind, dtype=float))
 
-    def _wanted(self, acceleration: Array) -> tuple[Array, Array]:
+    def _nominal(self, acceleration: Array) -> tuple[Array, Array]:
         force: Array = acceleration + GRAVITY * _UP
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = np.maximum(force[..., 2], 0.1 * GRAVITY)

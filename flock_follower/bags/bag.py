@@ -267,7 +267,7 @@ def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
     if isinstance(connection.ext, ConnectionExtRosbag1):
         return bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
     if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
-        raise ValueError(f'a message of {topic.name} does not begin as CDR does')
+        raise ValueError(f'a message of {topic.name} has no valid CDR header')
     return raw
 
 

@@ -66,11 +66,11 @@ def _nodes(seen: Observations) -> Iterator[Finding]:
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = [name for name, number in count.items() if number == 0]
     twice = [name for name, number in count.items() if number > 1]
-    away = [full for full in seen.nodes if _plain(full) in missing]
-    if away:
-        namespace = away[0].rsplit('/', 1)[0].strip('/')
+    elsewhere = [full for full in seen.nodes if _plain(full) in missing]
+    if elsewhere:
+        namespace = elsewhere[0].rsplit('/', 1)[0].strip('/')
         yield error('nodes', f'{", ".join(missing)} not in /{seen.namespace.strip("/")}, but '
-                    f'{", ".join(away)}', wanted,
+                    f'{", ".join(elsewhere)}', wanted,
                     f'check --namespace {namespace}; or start all in one namespace'
                     if namespace else 'check without --namespace')
     elif missing:

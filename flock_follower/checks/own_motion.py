@@ -77,7 +77,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} say nothing: {motion.why}',
+                     f'{motion.lost} of {count} say nothing: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialised; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:

@@ -149,17 +149,17 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
     """Report the status of our nodes and of the autopilot."""
     for node in OURS:
         full = full_name(node, seen.namespace)
-        told = seen.told.get(full.lstrip('/'))
-        if told is None:
+        status = seen.statuses.get(full.lstrip('/'))
+        if status is None:
             if full in seen.nodes:
                 yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
             continue
-        advice = next((advice for words, advice in ADVICE.items() if words in told.message),
+        advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
-        found = [judged(told.level > 1, told.level == 1, f'{node} says', told.message, 'running',
-                        advice)]
+        found = [judged(status.level > 1, status.level == 1, f'{node} says', status.message,
+                        'running', advice)]
         if node == 'mavlink_bridge':
-            found += _autopilot(told.values)
+            found += _autopilot(status.values)
         # Faults at the time of a recording do not prevent its use.
         yield from (finding if seen.live or finding.level != ERROR else
                     finding._replace(level=WARNING) for finding in found)

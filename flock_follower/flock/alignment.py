@@ -65,7 +65,7 @@ _SIZE = 4
 
 class FirstFit(NamedTuple):
     """
-    First estimate of a frame in another one: see ``first_fit``.
+    Initial estimate of the transform between two frames: see ``first_fit``.
 
     ``yaw``, rad, turns its coordinates to the other's; ``anchor`` (3,), m, in it is at ``place``
     (3,), m, in the other; ``covariance`` (4, 4) is of yaw and place.

@@ -59,7 +59,7 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     return joined
 
 
-def attended(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
+def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
              params: FlockingParams, most: float) -> Array:
     """
     Return the acceleration (n,), m/s^2, of one agent of a flock.

@@ -44,7 +44,7 @@ NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
 
 POSITION_STD_MAX = 0.5  # m: a frame or a position known worse is not used; as in the planner
 YAW_STD_MAX = 0.1  # rad: likewise the yaw of a frame
-WORD_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
+MESSAGE_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
 CLOCK_TOLERANCE = 0.02  # s by which a message may be ahead of the own clock
 SEEN_TIMEOUT = 0.5  # s after an own sighting in which received states of that vehicle are not used
 POSITION_DRIFT = 0.025  # m/sqrt(s): random walk of the odometry of each vehicle
@@ -217,15 +217,15 @@ def refusal(state: OdometryState, received: int) -> Refusal | None:
     if age < -CLOCK_TOLERANCE:
         return FUTURE, (
             f'{sender}: by {-age:.3f} s: its clock is ahead by that at least')
-    if age > WORD_AGE_MAX:
+    if age > MESSAGE_AGE_MAX:
         return 'word too old', (f'{sender}: {age:.2f} s: its clock is behind, or the way is slow')
     known = state.child == sender or is_covariance(state.pose_covariance[:3, :3])
-    return None if known else ('word without a covariance', f'{sender} tells of {state.child}')
+    return None if known else ('word without a covariance', f'{sender} sends {state.child}')
 
 
 #: An odometry that is further from where it led, m or rad, has leapt ...
 LEAP, TURN = 0.25, 0.4
-#: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, nothing can be told.
+#: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, no prediction is possible.
 PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
 #: So many leaps in this time, ns, are too many; for as long the sender is ignored.
 LEAPS, BAN = 3, 5 * NANOSECONDS
@@ -304,7 +304,7 @@ class Sender:
         self._sent.append(stamp)
         if len(self._sent) == OFTEN and stamp - self._sent[0] < TOO_SHORT:
             rate = (OFTEN - 1) * NANOSECONDS / max(stamp - self._sent[0], 1)
-            self.ban(received, f'talks at {rate:.0f} Hz, one does at 10 Hz')
+            self.ban(received, f'sends at {rate:.0f} Hz instead of 10 Hz')
             self._sent.clear()
 
     def ban(self, received: int, why: str) -> None:

@@ -163,7 +163,7 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
             replace(OFFBOARD) if vehicle.dialect.setpoints_end_takeoff else None))
 
 
-def result_words(result: int) -> str:
+def result_text(result: int) -> str:
     """Return a MAV_RESULT in words: 'temporarily rejected'."""
     entry = mavlink.enums['MAV_RESULT'].get(result)
     return entry.name.removeprefix('MAV_RESULT_').lower().replace('_', ' ') if entry else (
@@ -329,18 +329,18 @@ class Request:
             mode = goal.modes(vehicle.dialect)[0] if goal.modes else vehicle.status.mode
         reasons = texts.why(self._since, mode)
         self._advice = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
-        result = 'no result' if self._result is None else result_words(self._result)
+        result = 'no result' if self._result is None else result_text(self._result)
         return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         name = self.current.name
         if self._result is None:
-            told = f'{name}: no answer to {self._attempts} commands' + (
+            problem = f'{name}: no answer to {self._attempts} commands' + (
                 ', and no HEARTBEAT' if vehicle is None else '')
         else:
-            told = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
+            problem = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
                 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
-        return ': '.join(filter(None, (told, '; '.join(texts.since(self._since)))))
+        return ': '.join(filter(None, (problem, '; '.join(texts.since(self._since)))))
 
     def _finish(self, success: bool, message: str) -> None:
         abandoned = self.current is LAND and self.goal is not LAND

@@ -149,11 +149,11 @@ class FlightEnd:
             return '', HOLD
         if command_time < active_since:
             waited, most = now - active_since, self.params.engage_timeout
-            told = f'no command within engage_timeout = {most:g} s'
+            reason = f'no command within engage_timeout = {most:g} s'
         else:
             waited, most = now - command_time, COMMAND_TIMEOUT
-            told = f'no command for {COMMAND_TIMEOUT:g} s'
-        return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
+            reason = f'no command for {COMMAND_TIMEOUT:g} s'
+        return (reason, self.params.leader_lost_action) if waited > most else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
              status: VehicleStatus, now: float) -> str:

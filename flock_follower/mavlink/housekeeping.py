@@ -138,7 +138,7 @@ FEW: Final[float] = 0.5
 #: Told where nothing comes for longer than this, s: as long as a velocity to brake on may be old.
 PAUSE: Final[float] = 0.3
 #: Who answers no TIMESYNC for this long, s, does not hear us.
-UNHEARD: Final[float] = 5.0
+UNANSWERED_MAX: Final[float] = 5.0
 #: Whether it flies is asked for this long, s; some autopilots never tell.
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
@@ -251,18 +251,18 @@ class Housekeeping:
         """Return that the estimate comes too seldom, or the link stalls, or ''."""
         if now - self._watched_since < RECENT + STREAM_REQUEST_PERIOD:
             return ''  # what was asked for has not had the time to come
-        told = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
+        problems = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
                 for name, (rate, wanted) in self.rates(now).items() if 0.0 < rate < FEW * wanted]
         pause = self._link.telemetry.arrivals.longest_pause(now)
         if pause > PAUSE:
-            told.append(f'nothing came from the autopilot for {pause:.2f} s '
+            problems.append(f'nothing came from the autopilot for {pause:.2f} s '
                         f'in the last {RECENT:g} s')
-        return '; '.join(told)
+        return '; '.join(problems)
 
     def unreceived(self, now: float) -> str:
         """Return why the autopilot, which is heard, does not hear us, or ''."""
-        if self._link.signs or not self._link.autopilot_signs or (
-                self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
+        if self._link.signs or not self._link.autopilot_signs or (  # USB needs no signature
+                self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
             return ''
         return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
                 'not set, it will not hear us')
@@ -277,10 +277,10 @@ class Housekeeping:
         watched = {message_id: wanted[message_id] for message_id in (
             *ESTIMATE.values(), dialect.estimator_status)} | {
                 dialect.mode_message: dialect.least_mode_rate}
-        untold = telemetry.flying(now) is None and (
+        unreported = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
-                untold and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
+                unreported and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
             self._link.request_streams(wanted)
             self._streams_requested = now
             for message_id in watched:

@@ -198,7 +198,7 @@ class Rule(NamedTuple):
 
     name: str
     forbidden: Callable[[float], bool]
-    words: str
+    advice: str
     """What follows NAME = VALUE: why, and what to set."""
     forwarding: bool = False
     """Whether it matters only where odometry is forwarded."""
@@ -240,7 +240,7 @@ def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
     values = parameters.values
-    return next((f'{rule.name} = {values[rule.name]:g}{rule.words} (or {_ANYWAY})'
+    return next((f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'
                  for rule in rules(dialect, forwarding)
                  if rule.name in values and rule.forbidden(values[rule.name])), '')
 

@@ -49,7 +49,7 @@ TAKEOVER_TIME: Final[float] = 10.0
 TWO_COMMAND: Final[str] = 'two nodes command'
 #: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
 #: the pilot may have taken over unseen.
-LONGEST_UNHEARD: Final[float] = 5.0
+LONGEST_SILENCE: Final[float] = 5.0
 
 
 class Phase(enum.Enum):
@@ -71,7 +71,7 @@ class Permission:
     """Why it is not ACTIVE, for people; '' where it is."""
     since: float = math.inf
     """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
-    heard: float = math.inf
+    received: float = math.inf
     """When the newest message came that has told the mode since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
@@ -88,9 +88,9 @@ class Permission:
 
     def taken_over(self, now: float) -> str:
         """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
-        if self.phase is not Phase.TAKEN_OVER or now - self.heard >= TAKEOVER_TIME:
+        if self.phase is not Phase.TAKEN_OVER or now - self.received >= TAKEOVER_TIME:
             return ''
-        return (f'the pilot took over {max(now - self.heard, 0.0):.0f} s ago: refused for '
+        return (f'the pilot took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
 
     def announced(self) -> str:
@@ -148,10 +148,10 @@ class Restarted:
 
 @dataclass(frozen=True)
 class Seen:
-    """What HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
+    """What HEARTBEAT or CURRENT_MODE, which came at the time ``received``, s, shows."""
 
     status: VehicleStatus
-    heard: float
+    received: float
     airborne: bool | None
     """Whether it reports that it flies: on the ground setpoints could start a take-off. None: it
     does not report, which permits nothing."""
@@ -191,13 +191,13 @@ def next_permission(now: Permission, event: Event) -> Permission:
 
 
 def _seen(now: Permission, seen: Seen) -> Permission:
-    if not now.streams or seen.heard <= now.since:
+    if not now.streams or seen.received <= now.since:
         return now
-    status, unreceived = seen.status, seen.heard - now.heard
-    now = replace(now, heard=seen.heard)
-    if now.obeyed and status.offboard and status.armed and unreceived > LONGEST_UNHEARD:
+    status, silence = seen.status, seen.received - now.received
+    now = replace(now, received=seen.received)
+    if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
         return replace(now, phase=Phase.GIVING_BACK,
-                       reason=f'no HEARTBEAT for {unreceived:.0f} s, the pilot may have taken '
+                       reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
                               'over')
     if now.phase is Phase.GIVING_BACK:
         if status.offboard and status.armed:
@@ -207,7 +207,7 @@ def _seen(now: Permission, seen: Seen) -> Permission:
         return Permission(reason=ON_GROUND if status.armed else 'disarmed')
     if not status.offboard:
         return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
-                          heard=seen.heard) if now.obeyed else now
+                          received=seen.received) if now.obeyed else now
     if now.phase is Phase.ACTIVE:
         return now if status.armed else Permission(reason='disarmed')
     if seen.airborne is None:

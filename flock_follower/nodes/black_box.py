@@ -185,10 +185,10 @@ class BlackBox(FlockNode):
 
     def _take_on(self) -> None:
         """
-        Take messages until the end.
+        Receive messages until shutdown.
 
-        Not in the executor: if another process was killed, Fast DDS can hold up a publisher, as
-        that of this node's diagnostics, for a second.
+        It has a thread of its own, because Fast DDS can block a publisher in the executor for a
+        second after another process was killed.
         """
         while not self._ending.wait(TAKE_PERIOD):
             try:

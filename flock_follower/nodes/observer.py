@@ -71,7 +71,7 @@ POLL_PERIOD = 0.25  # s between looks for topics that are new
 PROCESSORS = Path('/proc/stat')
 ANSWER = 2.0  # s that nodes have to tell their parameters after all else
 # Best effort and volatile takes what any publisher sends.
-HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+OBSERVED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 #: What is decoded; of the others it is only counted how often they come.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom', 'mavlink/odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory')
@@ -196,11 +196,11 @@ class Observer(Node):
             if topic not in self._subscribed and TYPES[name] in published.get(topic, ()):
                 self._subscribed.add(topic)
                 kind = message_class(TYPES[name])
-                self.create_subscription(kind, topic, partial(self._take, name, topic), HEARD_QOS,
-                                         raw=kind in READERS or name in COUNTED)
+                self.create_subscription(kind, topic, partial(self._take, name, topic),
+                                         OBSERVED_QOS, raw=kind in READERS or name in COUNTED)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
-            self.create_subscription(Clock, '/clock', self._take_clock, HEARD_QOS)
+            self.create_subscription(Clock, '/clock', self._take_clock, OBSERVED_QOS)
 
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
@@ -241,19 +241,19 @@ class Observer(Node):
                if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
         problems = self.seen.file_problems
         for node, path in files_of_processes():
-            if node in own and (told := misses(path, own[node])) and told not in problems:
-                problems.append(told)
+            if node in own and (problem := misses(path, own[node])) and problem not in problems:
+                problems.append(problem)
         if self._config is None:
             return
-        told = ''
+        problem = ''
         for node, full in own.items():
-            if told := misses(str(self._config), full):
-                problems += [told] if 'but none for' in told else []
+            if problem := misses(str(self._config), full):
+                problems += [problem] if 'but none for' in problem else []
             elif values := {
                     **shared([self._config], full), **given(self._config, full)}:
                 self.seen.file_parameters[node] = values
-        if told and not self.seen.file_parameters and not problems:
-            problems.append(told)
+        if problem and not self.seen.file_parameters and not problems:
+            problems.append(problem)
 
 
 def _machine(idle: float | None) -> Machine:

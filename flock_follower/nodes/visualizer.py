@@ -149,10 +149,11 @@ class Visualizer(FlockNode):
         planner = f'{self.get_namespace().strip("/")}/planner'.lstrip('/')
         for status in message.status:
             if status.name == planner:
-                said = {pair.key: pair.value for pair in status.values}
+                reported = {pair.key: pair.value for pair in status.values}
                 self._report = PlannerReport(
-                    said.get('state', ''), said.get('reason', ''), said.get('limits', ''),
-                    tuple(filter(None, said.get('edges', '').split(', '))))
+                    reported.get('state', ''), reported.get('reason', ''),
+                    reported.get('limits', ''),
+                    tuple(filter(None, reported.get('edges', '').split(', '))))
 
     def _take_perception(self, values: dict[str, Any]) -> None:
         """Take the parameters of relative_pose; subscribe to the calibration of each camera."""

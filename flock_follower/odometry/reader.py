@@ -196,7 +196,7 @@ class OdometrySource:
         """Return the longest time of late between two stamps, s; 0 before the second."""
         return max(self._gaps, default=0.0)
 
-    def told(self) -> list[tuple[str, str]]:
+    def new_events(self) -> list[tuple[str, str]]:
         """Return the events since this was asked last."""
         events, self.events = self.events, []
         return events

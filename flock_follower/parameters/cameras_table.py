@@ -105,10 +105,10 @@ def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict
 
     :raises ValueError: where none of them has that name.
     """
-    told = cameras(values)
-    found = next((camera for camera in told if name in ('', camera.name)), None)
+    configured = cameras(values)
+    found = next((camera for camera in configured if name in ('', camera.name)), None)
     if found is None:
-        names = ', '.join(camera.name for camera in told if camera.name)
+        names = ', '.join(camera.name for camera in configured if camera.name)
         raise ValueError(f'camera {name}: must be {f"one of {names}" if names else "left out"}')
     return found, {**values, **{single: getattr(found, key) for single, (key, _) in ALONE.items()
                                 if single in values}}

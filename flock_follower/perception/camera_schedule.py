@@ -197,12 +197,12 @@ class CameraSchedule:
         self._seen: dict[str, tuple[MountedCamera, float]] = {}
         self._bases: dict[str, float] = {}
 
-    def time(self, name: str, camera: MountedCamera, moment: float) -> float:
+    def time(self, name: str, camera: MountedCamera, stamp: float) -> float:
         """Return a moment, s, by a camera's clock as that of a neighbour's filter."""
         if not self.shared:
-            return moment
+            return stamp
         base = self._bases.get(name)
-        time = moment if base is None else moment + (camera.time_offset.applied - base)
+        time = stamp if base is None else stamp + (camera.time_offset.applied - base)
         last, seen = self._seen.get(name, (camera, time))
         if last is not camera and abs(time - seen) < TOGETHER:
             return seen + STEP  # taken at once: one after the other for the filter

@@ -149,8 +149,8 @@ def facing(model: EdgeModel, pose: Transform) -> Any:
     if not within_reason(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
-    away = (sight * model.facings).dot(_SUM)
-    return -away > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
+    along = (sight * model.facings).dot(_SUM)
+    return -along > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
 
 
 def within_reason(pose: Transform) -> bool:

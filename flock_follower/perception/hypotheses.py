@@ -141,12 +141,12 @@ class Hypotheses:
 
     def __init__(self, params: FilterParams) -> None:
         self.params = params
-        self.believed = NeighborFilter(params)
+        self.primary = NeighborFilter(params)
         self.reset()
 
     def reset(self) -> None:
         """Forget all of them."""
-        self.believed.reset()
+        self.primary.reset()
         self._motion = _Motion()
         self._lost: Array | None = None
         """Where the believed one was before it began anew (3,), m; None where it did not."""
@@ -155,14 +155,14 @@ class Hypotheses:
     @property
     def tracks(self) -> list[NeighborFilter]:
         """Return the filters of all of them."""
-        return [self.believed, *(each.track for each in self.candidates)]
+        return [self.primary, *(each.track for each in self.candidates)]
 
-    def whose(self, time: float, place: Array) -> Candidate | None:
+    def candidate_at(self, time: float, place: Array) -> Candidate | None:
         """Return of which candidate a measurement at a place (3,), m, is; None: of none."""
         if not self.candidates:
             return None
         nearest = min(self.candidates, key=lambda each: each.distance(time, place))
-        expected = self.believed.place(time)
+        expected = self.primary.place(time)
         least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
         return nearest if nearest.distance(time, place) < least else None
 
@@ -173,21 +173,21 @@ class Hypotheses:
 
         :param another: whether the believed one is elsewhere in the same image.
         """
-        newest = self.believed.newest
+        newest = self.primary.newest
         if newest is not None and time < newest.stamp - MAX_JUMP:
             self.reset()
         self._forget(time)
-        candidate = self.whose(time, measured.translation)
+        candidate = self.candidate_at(time, measured.translation)
         arguments = time, measured, reference, covariance
         if candidate is None:
-            outcome = UpdateOutcome.OUTLIER if another else self._believe(*arguments)
+            outcome = UpdateOutcome.OUTLIER if another else self._update_primary(*arguments)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
             candidate = self._add(time, measured.translation)
         if time <= candidate.seen:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
-        last = self.believed.newest
+        last = self.primary.newest
         if another or (last is not None and abs(time - last.stamp) < TOGETHER):
             candidate.beside, candidate.alone = True, 0
         if self._is_neighbor(candidate, time):
@@ -195,15 +195,15 @@ class Hypotheses:
             return Taken(UpdateOutcome.STARTED)
         return Taken(UpdateOutcome.OUTLIER, candidate)
 
-    def _believe(self, time: float, measured: Transform, reference: Array,
+    def _update_primary(self, time: float, measured: Transform, reference: Array,
                  covariance: Array) -> UpdateOutcome:
         """Take in a measurement of the believed one, if it can be that."""
-        last, reach = self.believed.newest, self._reach(time)
-        if last is not None and time > last.stamp and self.believed.place(time) is None and (
+        last, reach = self.primary.newest, self._reach(time)
+        if last is not None and time > last.stamp and self.primary.place(time) is None and (
                 math.dist(measured.translation, last.position) > reach):
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
-        outcome = self.believed.update(time, measured, reference, covariance,
+        outcome = self.primary.update(time, measured, reference, covariance,
                                        reach if surprised else 0.0)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
@@ -215,13 +215,13 @@ class Hypotheses:
 
     def _reach(self, time: float) -> float:
         """Return how far from its newest place the believed one can be, m."""
-        last = self.believed.newest
+        last = self.primary.newest
         return SLACK if last is None else (
             SLACK + self.params.leader_speed_max * max(time - last.stamp, 0.0))
 
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
         """Return whether a candidate is to be believed from now on; see the module."""
-        moved, last = candidate.motion.moved, self.believed.newest
+        moved, last = candidate.motion.moved, self.primary.newest
         if candidate.measured < self.params.max_rejections:
             return False
         if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
@@ -235,17 +235,17 @@ class Hypotheses:
 
     def _nearer_to_loss(self, candidate: Candidate) -> bool:
         """Return whether a candidate is nearer to where the believed one was lost than that is."""
-        now, other = self.believed.newest, candidate.track.newest
+        now, other = self.primary.newest, candidate.track.newest
         return self._lost is not None and now is not None and other is not None and (
             math.dist(other.position, self._lost) < math.dist(now.position, self._lost))
 
     def _exchange(self, candidate: Candidate) -> None:
         """Believe a candidate; the one believed so far stays one where both were seen at once."""
-        last = self.believed.newest
+        last = self.primary.newest
         self._lost = None if candidate.beside or last is None else last.position
-        before = self.believed.continued(self.params.max_gap)
-        self.believed.reset()
-        self.believed.newest = candidate.track.newest
+        before = self.primary.continued(self.params.max_gap)
+        self.primary.reset()
+        self.primary.newest = candidate.track.newest
         self._motion, candidate.motion = candidate.motion, self._motion
         candidate.track, candidate.alone = before, 0
         if not candidate.beside:
@@ -256,10 +256,10 @@ class Hypotheses:
         if len(self.candidates) == MOST:
             self.candidates.remove(min(self.candidates, key=lambda c: (c.confirmed, c.seen)))
         number = min({*range(1, MOST + 1)} - {each.number for each in self.candidates})
-        last = self.believed.newest
+        last = self.primary.newest
         candidate = Candidate(number, NeighborFilter(self.params), (
             last is not None and math.dist(place, last.position) <= self._reach(time)))
-        candidate.track.walk = self.believed.walk
+        candidate.track.walk = self.primary.walk
         self.candidates.append(candidate)
         return candidate
 

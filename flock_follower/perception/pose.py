@@ -112,8 +112,8 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
 
 def _uncertainty(measurement: Measurement) -> float:
     """Return the deviation of the place, as a share of the distance."""
-    away = measurement.T_camera_body.translation
-    return math.sqrt(measurement.covariance[:3, :3].trace() / away.dot(away))
+    offset = measurement.T_camera_body.translation
+    return math.sqrt(measurement.covariance[:3, :3].trace() / offset.dot(offset))
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,

@@ -109,11 +109,11 @@ def read(brightness: Array, seen: Windows) -> Array:
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
     shown = (values - 0.5 * (light + dark)) / half
-    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
+    readable = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
     # Best is a window that is even, and in which the cell is as any black or white one.
     odd = spread + (np.abs(shown) - 1.0)**2
     odd, shown = (part.reshape(len(values), -1) for part in (
-        np.where(told, odd, np.inf), np.where(told, shown, 0.0)))
+        np.where(readable, odd, np.inf), np.where(readable, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
     colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)

@@ -264,7 +264,7 @@ class RangeSeries:
         now = self._apart.newest
         if now is None or outcome not in (UpdateOutcome.USED, UpdateOutcome.SURPRISING):
             return None
-        return self._told(now, own)
+        return self._reported(now, own)
 
     def _learn(self, measured: PlacedRange, seen: Estimate) -> None:
         then = self._seen.near(measured.stamp)
@@ -282,7 +282,7 @@ class RangeSeries:
             measured.stamp, measured.distance - float(self.bias.value[0]), measured.antenna,
             measured.variance + float(self.bias.variance(measured.stamp)[0]), self._tag)
 
-    def _told(self, now: Estimate, own: OdometrySample) -> Estimate:
+    def _reported(self, now: Estimate, own: OdometrySample) -> Estimate:
         """Return a state in odom; what is not known of the bias is not known of the distance."""
         sight = now.position - own.travel
         along = sight / max(math.hypot(*sight.tolist()), 1e-6)

@@ -50,7 +50,7 @@ from flock_follower.perception.markers import (
 #: up to which it is looked for.
 PER_CELL = 3
 MARGIN = 1
-AWAY = 8
+REACH = 8
 #: Of the exposure, which lasts for 1.
 INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
 _TEXELS = 12  # of the print, per cell
@@ -115,7 +115,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     smeared = np.array([smear_print(printed[lens], places, smear)[0]
                         for lens, smear in zip(lenses, smears)])
     return SmearModel(
-        origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + AWAY),
+        origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + REACH),
         printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
         turned[order].reshape(4 * len(words), -1).astype(float),
         max(correctable_cells(dictionary), 1), n)
@@ -205,9 +205,9 @@ def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
     which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     if not likeness[which, row, column] > _LIKENESS:
         return None
-    shift = (np.array([column, row]) - AWAY) / PER_CELL
-    away = start.rotation @ (shift @ model.axes)
-    pose = Transform(start.rotation, start.translation + away)
+    shift = (np.array([column, row]) - REACH) / PER_CELL
+    offset = start.rotation @ (shift @ model.axes)
+    pose = Transform(start.rotation, start.translation + offset)
     return pose, model.smears[which], model.lenses[which]
 
 
@@ -282,14 +282,14 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         if step is None:
             return None
         light, _, curve = step[6:9].tolist()
-        turn, away = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
+        turn, offset = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
         smear = smear + step[9:]
         if (not max(turn, float(np.abs(step[9:]).max())) < _LONGEST_TURN or light <= 0.0
-                or away > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
+                or offset > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
             return None
         pose = moved(pose, center, step)
         residual = brightness - design.dot(step)
-        if count > 2 and away < 10.0 * _SMALL * cell and turn < _SMALL:
+        if count > 2 and offset < 10.0 * _SMALL * cell and turn < _SMALL:
             break
         squares = residual * residual
         variance = max((1.4826 * float(np.median(np.abs(residual))))**2, _FLOOR**2)

@@ -203,14 +203,14 @@ class JointOffsets:
         both = np.array([*(offset.follow(name, step, moving if offset is camera else None)
                            for offset in self._offsets), step.innovation])
         products = both.dot(cv2.solve(step.spread, both.T)[1])
-        seen, said = products[:-1, :-1], products[:-1, -1]
+        seen, right_side = products[:-1, :-1], products[:-1, -1]
         applied = np.array([offset.applied for offset in self._offsets])
         off = np.array([offset.estimate for offset in self._offsets]) - applied
-        camera.watch(float(products[-1, -1] - 2.0 * off.dot(said) + off.dot(seen).dot(off))
+        camera.watch(float(products[-1, -1] - 2.0 * off.dot(right_side) + off.dot(seen).dot(off))
                      / len(step.innovation))
         keep = 1.0 - 1.0 / REMEMBERED
         self._information = keep * self._information + seen
-        self._weighted = keep * self._weighted + seen.dot(applied) + said
+        self._weighted = keep * self._weighted + seen.dot(applied) + right_side
         self._count += 1
         if self._count % EVERY:
             return [0.0] * len(self._offsets)

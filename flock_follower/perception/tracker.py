@@ -136,7 +136,7 @@ class Tracker:
         self._odometry = OdometryBuffer()
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
-        self._filters = {name: each.believed for name, each in self._hypotheses.items()}
+        self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
         self._schedule = CameraSchedule(config.neighbors, list(self.cameras.values()))
         self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
@@ -320,7 +320,7 @@ class Tracker:
         if not self._hypotheses[name].candidates:
             return False
         place = look.views[camera.delays[name]].T_smooth_camera @ measurement.T_camera_body
-        return self._hypotheses[name].whose(
+        return self._hypotheses[name].candidate_at(
             self._schedule.time(name, camera, look.stamp + camera.delays[name]),
             place.translation) is not None
 

@@ -45,7 +45,7 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.messages import FARTHEST, FASTEST, FUTURE_TOLERANCE
 from flock_follower.planner.limits import limit_norm
-from flock_follower.planner.params import Member, PlannerParams, SEEN_FIRST
+from flock_follower.planner.params import Member, PlannerParams, SEEN_DEFAULT
 
 LATE = 0.5  # share of the timeout: younger odometry is never overdue
 LATEST = 0.8  # share of the timeout: older odometry always is, to brake before commands end
@@ -108,9 +108,9 @@ class Neighbor(NamedTuple):
     velocity_covariance: Array = UNKNOWN
     acceleration: Array | None = None
     yaw: float | None = None
-    heard: bool = False
+    received: bool = False
     """Whether another vehicle reported it; else the own camera sees it."""
-    who: Member = SEEN_FIRST
+    member: Member = SEEN_DEFAULT
     """Its role and size, known beforehand."""
 
 
@@ -213,7 +213,7 @@ def expected(n: Neighbor, acceleration: Array, age: float, params: PlannerParams
     known = min(max(age, 0.0), TRUSTED_TIME)
     position = n.position + age * n.velocity + known * (age - 0.5 * known) * a
     velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * a
-    blind = max(age - (params.heard_timeout if n.heard else FRESH), 0.0)
+    blind = max(age - (params.heard_timeout if n.received else FRESH), 0.0)
     most, fastest = params.leader_acceleration_max, (
         params.leader_speed_max + math.hypot(*n.velocity.tolist()))
     speeding = min(blind, fastest / most) if most > 0.0 else 0.0

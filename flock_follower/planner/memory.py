@@ -193,21 +193,21 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
+        what, before = 'heard estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped
-        n = n._replace(who=member(params.vehicles, n.name, n.heard))
-        if vague and not (unusable or outside or old or n.heard) and (
+        n = n._replace(member=member(params.vehicles, n.name, n.received))
+        if vague and not (unusable or outside or old or n.received) and (
                 distance_known(n, me, params.max_position_std)):
             ranged[n.name] = n
         elif problem := unusable or vague or outside:
             rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
         elif old:
             rejected.append(Rejection(f'{what} older than the jump of odometry', n.name))
-        elif before is None or (before.heard and not n.heard):  # sightings beat received states
+        elif before is None or (before.received and not n.received):  # sightings come first
             kept[n.name] = n
-        elif before.heard == n.heard and n.stamp >= before.stamp:
+        elif before.received == n.received and n.stamp >= before.stamp:
             if (by := off(n, before)) > NEIGHBOR_JUMP:
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
@@ -220,7 +220,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
 
 def longest(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
-    return params.heard_timeout if n.heard else params.predict_timeout
+    return params.heard_timeout if n.received else params.predict_timeout
 
 
 def off(n: Neighbor, before: Neighbor) -> float:

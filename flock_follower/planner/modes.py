@@ -21,7 +21,7 @@ state    when                                              horizontal command
 IDLE     not engaged, or nobody flies the commands         none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
-         one told by others of at most ``heard_timeout``
+         one received of at most ``heard_timeout``
 COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
 HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
          occluded, odometry is overdue, or no image was    lost, then all round
@@ -37,7 +37,7 @@ Whether the planner's commands are flown: the text of ``mavlink_bridge/state``.
 
 Its text is a word and, after a colon, the reason::
 
-    NO_AUTOPILOT: none heard yet
+    NO_AUTOPILOT: none received yet
     INACTIVE: offboard was not requested
     READY: waiting for offboard mode
     ACTIVE
@@ -76,7 +76,7 @@ class State(str, enum.Enum):
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
                params: PlannerParams, waiting: str = '', given_up: bool = False,
-               heard: float | None = None, occluded: bool = False) -> tuple[State, str]:
+               received: float | None = None, occluded: bool = False) -> tuple[State, str]:
     """
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
@@ -85,7 +85,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
     :param given_up: whether it followed nobody for too long to command anything unasked.
-    :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
+    :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the neighbour that it faces is covered by something.
     """
     if not engaged:
@@ -101,7 +101,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
         return lost, fault
     if youngest is not None and youngest <= params.predict_timeout:
         return State.TRACK, ''
-    if heard is not None and heard <= params.heard_timeout:
+    if received is not None and received <= params.heard_timeout:
         return State.TRACK, 'nobody seen: flies by what others tell'
     if followed is None:
         return State.SEARCH, 'no neighbor seen since engaging'
@@ -137,7 +137,7 @@ def blind(looked: float | None, now: float, params: PlannerParams) -> str:
             if silent > params.perception_timeout - 1e-6 else '')
 
 
-NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = WORDS = (
+NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = BRIDGE_STATES = (
     'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
 TOPIC = 'mavlink_bridge/state'
 #: Where the vehicle was armed, in the frame of the odometry; latched.
@@ -147,37 +147,37 @@ _LONGEST_REASON = 200  # characters
 
 
 class BridgeState(NamedTuple):
-    """One of ``WORDS``, and why it is that one."""
+    """One of ``BRIDGE_STATES``, and why it is that one."""
 
-    word: str
+    name: str
     reason: str = ''
 
     def __str__(self) -> str:
-        return f'{self.word}: {self.reason}' if self.reason else self.word
+        return f'{self.name}: {self.reason}' if self.reason else self.name
 
 
 def parse(text: str) -> BridgeState:
     """Return the state in a message; an unknown word, or none, counts as ``INACTIVE``."""
-    word, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
+    name, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
         r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
-    if word not in WORDS:
+    if name not in BRIDGE_STATES:
         return BridgeState(INACTIVE, f'the bridge says {text[:40]!r}, which means nothing here')
-    return BridgeState(word, ' '.join(reason.split())[:_LONGEST_REASON])
+    return BridgeState(name, ' '.join(reason.split())[:_LONGEST_REASON])
 
 
-def believed(said: BridgeState | None, age: float) -> BridgeState:
+def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     """
     Return the state of the bridge, which counts as absent after a silence.
 
-    :param said: its last message, None without one.
+    :param reported: its last message, None without one.
     :param age: how long ago that was, s, by a clock that neither stops nor jumps.
     """
-    if said is None or math.isinf(age):
-        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} (where somebody else flies '
+    if reported is None or math.isinf(age):
+        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (where somebody else flies '
                            'the commands, require_bridge:=false)')
     if not age <= SILENCE:  # written so that NaN fails
-        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} for {age:.1f} s')
-    return said
+        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
+    return reported
 
 
 #: A smaller change, s, is slewing or a late reading, and followed as it is.

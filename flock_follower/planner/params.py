@@ -46,17 +46,17 @@ class Member(Checked):
         'Directions in which its markers face, anticlockwise from its own, rad.')
 
 
-SEEN_FIRST, HEARD_FIRST = Member(LEADER), Member(FOLLOWER)  # strangers
+SEEN_DEFAULT, RECEIVED_DEFAULT = Member(LEADER), Member(FOLLOWER)  # strangers
 
 
-def member(members: Mapping[str, Member], name: str, heard: bool) -> Member:
+def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     """
     Return what is known of a vehicle; of a stranger, that depends on how it is known.
 
     What carries the marker of another without being it is avoided, and as large as that one.
     """
     base, duplicate, _ = name.partition(DUPLICATE)
-    known = members.get(base, HEARD_FIRST if heard else SEEN_FIRST)
+    known = members.get(base, RECEIVED_DEFAULT if received else SEEN_DEFAULT)
     return Member(AVOID, known.radius) if duplicate else known
 
 

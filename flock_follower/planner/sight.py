@@ -154,7 +154,7 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     :param frames: stamps of the newest processed images, s, in their order.
     :param forward: own acceleration ahead, m/s^2, which tilts the camera.
     """
-    if n is None or n.heard or not view:
+    if n is None or n.received or not view:
         return None if n is None else before
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:

@@ -43,7 +43,7 @@ from flock_follower.geometry import wrap_angle
 from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams
 
-LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
+THRUST_BIAS_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
 MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
 MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
@@ -51,8 +51,8 @@ INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
 INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
 BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
 CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
-BELIEVED_CLIMB = 0.3  # of what is new in it that is believed at once, its acceleration known
-BELIEVED_HEIGHT = 0.5  # likewise of what is new in its height
+CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
+HEIGHT_GAIN = 0.5  # likewise of a change in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
 INSIDE = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
 BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
@@ -71,7 +71,7 @@ class Altitude(NamedTuple):
     """m."""
     climb: float = 0.0
     """How fast ``held`` changes, m/s."""
-    lift: float = 0.0
+    thrust_bias: float = 0.0
     """The integral, m/s^2."""
     neighbor_climb: float | None = None
     """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
@@ -94,27 +94,27 @@ class Altitude(NamedTuple):
         """Return it after following a neighbour, at the own time, for some time, s."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
-        wanted = float(leader.position[2]) + params.altitude_offset
-        within = min(max(wanted, self.lowest), self.highest)
+        goal = float(leader.position[2]) + params.altitude_offset
+        within = min(max(goal, self.lowest), self.highest)
         most, faster = params.climb_rate, CLIMB_ACCELERATION * elapsed
-        its = float(leader.velocity[2])
+        neighbor_climb = float(leader.velocity[2])
         if self.neighbor_climb is not None and leader.acceleration is not None:
             # Smoothed, without lag if it accelerates.
             change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
                          TRUSTED_ACCELERATION) * elapsed
             due = self.neighbor_climb + change
-            its = due + BELIEVED_CLIMB * (its - due)
+            neighbor_climb = due + CLIMB_GAIN * (neighbor_climb - due)
         significant = 0.0
-        if within == wanted:
-            share = (its / CLIMB_NOISE) ** 4  # of it that is more than its noise
-            significant = min(max(its * share / (1.0 + share), -most), most)
+        if within == goal:
+            share = (neighbor_climb / CLIMB_NOISE) ** 4  # of it that is more than its noise
+            significant = min(max(neighbor_climb * share / (1.0 + share), -most), most)
         ahead = self.held + significant * elapsed
-        ahead = min(max(ahead + BELIEVED_HEIGHT * (within - ahead), self.lowest), self.highest)
+        ahead = min(max(ahead + HEIGHT_GAIN * (within - ahead), self.lowest), self.highest)
         held = min(max(ahead, self.held - most * elapsed), self.held + most * elapsed)
         climb = min(max(significant + (ahead - held) / CATCH_UP_TIME, -most), most)
         climb = min(max(climb, min(self.climb, significant) - faster),
                     max(self.climb, significant) + faster)
-        return self._replace(held=held, climb=climb, neighbor_climb=its)
+        return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
@@ -154,7 +154,7 @@ class Altitude(NamedTuple):
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
-        wanted, within = (2.0 * w * (each - rate)
+        nominal, within = (2.0 * w * (each - rate)
                           for each in (speed, min(max(clear, -down), up)))
         vertical = min(max(within, -strongest), strongest)
         # An overshoot of the climb would be taken from backing off, which shares v_max with it.
@@ -169,13 +169,14 @@ class Altitude(NamedTuple):
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
             BEYOND < above < FAR_BEYOND and rate > -RETURNING)
         share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
-        lift = self.lift + share * w ** 3 * error * elapsed
+        bias = self.thrust_bias + share * w ** 3 * error * elapsed
         # Anti-windup: what a limit takes away the integral does not ask for as well.
-        if (vertical - wanted) * (lift - self.lift) < 0.0 and abs(lift) > abs(self.lift):
-            lift = self.lift
-        lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
-        total = min(max(vertical + self.lift, -params.a_max), params.a_max)
-        return self._replace(lift=lift if math.isfinite(lift) else 0.0), total
+        if (vertical - nominal) * (bias - self.thrust_bias) < 0.0 and (
+                abs(bias) > abs(self.thrust_bias)):
+            bias = self.thrust_bias
+        bias = min(max(bias, -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
+        total = min(max(vertical + self.thrust_bias, -params.a_max), params.a_max)
+        return self._replace(thrust_bias=bias if math.isfinite(bias) else 0.0), total
 
 
 def _stopped_within(gap: float, gain: float) -> float:
@@ -238,6 +239,6 @@ def turning(before: float, commanded: float, me: OwnState, params: PlannerParams
     return min(max(rate, -params.yaw_rate_max), params.yaw_rate_max)
 
 
-def _turned(last: float, wanted: float, params: PlannerParams, elapsed: float) -> float:
+def _turned(last: float, goal: float, params: PlannerParams, elapsed: float) -> float:
     most = params.yaw_rate_max * elapsed
-    return wrap_angle(last + min(max(wrap_angle(wanted - last), -most), most))
+    return wrap_angle(last + min(max(wrap_angle(goal - last), -most), most))

@@ -30,7 +30,7 @@ import pytest
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
-from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
+from flock_follower.checks.observations import NodeStatus, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.resting_marker import HOW
 from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
@@ -79,7 +79,7 @@ def rows(columns: slice, values: list[float]) -> Change:
 
 
 def bridge(key: str, value: str) -> Change:
-    return lambda seen: seen.told['mavlink_bridge'].values.update({key: value})
+    return lambda seen: seen.statuses['mavlink_bridge'].values.update({key: value})
 
 
 def parameter(node: str, name: str, value: Any) -> Change:
@@ -194,7 +194,7 @@ FAULTS: list[Fault] = [
           bridge('link', 'never received')),
     Fault('an error of a node', LIVE, ERROR, 'relative_pose says', 'no image processed for 4 s',
           'see images',
-          lambda seen: seen.told.update(relative_pose=Told(
+          lambda seen: seen.statuses.update(relative_pose=NodeStatus(
               2, 'no image processed for 4 s: no usable camera_info'))),
     Fault('odometry as late as the planner allows', BOTH, ERROR, 'odom latency', '310 ms',
           'processor time',
@@ -310,7 +310,7 @@ def time_of_day(seen: Observed) -> None:
 
 
 @fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
-       'but the topic says rectified', 'rectified:=true')
+       'but the topic is marked as rectified', 'rectified:=true')
 def rectified(seen: Observed) -> None:
     seen.topics['/image_rect'] = lose(seen, 'image_raw')
     seen.names['image_raw'] = '/image_rect'
@@ -501,7 +501,7 @@ def test_the_share_of_the_processors_that_idles() -> None:
 
 def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:
     seen = healthy(live=False)
-    seen.told = {'planner': Told(2, 'no /odom for 4 s: no publisher')}
+    seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
     findings = seen.judged()
     assert [f.level for f in findings if f.what == 'planner says'] == [WARNING]
     assert ready(findings)
@@ -542,8 +542,9 @@ def test_one_cause_has_one_row() -> None:
     no_calibration(seen)
     seen.sightings = []  # without a calibration a marker has no place
     seen.topic('neighbors/frames').arrivals = []
-    seen.told['relative_pose'] = Told(2, 'no image processed for 4 s: no usable camera_info')
-    seen.told['planner'] = Told(1, 'no neighbor: relative_pose processes no image')
+    seen.statuses['relative_pose'] = NodeStatus(
+        2, 'no image processed for 4 s: no usable camera_info')
+    seen.statuses['planner'] = NodeStatus(1, 'no neighbor: relative_pose processes no image')
     left = rows(healthy()).keys() - rows(seen).keys()
     assert left == {'calibration', 'odom ahead', 'camera time offset', 'marker size',
                     'camera mounting', 'images processed', 'relative_pose says', 'planner says'}
@@ -557,7 +558,7 @@ def test_one_cause_has_one_row() -> None:
 
 def test_without_what_is_essential_it_is_never_ready() -> None:
     seen = healthy()
-    del seen.told['planner']
+    del seen.statuses['planner']
     findings = seen.judged()
     assert still_needed(findings) == ['planner says'] and not ready(findings)
 

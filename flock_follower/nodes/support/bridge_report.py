@@ -263,8 +263,8 @@ class BridgeReport:
             if request is not None and request not in before:
                 log.error(f'the bridge requests {request.goal.name}: {why}')
             if request is not None and request.outcome is not None and not before.get(request):
-                tell = log.warning if request.outcome.success else log.error
-                tell(request.outcome.message)
+                write = log.warning if request.outcome.success else log.error
+                write(request.outcome.message)
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
@@ -282,11 +282,11 @@ class BridgeReport:
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
             return ''
-        transport, heard = self._bridge.link.transport, self._bridge.telemetry.message_time
+        transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
-        if math.isfinite(heard):
-            return f'autopilot lost on {transport.url}, silent for {now - heard:.1f} s'
+        if math.isfinite(received):
+            return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
         if now - self._start < SILENCE:
             return ''
         return f'no autopilot on {transport.url}: {self._bridge.link.silence()}'

@@ -48,8 +48,8 @@ class OwnOdometry:
         self._described = ''
         node.diagnostics.checks += [self._problem, self._axes_problem]
         self._child = self._placed = ''
-        told = any(values['odom_child_position']) or any(values['odom_child_rpy'])
-        self._static = None if told else StaticChild(node, self._place)
+        configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
+        self._static = None if configured else StaticChild(node, self._place)
 
     def _place(self) -> None:
         """Let the source know where its child frame is, where tf_static says so."""
@@ -79,7 +79,7 @@ class OwnOdometry:
         if arrival is None:
             arrival = self._node.get_clock().now().nanoseconds - shift
         state = source.take(message, arrival, shift)
-        for event in source.told():
+        for event in source.new_events():
             self._report(*event)
         described = source.twist.describe
         if described != self._described:
