@@ -237,6 +237,27 @@ class OdometryBuffer:
             return OdometrySample.of_row(self._rows[after].copy())  # a copy, as rows move
         return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
+    def places(self, stamps: Array, points: Array) -> Array | None:
+        """
+        Return points (n, 3) on the body in the smooth frame, (k, n, 3), for stamps (k, n), s.
+
+        Between two samples position and attitude are linear. None if a stamp is not covered.
+        """
+        held = self._rows[self._first:self._end]
+        if not len(held) or not held[0, 0] <= stamps.min() <= stamps.max() <= held[-1, 0]:
+            return None
+        after = held[:, 0].searchsorted(stamps).clip(1)
+        a, b = held[after - 1], held[after]
+        span = b[..., :1] - a[..., :1]
+        if span.max() > self.MAX_GAP:
+            return None
+        rows = a + (stamps[..., None] - a[..., :1]) / span * (b - a)
+        x, w = rows[..., 13:16], rows[..., 16:]
+        turned = np.cross(x, np.cross(x, points) + w * points)
+        norm = np.einsum('...i,...i', rows[..., _ATTITUDE], rows[..., _ATTITUDE])
+        places: Array = rows[..., _TRAVEL] + points + 2.0 / norm[..., None] * turned
+        return places
+
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""
         after = self._reaching(stamp, extrapolate)

@@ -103,8 +103,8 @@ def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise,
         place = place + 0.5 * dt * (before + velocity)
         measured = Transform(np.eye(3), place + rng.normal(0.0, 0.001, 3))
         tracker.update(t, measured, np.zeros(3), noise)
-        if tracker.step is not None and tracker.step.change is not None:
-            learnt.take(tracker.step.change, tracker.step.expected, place)
+        if tracker.change is not None:
+            learnt.take(*tracker.change, place)
         if t > 2.0 and tracker.newest is not None:
             error = tracker.newest.velocity - velocity
             nees.append(error @ np.linalg.solve(tracker.newest.covariance[3:6, 3:6], error))
