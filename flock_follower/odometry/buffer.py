@@ -243,20 +243,23 @@ class OdometryBuffer:
 
         Between two samples position and attitude are linear. None if a stamp is not covered.
         """
-        held = self._rows[self._first:self._end]
-        if not len(held) or not held[0, 0] <= stamps.min() <= stamps.max() <= held[-1, 0]:
+        held = self._stamps[self._first:self._end]
+        if not len(held) or not held[0] <= stamps.min() <= stamps.max() <= held[-1]:
             return None
-        after = held[:, 0].searchsorted(stamps).clip(1)
-        a, b = held[after - 1], held[after]
-        span = b[..., :1] - a[..., :1]
+        after = held.searchsorted(stamps).clip(1)
+        span = held[after] - held[after - 1]
         if span.max() > self.MAX_GAP:
             return None
-        rows = a + (stamps[..., None] - a[..., :1]) / span * (b - a)
-        x, w = rows[..., 13:16], rows[..., 16:]
-        turned = np.cross(x, np.cross(x, points) + w * points)
-        norm = np.einsum('...i,...i', rows[..., _ATTITUDE], rows[..., _ATTITUDE])
-        places: Array = rows[..., _TRAVEL] + points + 2.0 / norm[..., None] * turned
-        return places
+        part = (stamps - held[after - 1]) / span
+        poses = self._rows[self._first:self._end, 10:].T  # travel and attitude
+        before = poses[:, after - 1]
+        px, py, pz, x, y, z, w = before + part * (poses[:, after] - before)
+        u, v, t = points.T
+        # Of the quaternion (r, w), of any length: p + 2 r x (r x p + w p) / (r.r + w w).
+        a, b, c = y * t - z * v + w * u, z * u - x * t + w * v, x * v - y * u + w * t
+        twice = 2.0 / (x * x + y * y + z * z + w * w)
+        return np.stack([px + u + twice * (y * c - z * b), py + v + twice * (z * a - x * c),
+                         pz + t + twice * (x * b - y * a)], axis=-1)
 
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""

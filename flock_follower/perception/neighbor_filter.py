@@ -140,6 +140,7 @@ NEAREST = 0.01
 #: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
 SETTLING = 0.2
 _CENTRE = np.zeros(3)
+_UNSCALED = [1.0] * 6  # attitude and its rate
 
 
 class UpdateOutcome(Enum):
@@ -252,9 +253,8 @@ class NeighborFilter:
                 self._steps.clear()
             self._steps[dt] = transition(dt, self.params)
         linear, whole, noise = self._steps[dt]
-        x, y, z = self._motion.scale(dt)
-        scale = np.array([x, y, z, x, y, z, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, x, y, z])
-        noise = scale[:, None] * noise * scale
+        x, y, z = self._motion.scale(dt)  # axes are independent of each other
+        noise = noise * np.array([x, y, z, x, y, z, *_UNSCALED, x, y, z])
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,

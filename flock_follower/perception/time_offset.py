@@ -49,8 +49,8 @@ from flock_follower.perception.neighbor_motion import FilterParams
 PRIOR: Final[float] = 0.1
 MOST: Final[float] = 0.2
 #: Offsets of the grid, s, relative to the one that is known from the start.
-STEP: Final[float] = 0.01
-GRID: Final[Array] = STEP * np.arange(-14.0, 15.0)
+STEP, FURTHEST = 0.01, 0.14
+GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)
 #: Least length of a batch, s, and number of its points; most points in this time.
 BATCH: Final[float] = 0.6
 FEWEST, MOST_POINTS = 8, 40
@@ -62,6 +62,8 @@ WIDENING: Final[float] = 2.0
 #: and later, and by so much, s.
 SIGNIFICANT: Final = (4.0, 1.5)
 LEAST: Final[float] = 0.001
+#: While the deviation is below LEAST, so long, s, are no points taken after a batch.
+REST: Final[float] = 3.0
 #: Batches that are remembered: clocks drift.
 REMEMBERED: Final[float] = 60.0
 
@@ -88,6 +90,7 @@ class TimeOffset:
         self._misfits: Array = np.zeros(len(GRID))
         self._freedom = 0.0
         self._found = False
+        self._resting = -math.inf  # until this time, s
         self._paths: dict[str, list[tuple[float, Array]]] = {}  # times, points on the body
 
     @property
@@ -107,16 +110,21 @@ class TimeOffset:
         :param time: of the exposure by the camera's clock, s.
         :param point: (3,), m, in base_link.
         """
+        if time < self._resting:
+            return 0.0
         path = self._paths.setdefault(name, [])
         if path and not 0.0 < time - path[-1][0] < 0.5 * BATCH:
             path.clear()
         if not path or time - path[-1][0] > 0.9 * BATCH / MOST_POINTS:
             path.append((time, point))
-        last = (odometry.newest or time) - self._first - float(GRID[-1])
+        last = (odometry.newest or time) - self._first - FURTHEST
+        if path[0][0] + BATCH > last:
+            return 0.0
         usable = [each for each in path if each[0] <= last]
         if len(usable) < FEWEST or usable[-1][0] - usable[0][0] < BATCH:
             return 0.0
         del path[:len(usable)]
+        self._resting = time + (REST if self.deviation < LEAST else 0.0)
         self._judge(np.array([t for t, _ in usable]), np.array([p for _, p in usable]), odometry)
         return self._apply()
 
