@@ -15,8 +15,8 @@
 """
 An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
 
-``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and talks to a bridge listening
-there. It is for tests and demonstrations, and refuses any address but loopback.
+``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and connects to a bridge that
+listens there. It is for tests and demonstrations, and refuses any address but loopback.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Endpoint:
         return due
 
     def step(self, now: float) -> None:
-        """Fly on to ``now``, s on the monotonic clock, and send what is due."""
+        """Fly on to ``now``, s on the monotonic clock, and send the messages that are due."""
         self._send(self.autopilot.step(now))
 
     def close(self) -> None:

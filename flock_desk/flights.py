@@ -61,7 +61,7 @@ from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file
 
-CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
+CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
 MOST_EXITS = 5  # of a scenario that are named
 MODES = ('law', 'guard')
@@ -234,7 +234,7 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
     try:
         yield from flown
     except BaseException:
-        # A task runs for up to a minute: what it would return, nobody wants any more.
+        # A task runs for up to a minute: its result is no longer needed.
         for worker in multiprocessing.active_children():
             worker.terminate()
         raise

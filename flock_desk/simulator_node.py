@@ -17,9 +17,9 @@ The simulator node: the camera, the odometry and both vehicles of a flight on th
 
 Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, and
 ``ranges`` where the scenario has them, in real time. The follower is flown by an embedded
-autopilot, which a ``mavlink_bridge`` on this machine talks to. It hovers, as the leader does,
-until ``planner/state`` says that it is engaged and it is in offboard mode; then the scenario
-begins, and the node ends with it.
+autopilot, connected to a ``mavlink_bridge`` on this machine. Follower and leader hover until
+``planner/state`` reports that it is engaged and the autopilot is in offboard mode. Then the
+scenario begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an external autopilot, usually a simulator, and
 ``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
@@ -77,16 +77,16 @@ MESSAGES = 3
 SPECS = [
     Spec('scenario', 'indoor',
          'name of a file in config/scenarios, or the path of a .yaml file'),
-    Spec('seed', 0, 'of everything that chance decides', SEEDS),
+    Spec('seed', 0, 'seed of all random numbers', SEEDS),
     Spec('duration', 0.0, 'flight time; 0: that of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
     Spec('vehicle', 'embedded',
          'autopilot of the follower: the embedded one, or an external one',
          ('embedded', 'external')),
     Spec('truth_connection', 'udpin:127.0.0.1:19410',
-         "link on which an external autopilot reports its vehicle's place, not the bridge's: "
-         "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the "
-         "default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
+         "link on which an external autopilot reports the true place of its vehicle; not the "
+         "bridge's link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; "
+         "PX4's SIH: the default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
     Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
     Spec('require_truth', False,
          'refuse the estimate of an external autopilot that sends no ground truth: set it if odom '
@@ -168,7 +168,7 @@ class Simulator(FlockNode):
                                    'mode and planner/engage')
 
     def _links(self) -> ExternalVehicles | None:
-        """Return the links to external vehicles; None if there is none."""
+        """Return the links to external vehicles, or None."""
         leader = self._values['leader_truth_connection']
         topic = self._values['leader_topic']
         if self._values['vehicle'] == 'embedded':

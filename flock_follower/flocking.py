@@ -107,8 +107,8 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
 
     L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
 
-    :param relative_positions: neighbours' positions minus one's own, (m, n), n = 2 or 3, m.
-    :param relative_velocities: neighbours' velocities minus one's own, (m, n), m/s.
+    :param relative_positions: neighbours' positions minus the own one, (m, n), n = 2 or 3, m.
+    :param relative_velocities: neighbours' velocities minus the own one, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
     x, v = checked(relative_positions, relative_velocities,

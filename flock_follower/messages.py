@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Messages to numpy and back; the only place where their fields are spelled out.
+Conversion of messages to numpy and back; the only module that reads and writes their fields.
 
-Nothing here knows whose classes the messages are of: rclpy's in the nodes, the type store's where
-bags are read. Whoever wants one built hands in ``make``, which returns an empty message of a type
-such as 'nav_msgs/msg/Odometry'.
+It works with any message classes: rclpy's in the nodes, the type store's when bags are read. To
+build a message, the caller passes ``make``, which returns an empty message of a type such as
+'nav_msgs/msg/Odometry'.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
 THRUST_BIAS = 'lift'
-#: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
-#: be it. It is kept clear of, and never followed.
+#: Suffix of a neighbour's name on ``neighbors``: another object with the same marker. The planner
+#: keeps clear of it, and never follows it.
 DUPLICATE = '/duplicate'
 
 # Plausible values: each room that judges a value from outside uses these.
@@ -310,7 +310,7 @@ class Command(NamedTuple):
     """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
 
     def ages(self, now: int) -> tuple[float, float]:
-        """Return how long ago, s, it applied at a time, ns, and how old is what it rests on."""
+        """Return the ages of the command and of its image, s, at a time, ns."""
         source = stamp_age(self.stamp, now)
         return source - (self.ahead / NANOSECONDS if self.stamp > 0 else 0.0), source
 

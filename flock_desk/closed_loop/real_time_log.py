@@ -67,7 +67,7 @@ class RealTimeLog:
         self._rows[_ODOM].append((stamp_ns, *_moving(state)))
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
-        """Record what was true at an image, from when there is a leader on."""
+        """Record the truth at an image, from the first image with a leader on."""
         if frame.leader is None:
             return
         self._rows[_IMAGE].append((

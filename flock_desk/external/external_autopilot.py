@@ -16,7 +16,7 @@
 The link on which an external autopilot reports the place of its vehicle.
 
 A thread of its own receives, since messages of ground truth carry no time: they count as of their
-arrival. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+arrival. It requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
 nothing else.
 """
 
@@ -154,9 +154,9 @@ class ExternalAutopilot:
         if link.telemetry.dialect is None:
             return link.silence()
         title, name = link.telemetry.dialect.title, link.telemetry.dialect.name
-        return (f'{title} is heard, but sends no {_TRUTH_OF.get(name, "truth")}'
+        return (f'{title} is connected, but sends no {_TRUTH_OF.get(name, "truth")}'
                 if self.motion.source != ESTIMATE
-                else f'{title} is heard, but sends no {ESTIMATE}: it has no position')
+                else f'{title} is connected, but sends no {ESTIMATE}: it has no position')
 
     def close(self) -> None:
         """End the thread and release the port."""

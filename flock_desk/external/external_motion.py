@@ -253,7 +253,7 @@ class ExternalMotion:
 
 def _attitude(wxyz: list[float],
               rates: tuple[float, float, float]) -> tuple[Array, Array] | None:
-    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are none."""
+    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are invalid."""
     try:
         quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
     except ValueError:

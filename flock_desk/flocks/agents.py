@@ -47,7 +47,7 @@ Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mea
 Neighbors = Literal['all', 'graph', 'nearest']
 Integrator = Literal['adaptive', 'semi_implicit']
 
-NEAREST = 7  # how many a starling attends to (Ballerini et al. 2008)
+NEAREST = 7  # neighbours that a starling follows (Ballerini et al. 2008)
 _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
@@ -214,7 +214,7 @@ def _led(acceleration: integrators.Acceleration, leader: Leader) -> integrators.
 
 def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: float, model: Model,
             leader: Leader | None) -> Iterator[State]:
-    """Yield the states after every so many steps of dt."""
+    """Yield the first state, and one after every ``every`` steps of dt."""
     yield x, v
     for n in range(samples * every):
         after = velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
@@ -267,7 +267,7 @@ def _checked_start(positions: ArrayLike, velocities: ArrayLike) -> State:
 
 
 def _check_band(x: Array, params: FlockingParams, model: Model, flock: _Flock) -> None:
-    """Raise ValueError where the law has no value, or cannot hold what it promises."""
+    """Raise ValueError if the law is undefined, or cannot keep its guarantees."""
     if model == 'cucker_smale' or len(x) < 2:
         return
     close = flock_graph.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))

@@ -91,7 +91,7 @@ def metrics(time: Array, positions: Array, velocities: Array, params: FlockingPa
     """
     Return the metrics of positions, m, and velocities, m/s, both (m, k, n).
 
-    :param graph: the neighbour graph at the end, where there is one.
+    :param graph: the neighbour graph at the end, if any.
     :param joined: when each of its edges joined (edges,), s.
     """
     least, greatest, mean = _distances(positions)

@@ -160,7 +160,7 @@ def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Gr
 def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
                           neighbors: NDArray[np.int64], coupling: Coupling = 'flock') -> Array:
     """
-    Return the acceleration (k, n), m/s^2, of agents that attend to some others, as birds do.
+    Return the acceleration (k, n), m/s^2, of agents that each follow some others, as birds do.
 
     The law over those only, its cohesion f1 psi: bounded, because neighbours come and go. This
     loses what the law is for: attending is not mutual, so the mean velocity drifts; nothing

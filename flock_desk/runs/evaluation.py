@@ -136,12 +136,12 @@ def _topics_of(camera: CameraValues, bag: Bag, published: Collection[str],
 @dataclass
 class Evaluation:
     """
-    The record of a run; per image, tick and setpoint a few numbers each.
+    The record of a run: a few numbers for each image, tick and setpoint.
 
     ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s
     since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
     index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
-    ``reasons`` are those of every tick in HOLD, with its time.
+    ``reasons`` has the time and the reason of every tick in HOLD.
     ``setpoints`` (n, 5): time, the acceleration sent (NaN: none), 1 for a command.
     """
 

@@ -67,7 +67,7 @@ class FigureBound(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """A bound, the figure found, and what is wrong with it, or ''."""
+    """A bound, the figure found, and its fault, or ''."""
 
     bound: FigureBound
     figure: float | None
@@ -78,7 +78,7 @@ def load_bounds(path: str | Path) -> list[FigureBound]:
     """
     Read a file of bounds.
 
-    :raises ValueError: naming the file, the key and what is wrong with it.
+    :raises ValueError: naming the file, the key and its fault.
     :raises OSError: where the file cannot be read.
     """
     try:
@@ -93,7 +93,7 @@ def parse_bounds(document: Any) -> list[FigureBound]:
     """
     Return the bounds of a parsed file.
 
-    :raises ValueError: naming the key and what is wrong with it.
+    :raises ValueError: naming the key and its fault.
     """
     if not isinstance(document, Mapping) or not document:
         raise ValueError('must map figures of the summary to {min: ..., max: ...}')

@@ -41,7 +41,7 @@ from flock_follower.planner.params import PlannerParams
 
 matplotlib.use('Agg')
 
-# Okabe and Ito's palette: told apart by the colour-blind, and by lightness in grey.
+# Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 _OTHERS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)

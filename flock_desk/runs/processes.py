@@ -89,8 +89,8 @@ def free_udp_port() -> int:
     """
     Return a UDP port of the loopback interface that is free now.
 
-    It is above those that the system gives to whoever asks for any, as DDS does: else one of them
-    may have it before it is used.
+    It is above the ephemeral ports: otherwise another process, such as DDS, could receive the same
+    port before it is used.
     """
     chance = random.SystemRandom()
     while True:
@@ -117,7 +117,7 @@ def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """End this process by an exception, so that ``with`` blocks stop what they started."""
+    """End this process by an exception, so that ``with`` blocks stop their processes."""
     raise SystemExit(128 + number)
 
 

@@ -58,7 +58,7 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     Return how often and how well neighbours were measured, from the tables of ``frame_errors``.
 
     Images count once for each neighbour. ``recall`` is the share with an estimate, of those in
-    which the truth has a marker in view, or of all where there is no truth. Errors are over all
+    which the truth has a marker in view, or of all without a truth. Errors are over all
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
     a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
@@ -385,7 +385,7 @@ def write_summary(summary: Mapping[str, Any], path: Path) -> None:
 
 
 def jsonable(value: Any) -> Any:
-    """Return a summary with None for what is NaN or infinite, which JSON does not know."""
+    """Return a summary with None for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: jsonable(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

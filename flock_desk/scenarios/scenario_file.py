@@ -60,7 +60,7 @@ def load(name: str) -> Scenario:
     """
     Return a scenario of the package by its name, or another one by the path of its file.
 
-    :raises ScenarioError: where there is none, or its file is wrong.
+    :raises ScenarioError: if it does not exist, or its file is wrong.
     """
     path = Path(name)
     if path.suffix not in ('.yaml', '.yml'):
@@ -95,7 +95,7 @@ def parse(text: str, path: str) -> Scenario:
     """
     Return the scenario in the text of a file.
 
-    :raises ScenarioError: naming file, line, key, value and what is allowed.
+    :raises ScenarioError: naming file, line, key, value and the allowed values.
     """
     root = _composed(text, path)
     if root is None:

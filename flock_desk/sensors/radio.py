@@ -75,7 +75,7 @@ class Radios:
         self._walk = errors.bias_walk * errors.rate ** -0.5
 
     def measure(self, distance: Array) -> Array:
-        """Return what is measured of true distances (n,), m, one period after the last."""
+        """Return measurements of true distances (n,), m, one period after the last."""
         errors = self._errors
         drawn = np.stack([g.standard_normal(2) for g in self._generators])
         chance = np.stack([g.random(2) for g in self._generators])

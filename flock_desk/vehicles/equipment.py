@@ -90,7 +90,7 @@ class Equipment:
         self._vehicle = vehicle
         self.barometer = Barometer([np.random.default_rng([seed, 1])], errors)
         self.charge: float | None = 1.0
-        """What is left of the battery's capacity, a share; None: unknown."""
+        """Remaining charge of the battery, a share; None: unknown."""
 
     def step(self, armed: bool, dt: float) -> None:
         """Let the battery drain for ``dt``, s."""

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the embedded autopilot believes of its own motion: GPS, or external vision that can go stale.
+Position estimator of the embedded autopilot: GPS, or external vision that can become stale.
 
 With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
 they are right or not, and dead-reckons with a biased accelerometer once they stop: position and

@@ -15,7 +15,7 @@
 """
 Recordings in flight: one folder each, in files of limited size, of which the oldest make way.
 
-Each recording is a ROS 2 bag of several MCAP files. What was written is on the disk when ``write``
+Each recording is a ROS 2 bag of several MCAP files. The data is on the disk when ``write``
 returns. Whatever is at hand goes with it as files beside them, see ``note``.
 """
 
@@ -216,7 +216,7 @@ class FlightRecording:
         used = sum(sizes.values())
         if self._file is not None:
             sizes.pop(self._file.path)
-        # Where somebody else fills the disk, to delete what is new would only lose that, too.
+        # If another program fills the disk, deleting new recordings would not help.
         helps = _free(self.folder) + sum(sizes.values()) > _MEGABYTE * (
             limits.disk_free + limits.file_size)
         for oldest, size in sizes.items():
@@ -261,7 +261,7 @@ def _free(folder: Path) -> int:
 
 
 def _locked(folder: Path) -> int:
-    """Make a folder and lock it for as long as what is returned is open."""
+    """Make a folder and lock it for as long as the returned file is open."""
     folder.mkdir(parents=True, exist_ok=True)
     opened = os.open(folder, os.O_RDONLY)
     try:

@@ -46,7 +46,7 @@ class TopicEnd:
 
 @dataclass
 class TopicSeen:
-    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is none."""
+    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is missing."""
 
     publishers: list[TopicEnd] = field(default_factory=list)
     subscribers: list[TopicEnd] = field(default_factory=list)

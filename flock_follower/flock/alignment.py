@@ -16,16 +16,16 @@
 Alignment of the odometry frames of other vehicles with the own frame, in one Kalman filter.
 
 All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
-state of each frame is the yaw, which turns its coordinates to the own ones, and the place in the
-own frame of an anchor in it. The anchor moves with its vehicle, about which the drift of its
-odometry turns the frame: yaw and place are then nearly independent, and the lever is short. The
-drift of the own odometry moves all frames at once, as their joint covariance knows: so a frame
-may be related to another instead of the own one, and nothing counts twice.
+state of each frame is the yaw, which turns its coordinates to the own ones, and the place of an
+anchor point in the own frame. The anchor moves with the sending vehicle, because the drift of its
+odometry turns the frame about the vehicle. So yaw and place are nearly independent, and the lever
+is short. The drift of the own odometry moves all frames together; their joint covariance includes
+that. So two other frames can be related to each other without counting information twice.
 
 The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
 best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
 so that no first guess is needed; attitudes of a vehicle known in both frames add to the same sum.
-The length of that sum is the information about the yaw: zero if all points are at one place.
+The length of this sum of vectors is the information about the yaw; zero if all points coincide.
 """
 
 from __future__ import annotations

@@ -385,7 +385,7 @@ class Sharing:
             return OWN_FUTURE
         active = [s for s in self.status(now) if s.silent <= MESSAGE_AGE_MAX]
         if not active:
-            return 'nobody else talks'
+            return 'no other sender'
         return '' if any(not s.why for s in active) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in active)
 

@@ -184,7 +184,7 @@ FUTURE = 'word from the future'
 
 
 def sender_of(frame: str) -> str:
-    """Return the vehicle whose odometry frame it is, '' if it is none."""
+    """Return the vehicle of an odometry frame, '' if the frame is not ``NAME/odom``."""
     name = frame.removesuffix(FRAME)
     return name if name != frame and NAME.fullmatch(name) else ''
 
@@ -223,13 +223,14 @@ def refusal(state: OdometryState, received: int) -> Refusal | None:
     return None if known else ('word without a covariance', f'{sender} sends {state.child}')
 
 
-#: An odometry that is further from where it led, m or rad, has leapt ...
+#: Odometry that is further from its prediction than this, m or rad, has jumped ...
 LEAP, TURN = 0.25, 0.4
-#: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, no prediction is possible.
+#: ... plus the motion of these, m/s^2 and rad/s, since its last message. After LONGEST, s, no
+#: prediction is possible.
 PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
-#: So many leaps in this time, ns, are too many; for as long the sender is ignored.
+#: After this many jumps within BAN, ns, the sender is ignored for BAN.
 LEAPS, BAN = 3, 5 * NANOSECONDS
-#: So many states of itself within this time, ns, come from two: one sends at 10 Hz.
+#: This many own states within this time, ns, come from two senders: one sends at 10 Hz.
 OFTEN, TOO_SHORT = 20, 1_400_000_000
 #: Relations refused in a row: from DOUBTED on nothing is taken from the sender, from WRONG on its
 #: frame is aligned anew.

@@ -74,7 +74,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What is requested, by which command, and how the vehicle shows that it is reached."""
+    """A request: its command, and how the vehicle shows that it is fulfilled."""
 
     name: str
     command: int
@@ -91,7 +91,7 @@ class Goal:
     before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
     """What has to be reached first, by the state of the vehicle when the request begins."""
     instead: Callable[[Dialect], Goal | None] = lambda dialect: None
-    """What is requested if the autopilot refuses it."""
+    """The request that replaces it if the autopilot refuses it."""
 
 
 def _mode_goal(name: str, mode: Callable[[Dialect], str], **options: Any) -> Goal:

@@ -176,7 +176,7 @@ PX4: Final[Dialect] = Dialect(
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, mode_rate=50.0, least_mode_rate=2.0,
     reports_checks=True,
-    no_reason='PX4 tells the cause only to a ground station: look there, or set announce_as_gcs')
+    no_reason='PX4 sends the cause only to a ground station: look there, or set announce_as_gcs')
 #: ArduCopter; its behaviour was measured on 4.7.
 ARDUPILOT: Final[Dialect] = Dialect(
     name='ardupilot', title='ArduPilot', firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,

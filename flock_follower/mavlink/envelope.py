@@ -75,7 +75,7 @@ class GateLimits(Checked):
         'refuses offboard', live=True)
     velocity_disagreement: float = parameter(
         0.0, Range(0.0, 100.0, 'm/s'),
-        'difference between their velocities above which it believes neither, where odom is the '
+        'difference between their velocities above which neither is used, if odom is the '
         'velocity source; 0: half of v_max, and 0.4 at least', live=True)
     height_min: float = parameter(
         0.5, Range(0.3, 100.0, 'm'),
@@ -259,7 +259,7 @@ class HeightEstimator:
         if not elapsed > 0.0:
             return 'not newer'
         if elapsed > TIMEOUT:
-            # A sensor that comes back is believed, with the reference as it was.
+            # A sensor that returns is used again, with the same reference.
             self._altitude, self._velocity_error = altitude, 0.0
             self._differences.clear()
         else:
@@ -270,7 +270,7 @@ class HeightEstimator:
     def _follow(self, altitude: float, climb_rate: float | None, elapsed: float,
                 now: float) -> None:
         if (climb_rate is None) != (self._reported is None):
-            # The rate stays: only what it is made of changes.
+            # The rate stays; only its components change.
             self._velocity_error = self.climb_rate - (climb_rate or 0.0)
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
@@ -334,7 +334,7 @@ class HeightEstimator:
         return self._reference is not None and now - self._time > TIMEOUT
 
     def lost(self, now: float) -> str:
-        """Return why a height that was known cannot be believed at ``now``, or ''."""
+        """Return why a height that was known cannot be used at ``now``, or ''."""
         if self.missing(now):
             return 'height stale'
         jumped = self._reference is not None and now - self._stepped < STEP_PAUSE

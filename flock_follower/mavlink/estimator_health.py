@@ -28,7 +28,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-#: The estimate rests on what was forwarded for this long after the last ODOMETRY, s: PX4's limit.
+#: The estimate uses forwarded odometry for this long after the last ODOMETRY, s: PX4's limit.
 FORWARDED_TIMEOUT: Final[float] = 0.2
 #: What the estimator said of itself longer ago than this, s, is the past.
 STATUS_TIMEOUT: Final[float] = 3.0
@@ -93,9 +93,9 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
     """
     Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks.
 
-    PX4 1.16 publishes no global position while its yaw is not aligned; no flag tells that. Seen
-    after a landing, for 150 s: a compass offset was learnt, which takes the alignment away, and
-    yaw from vision, in use already, does not give it back.
+    PX4 1.16 publishes no global position while its yaw is not aligned; no flag reports that. Seen
+    after a landing, for 150 s: PX4 learnt a compass offset, which ended the alignment, and yaw
+    from vision, already in use, did not restore it.
     """
     if status is None or now - status.time > STATUS_TIMEOUT:
         return refusal
@@ -105,7 +105,7 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
-    """Return what a GPS_RAW_INT says after what was said before."""
+    """Return the state of the GPS fix after a GPS_RAW_INT."""
     fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
     accuracy = message.h_acc * 1e-3 if fixed else 0.0
     if before is None:
@@ -116,11 +116,11 @@ def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
 def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
                now: float) -> str:
     """
-    Return why the autopilot's velocity is not to be believed at ``now``, s, or ''.
+    Return why the autopilot's velocity is invalid at ``now``, s, or ''.
 
-    :param status: the newest, None where it tells none.
-    :param gps: the newest, None where it tells none.
-    :param forwarded: how long ago ODOMETRY was last sent, s; infinite where none ever was.
+    :param status: the newest, None if it sends none.
+    :param gps: the newest, None if it sends none.
+    :param forwarded: how long ago ODOMETRY was last sent, s; infinite if never.
     """
     if FORWARDED_TIMEOUT < forwarded < math.inf:
         return 'rests on odometry that is lost'
@@ -132,14 +132,14 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
     return ''
 
 
-#: Rates and pauses are told of this long, s.
+#: Rates and pauses are reported over this time, s.
 RECENT: Final[float] = 5.0
 #: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
 WINDOW: Final[float] = 1.0
 FEWEST: Final[int] = 5
 #: So many of a kind are remembered: RECENT at 400 Hz.
 MOST: Final[int] = 2000
-#: A message comes too seldom below this share of what was asked for; autopilots round intervals.
+#: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
 #: Time between two requests, s; the longest where asking does no good.
 SHORTEST_WAIT: Final[float] = 2.0

@@ -52,9 +52,9 @@ class CommandSources:
         """
         Take a command; return whether it shows that two publishers command.
 
-        Where the one before has fallen silent, the other has replaced it: that is one.
+        A publisher that replaces a silent one does not count as a second.
 
-        :param number: what its publisher counts, from 1; None where the middleware does not tell.
+        :param number: its sequence number, from 1; None if the middleware has none.
         :param time: when it came, s on a monotonic clock.
         """
         if number is None:

@@ -201,7 +201,7 @@ class Gate:
     def update_height(self, altitude: float, now: float) -> str:
         """Take an altitude, m, of the barometer; return '' or why it is refused."""
         known = self._known(now)
-        # Also of a source that is not believed: a constant error is found and taken out.
+        # Also from an invalid source: a constant error is estimated and removed.
         velocity = known.source_first[0].fresh_velocity(
             self.limits) or known.braking_velocity(self.limits)
         refused = self.heights.take(altitude, None if velocity is None else float(
@@ -216,7 +216,7 @@ class Gate:
         return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
     def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity of the autopilot is not believed, or ''."""
+        """Note, each cycle, why the velocity of the autopilot is invalid, or ''."""
         self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
 
     def update_yaw(self, source: str, yaw: float, time: float) -> None:

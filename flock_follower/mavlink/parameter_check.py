@@ -71,7 +71,7 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     Return the entries of a ``.params`` or ``.parm`` file.
 
     :param forwarding: whether those that matter only with forwarded odometry are wanted too.
-    :raises ValueError: naming the first line that is none of an entry, a comment, or empty.
+    :raises ValueError: naming the first line that is neither an entry, a comment, nor empty.
     """
     found: list[Recommendation] = []
     comments: list[str] = []
@@ -170,7 +170,7 @@ class ParameterCheck:
             self._unanswered = [other for other in self._unanswered if other != name]
 
     def result(self) -> CheckResult | None:
-        """Return what was found, None until every parameter was answered or given up."""
+        """Return the differences, None until every parameter was answered or given up."""
         values, unanswered = self.values.copy(), self._unanswered.copy()
         if self._waiting or self._asked or not self._names:
             return None
@@ -252,5 +252,5 @@ def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> st
     for name in names:
         parameters.again(name)
     return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
-            f'bridge, or not fuse what is forwarded ({_ANYWAY} flies all the same)'
+            f'bridge, or not fuse forwarded odometry ({_ANYWAY} flies all the same)'
             if names else '')

@@ -42,8 +42,8 @@ from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
 from flock_follower.planner.limits import limit_norm
 
-#: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
-#: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
+#: The stream stops this long, s, after a velocity that still arrives became invalid. If none
+#: arrives at all, the whole computer may have stalled: then ``blind_timeout`` applies.
 LOSS_TIMEOUT: Final[float] = 0.6
 #: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
 USUAL_AGE: Final[float] = 0.05
@@ -92,7 +92,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class KnownMotion:
-    """What both sources say of the vehicle's motion, and since when not to believe them."""
+    """The vehicle's motion by both sources, and for how long each has been invalid."""
 
     odom: Motion
     """By the odometry."""
@@ -103,7 +103,7 @@ class KnownMotion:
     disagreeing_for: float = -math.inf
     """How long ago the velocities began to disagree, s; negative: they agree."""
     distrusted_for: float = -math.inf
-    """For how long the autopilot has told a velocity that nothing carries, s."""
+    """For how long the autopilot has sent a velocity without a valid sensor behind it, s."""
 
     @property
     def source_first(self) -> tuple[Motion, Motion]:
@@ -113,7 +113,7 @@ class KnownMotion:
         return self.autopilot, self.odom
 
     def braking_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity to brake with; None where none is fresh, or two disagree."""
+        """Return the velocity to brake with; None if none is fresh, or if two disagree."""
         first, second = self.source_first
         if self.yaws_disagree(limits):
             # The autopilot's own frame is the one in which it obeys.
@@ -124,7 +124,7 @@ class KnownMotion:
         return second.fresh_velocity(limits) if velocity is None else velocity
 
     def blind(self, limits: GateLimits) -> bool:
-        """Return whether there was no velocity to believe for too long, after there was one."""
+        """Return whether no valid velocity has come for too long, after one had come."""
         if self.braking_velocity(limits) is not None:
             return False
         if self.disagreeing_for > LOSS_TIMEOUT or self.distrusted_for > LOSS_TIMEOUT:
@@ -187,7 +187,7 @@ def finite_vector(value: ArrayLike) -> Array | None:
 AVERAGING_TIME: Final[float] = 0.3
 #: Samples further apart than this, s, weigh no more than this.
 LONGEST_STEP: Final[float] = 0.1
-#: A difference counts up to this many times what is tolerated.
+#: A difference is clipped to this many times the tolerance.
 LARGEST: Final[float] = 3.0
 #: What disagreed for this long, s, does so until it flies anew: a wrong frame shows only at speed.
 #: With 0.3 s a sound PX4 was landed twice, after 24 and 26 minutes.
@@ -265,7 +265,7 @@ class Path:
         """
         Take a position, m.
 
-        :param velocity: (3,), m/s, by the same source; None tells no jump.
+        :param velocity: (3,), m/s, by the same source; None: jumps are not detected.
         """
         elapsed = now - self._time
         if elapsed <= 0.0:

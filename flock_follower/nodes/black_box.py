@@ -72,7 +72,7 @@ NICENESS = 10
 JPEG_QUALITY = 90  # of images compressed here
 PARAMETER_EVENTS = '/parameter_events'
 LATCHED = ('planner/state', 'mavlink_bridge/state', 'mavlink_bridge/armed_at', '/rosout')
-#: What is recorded besides the images and their calibration.
+#: Topics that are recorded besides the images and their calibration.
 RECORDED: Final = {
     **{name: TYPES[name] for name in (
         'odom', 'ranges', 'neighbors', 'neighbors/frames', 'command/trajectory', 'planner/state',
@@ -144,8 +144,8 @@ class BlackBox(FlockNode):
         self.get_logger().info(f'recording to {self._folder}')
         if shares_memory():
             self.get_logger().warning(
-                'receives through shared memory: if it is started in flight, who publishes may '
-                f'wait for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} ends that')
+                'receives through shared memory: if it is started in flight, publishers may block '
+                f'for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} prevents that')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""

@@ -306,7 +306,7 @@ class Replay(FlockNode):
 
 def bag_argument(args: list[str]) -> str:
     """
-    Return the bag given as a plain argument, '' if there is none.
+    Return the bag given as a plain argument, or ''.
 
     :raises ValueError: if there is more than one plain argument.
     """

@@ -263,7 +263,8 @@ class Visualizer(FlockNode):
         for name, camera in self._cameras.items():
             frame = self._frames[name]
             if not self._transforms.fix(known.now, BASE, frame, camera.T_body_optical):
-                self.diagnostics.values[f'frame {frame}'] = 'told on /tf_static by another node'
+                self.diagnostics.values[f'frame {frame}'] = (
+                    'published on /tf_static by another node')
 
     def _message(self, known: Snapshot) -> MarkerArray:
         stamp = nanoseconds_to_stamp(known.now)

@@ -91,7 +91,7 @@ class UpAxis:
 
     @property
     def fault(self) -> str:
-        """Return what is wrong where another axis than z points up, else ''."""
+        """Return the fault if another axis than z points up, else ''."""
         if self.axis in ('', 'z'):
             return ''
         return (f'base_link has {self.axis} up instead of z: set odom_child_rpy to how the child '
@@ -100,11 +100,11 @@ class UpAxis:
 
 #: Where the way to read the velocity changes, the step is faded out in this time constant, s.
 FADING = 0.5
-#: Messages over which latency and rate are told.
+#: Messages over which latency and rate are reported.
 REMEMBERED = 50
-#: So many attitudes are remembered, to derive rates from where they cease to come.
+#: Number of attitudes kept, to derive angular rates if the messages have none.
 ATTITUDES = 100
-#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+#: A velocity of this variance, (m/s)^2, is invalid: rtabmap sends zeros with 9999 without one.
 NO_VELOCITY = 1e3
 
 
@@ -143,8 +143,8 @@ class OdometrySource:
     """
     The own odometry, message by message.
 
-    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
-    are (reason, detail) of what was dropped or survived since :meth:`told`.
+    ``twist`` describes the frame of the velocity, ``up`` which axis of base_link points up.
+    ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:
@@ -197,7 +197,7 @@ class OdometrySource:
         return max(self._gaps, default=0.0)
 
     def new_events(self) -> list[tuple[str, str]]:
-        """Return the events since this was asked last."""
+        """Return the events since the last call."""
         events, self.events = self.events, []
         return events
 
@@ -219,7 +219,7 @@ class OdometrySource:
         time = (stamp - self._epoch) / NANOSECONDS
         self._latencies.append((now - stamp) / NANOSECONDS)
 
-        # Turns and levers that are none are left out: for every message, that is a third of it.
+        # Identity turns and zero levers are skipped: that saves a third of the time.
         R_odom_child = rotation = unit_quaternion_to_matrix(attitude)
         if not self._is_base:
             attitude = quaternion_multiply(attitude, self._q_child_base)

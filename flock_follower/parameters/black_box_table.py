@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the black box: what it records, and how much of the disk it may take."""
+"""The parameters of the black box: recorded topics, and its share of the disk."""
 
 from __future__ import annotations
 

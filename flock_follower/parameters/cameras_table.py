@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The parameters of the cameras, and what they say: of one, or of several by their names.
+The parameters of one camera, or of several by their names.
 
 One camera needs no name. Several are listed in ``cameras``, and each has parameters of its own
 below ``camera.NAME``; planner and relative_pose take the same ones.
@@ -60,11 +60,11 @@ ALONE: Final[Mapping[str, tuple[str, Any]]] = {
 
 
 class CameraValues(NamedTuple):
-    """What the parameters say of one camera; its name is '' where there is no other."""
+    """The parameters of one camera; its name is '' if there is no other."""
 
     name: str
     image: str = 'image_raw'
-    """Topic of the images as they are told; see :meth:`images`."""
+    """Base topic of the images; see :meth:`images`."""
     camera_info: str = 'camera_info'
     position: Sequence[float] = POSITION
     rpy: Sequence[float] = AHEAD
@@ -79,9 +79,10 @@ class CameraValues(NamedTuple):
 
 def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     """
-    Return the cameras that the checked values of a node's parameters tell of.
+    Return the cameras in the checked values of a node's parameters.
 
-    :raises ValueError: where two of them cannot be two, or what is for one stands beside several.
+    :raises ValueError: if two cameras share a name or a topic, or if a parameter of a single
+        camera is set beside several cameras.
     """
     names = [name for name in values[NAMES] if name]
     if not names:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the planner, with the core's own defaults and ranges, and what they suit."""
+"""The parameters of the planner, with the defaults and ranges of the planner's classes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     """
     Return the parameters of the core.
 
-    :param name: one's own, as others know it: it may stand in the neighbours' file, too.
+    :param name: of this vehicle; the neighbours' file may contain it, too.
     :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
     :raises OSError: where it cannot be read.
     """

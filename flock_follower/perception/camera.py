@@ -60,10 +60,10 @@ class CameraModel:
     :param matrix: K, shape (3, 3), px.
     :param distortion: D; shorter is filled up with zeros where the model allows it (none at all,
         or plumb_bob's first four), surplus zeros at the end are ignored.
-    :param model: a key of ``DISTORTION_MODELS``; empty is taken for plumb_bob.
+    :param model: a key of ``DISTORTION_MODELS``; empty means plumb_bob.
     :param width: image width, px.
     :param height: image height, px.
-    :raises ValueError: naming what is wrong with the calibration.
+    :raises ValueError: naming the fault of the calibration.
     """
 
     matrix: Array
@@ -120,7 +120,7 @@ class CameraModel:
         the left (3, 3) of P, (3, 4) or flat (12,), without distortion, and poses are then in
         the rectified frame.
 
-        :raises ValueError: naming what is wrong with the calibration.
+        :raises ValueError: naming the fault of the calibration.
         """
         if not rectified:
             return cls(_reshaped('K', K, (3, 3)), np.asarray(D, float), distortion_model,

@@ -48,9 +48,9 @@ _CHOLESKY = cv2.DECOMP_CHOLESKY
 
 def solve_normal(information: Array, moment: Array) -> Array | None:
     """
-    Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None where that is not definite.
+    Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None without a definite matrix.
 
-    What is not a number in either is not in x.
+    NaN in either gives NaN in x.
     """
     solved, x = cv2.solve(information, moment[:, None], flags=_CHOLESKY)
     return x[:, 0] if solved else None
@@ -80,7 +80,7 @@ _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
 _LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
-_MIN_SLOPE = 1.0  # grey levels per px: a weaker edge is none
+_MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
 _MIN_SHARE = 0.5  # of the edges must be found
 _WIDE = 0.5  # px between samples, for sharp images of large markers
 _FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
@@ -88,8 +88,8 @@ _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
 _LEAST_VARIANCE = 1e-9  # px^2: to divide by
-_FARTHEST = 1e4  # m: a pose beyond, or NaN, is none
-#: A peak at the rim of the range is none, and its neighbours are out of it: looked at one inside.
+_FARTHEST = 1e4  # m: a pose beyond, or NaN, is invalid
+#: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
 _ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
 _DIFFERENCE = np.array([1.0, -1.0])

@@ -38,13 +38,13 @@ A neighbour that carries several has, instead of the last four keys, a list of t
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
-Either may say what it is for the planner::
+Each neighbour may have keys for the planner::
 
         role: follower           # leader (the default), follower, or avoid: kept clear of only
         radius: 0.3              # m, of its hull: distances are kept between hulls; 0
 
-``tag_position: [x, y, z]``, m, on its body, says where the antenna is that ranges are measured to;
-without it they are to the body's origin.
+``tag_position: [x, y, z]``, m, on its body, is the antenna that ranges are measured to;
+without it ranges are measured to the body's origin.
 
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
@@ -289,7 +289,7 @@ def load(path: str | Path) -> NeighborConfig:
     """
     Read a neighbours file.
 
-    :raises ValueError: naming the file, the key, its value and what is valid.
+    :raises ValueError: naming the file, the key, its value and the valid range.
     :raises OSError: where the file cannot be read.
     """
     text = Path(path).read_text(encoding='utf-8')
@@ -305,7 +305,7 @@ def parse(document: Any) -> NeighborConfig:
     """
     Return the configuration of a parsed YAML document.
 
-    :raises ValueError: naming the key, its value and what is valid.
+    :raises ValueError: naming the key, its value and the valid range.
     """
     _check_keys('', document, {'dictionary', 'neighbors'})
     dictionary = document['dictionary']

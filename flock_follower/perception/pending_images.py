@@ -153,12 +153,12 @@ class Perceiver:
 
     def take_odometry(self, state: OdometryState) -> bool:
         """
-        Take one's own state; return whether time jumped back and everything restarted.
+        Take the own state; return whether time jumped back and everything restarted.
 
         Images that were waiting are then forgotten.
         """
         if self.frame not in ('', state.frame):
-            self.tracker.restart()  # what is known is in the frame before
+            self.tracker.restart()  # its estimates are in the old frame
         self.frame = state.frame
         jumped = self.tracker.feed_odometry(OdometrySample(
             self._seconds(state.stamp), state.position, state.quaternion, state.velocity,

@@ -49,8 +49,8 @@ from flock_follower.perception.markers import (
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
 _MIN_APART = 4.0  # grey levels between black and white, both in the shade
-#: Where black or white spread more than this, as a variance against half of what they are apart,
-#: squared, they are not what they should be, and tell nothing.
+#: Black or white cells are not used if their variance exceeds this share of the squared half of
+#: their contrast.
 _MAX_SPREAD = 0.35
 
 
@@ -96,7 +96,7 @@ def read(brightness: Array, seen: Windows) -> Array:
     """
     Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
 
-    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells.
+    -1: like the black cells around it, 1: like the white ones, 0: no cells to compare with.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []

@@ -129,7 +129,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     unit = n.tolist()
     rate = scalar_product(unit, w)
     common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
-    # Whoever may be anywhere in a sphere that grows comes nearer by that.
+    # The growing sphere of possible places comes nearer at its growth rate.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)

@@ -170,8 +170,8 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
     """
     Return whether the distance is known of a neighbor whose position is too uncertain.
 
-    It is if its variance is at most a third of what is admitted of a position's three axes: of a
-    position that is equally uncertain in all of them nothing is known.
+    It is if its variance is at most a third of the variance admitted for a whole position. A
+    position that is equally uncertain along all axes gives no distance.
     """
     if own is None:
         return False
@@ -183,7 +183,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
     return 0.0 <= float(along @ n.position_covariance @ along) <= most / 3.0
 
 
-TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
 ACCELERATION_NOISE = 0.35  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed

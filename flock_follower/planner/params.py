@@ -31,9 +31,9 @@ RADIUS = Range(0.0, 5.0, 'm')
 @dataclass(frozen=True)
 class Member(Checked):
     """
-    What is known of a vehicle beforehand.
+    The role and size of a vehicle, known before the flight.
 
-    :raises ValueError: naming what is wrong, its value and what is valid.
+    :raises ValueError: naming the field, its value and the valid range.
     """
 
     role: str = parameter(
@@ -51,9 +51,9 @@ SEEN_DEFAULT, RECEIVED_DEFAULT = Member(LEADER), Member(FOLLOWER)  # strangers
 
 def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     """
-    Return what is known of a vehicle; of a stranger, that depends on how it is known.
+    Return the role and size of a vehicle; a stranger's role depends on how it was detected.
 
-    What carries the marker of another without being it is avoided, and as large as that one.
+    A duplicate of a neighbor's marker is avoided, with the neighbor's radius.
     """
     base, duplicate, _ = name.partition(DUPLICATE)
     known = members.get(base, RECEIVED_DEFAULT if received else SEEN_DEFAULT)
@@ -126,10 +126,10 @@ class PlannerParams(Checked):
         0.5, Range(0.05, 20.0, 'm/s'), 'largest speed, of the vector; likewise', live=True)
     a_max_start: float = parameter(
         0.0, Range(0.0, 20.0, 'm/s^2'),
-        '``a_max`` of the start, m/s^2, if it was lowered since; see ``strongest``.')
+        'initial ``a_max``, m/s^2, if it was lowered in flight; see ``strongest``.')
     v_max_start: float = parameter(
         0.0, Range(0.0, 20.0, 'm/s'),
-        '``v_max`` of the start, m/s, if it was lowered since; see ``fastest``.')
+        'initial ``v_max``, m/s, if it was lowered in flight; see ``fastest``.')
     period: float = parameter(
         0.1, Range(0.02, 1.0, 's'),
         'time between commands')
@@ -138,7 +138,7 @@ class PlannerParams(Checked):
         'age up to which a neighbor is extrapolated and followed', live=True)
     heard_timeout: float = parameter(
         1.0, Range(0.05, 5.0, 's'),
-        'age up to which what others tell of a neighbor is used')
+        'age up to which a state received from another vehicle is used')
     coast_timeout: float = parameter(
         2.0, Range(0.05, 10.0, 's'),
         'age of the last neighbor up to which to coast, then brake', live=True)
@@ -166,7 +166,7 @@ class PlannerParams(Checked):
         "Time over which the law's command is faded in when following begins or changes, s.")
     altitude_mode: str = parameter(
         'follow', ALTITUDE_MODES,
-        'follow the altitude of the leader, or of the nearest neighbor attended to, or hold the '
+        'follow the altitude of the leader, or of the nearest neighbor with an edge, or hold the '
         'one at which it became active', live=True)
     altitude_offset: float = parameter(
         0.0, Range(-10.0, 10.0, 'm'),
@@ -207,8 +207,8 @@ class PlannerParams(Checked):
         'commanding until planner/engage is called', live=True)
     yaw_mode: str = parameter(
         'leader', YAW_MODES,
-        'face the leader, or the nearest neighbor attended to, or hold the yaw at which it became '
-        'active', live=True)
+        'face the leader, or the nearest neighbor with an edge, or hold the yaw at which it '
+        'became active', live=True)
     yaw_rate_max: float = parameter(
         1.0, Range(0.05, 6.0, 'rad/s'),
         'largest rate at which the commanded yaw turns, and to turn to it', live=True)
@@ -219,7 +219,7 @@ class PlannerParams(Checked):
     radius: float = parameter(
         0.0, RADIUS, 'of the own hull: distances are kept between hulls', live=True)
     vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
-    """What is known beforehand of others, by name."""
+    """Roles and sizes of other vehicles, by name."""
 
     @property
     def strongest(self) -> float:
