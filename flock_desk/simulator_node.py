@@ -78,7 +78,7 @@ SPECS = [
     Spec('scenario', 'indoor',
          'name of a file in config/scenarios, or the path of a .yaml file'),
     Spec('seed', 0, 'seed of all random numbers', SEEDS),
-    Spec('duration', 0.0, 'flight time; 0: that of the scenario', DURATIONS),
+    Spec('duration', 0.0, 'flight time; 0: the duration of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
     Spec('vehicle', 'embedded',
          'autopilot of the follower: the embedded one, or an external one',
@@ -92,20 +92,20 @@ SPECS = [
          'refuse the estimate of an external autopilot that sends no ground truth: set it if odom '
          'is forwarded to it'),
     Spec('leader_truth_connection', '',
-         'link on which the autopilot of a second vehicle, the leader, reports its place, with '
-         "vehicle = external; none: the leader is the scenario's. PX4's second SIH: "
+         'link on which the autopilot of the leader, a second vehicle, reports its true place '
+         "(vehicle = external); empty: the leader of the scenario. PX4's second SIH: "
          "udpin:127.0.0.1:19411, ArduPilot's second SITL: tcp:127.0.0.1:5772"),
-    Spec('leader_target_system', 2, 'MAVLink system id of that autopilot', IDS),
+    Spec('leader_target_system', 2, "MAVLink system id of the leader's autopilot", IDS),
     Spec('leader_topic', '',
-         'topic on which another simulator publishes the true motion of its vehicle, the leader '
-         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded; none: the leader is the '
-         "scenario's"),
+         'topic with the true motion of the leader from another simulator (nav_msgs/Odometry, its '
+         'truth/motion; vehicle = embedded); empty: the leader of the scenario'),
     Spec('leader_offset', [1.5, 0.0, 0.0],
-         'origin of the odom frame of that vehicle in the own one',
+         "origin of the leader's odom frame in the own odom frame",
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
-         'end with exit code 3 in flight if the machine is too busy for what its parent started'),
-    Spec('log', '', '.npz file for the true flight; none: no log'),
+         'end the flight with exit code 3 if the machine is too busy for the nodes of the parent '
+         'process'),
+    Spec('log', '', '.npz file for the true motion; empty: no log'),
 ]
 
 

@@ -44,7 +44,7 @@ class Flights:
     """
     The motion of n rows of a scenario, from engaging on, at every planner tick (k of them).
 
-    Everything is true, not estimated; vectors are ENU. A row is a follower: see ``world``.
+    All values are ground truth; vectors are ENU. Each row is a follower: see ``world``.
     """
 
     scenario: Scenario

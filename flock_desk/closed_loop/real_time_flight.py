@@ -76,8 +76,8 @@ class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
-    :param latest_ns: an image that is due for longer than this is left out.
-    :param leader: None: the scenario's own leader.
+    :param latest_ns: images that are later than this are skipped.
+    :param leader: a leader flown elsewhere; None: the scenario's own leader.
     """
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,

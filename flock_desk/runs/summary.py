@@ -270,11 +270,11 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
 
 def _altitude_off(flight: LiveRecord) -> Array:
     """
-    Return the distance of the follower's height from the leader's, m, at the images that count.
+    Return the height difference between follower and leader, m, at the images that count.
 
-    Those count whose leader has been in view for ``LEVEL_WITHIN``: the follower cannot know the
-    height of a leader that it does not see. One of the scenario begins at the follower's height,
-    so all images from the beginning count; one flown by an autopilot begins at any height.
+    An image counts if the leader has been in view for ``LEVEL_WITHIN``: the follower does not know
+    the height of a leader out of view. A scenario's leader begins at the follower's height, so all
+    images from the beginning count. A leader flown by an autopilot begins at any height.
     """
     times, hidden = flight.table['time'], flight.table['visible'] == 0.0
     begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf

@@ -48,13 +48,14 @@ class GateLimits(Checked):
     """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
 
     a_max: float = parameter(
-        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest acceleration, of the vector', live=True)
+        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest magnitude of the acceleration', live=True)
     v_max: float = parameter(
-        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed, of the vector', live=True)
+        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed', live=True)
     planner_timeout: float = parameter(
-        0.2, Range(0.15, 1.0, 's'), 'oldest command obeyed; the planner sends one each 0.1 s',
+        0.2, Range(0.15, 1.0, 's'), 'largest age of a command; the planner sends one every 0.1 s',
         live=False)
-    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'oldest velocity used', live=True)
+    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'largest age of a '
+                                                                'velocity', live=True)
     link_timeout: float = parameter(
         1.0, Range(0.2, 5.0, 's'), 'silence of the autopilot before braking', live=True)
     blind_timeout: float = parameter(
@@ -71,21 +72,21 @@ class GateLimits(Checked):
         'Time constant of braking, s; longer where the velocity is late.')
     yaw_disagreement: float = parameter(
         0.35, Range(0.01, 3.2, 'rad'),
-        'difference between the yaws of odom and of the autopilot above which it brakes, and '
+        'difference between the yaws of odom and autopilot above which the bridge brakes, and '
         'refuses offboard', live=True)
     velocity_disagreement: float = parameter(
         0.0, Range(0.0, 100.0, 'm/s'),
-        'difference between their velocities above which neither is used, if odom is the '
-        'velocity source; 0: half of v_max, and 0.4 at least', live=True)
+        'difference between the velocities of odom and autopilot above which neither is used, if '
+        'odom is the velocity source; 0: half of v_max, and 0.4 at least', live=True)
     height_min: float = parameter(
         0.5, Range(0.3, 100.0, 'm'),
-        'least height above the place of arming that setpoints fly to, by barometer or '
+        'least height of setpoints above the place of arming, by barometer or '
         'rangefinder', live=False)
     height_max: float = parameter(
         10.0, Range(0.5, 1000.0, 'm'), 'greatest height above the place of arming', live=False)
     radius_max: float = parameter(
         50.0, Range(1.0, 10000.0, 'm'),
-        'greatest horizontal distance from where it became ACTIVE', live=False)
+        'greatest horizontal distance from the place where the bridge became ACTIVE', live=False)
 
     def __post_init__(self) -> None:
         """Check the fields, and that the heights are in order."""

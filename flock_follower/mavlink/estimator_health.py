@@ -184,12 +184,12 @@ class Arrivals:
         return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
 
     def longest_pause(self, now: float) -> float:
-        """Return the longest time without any message that ended, or lasts, within RECENT, s."""
+        """Return the longest pause in all messages within the last RECENT, s."""
         ended = [pause for time, pause in self._pauses.copy() if now - time <= RECENT]
         return max([*ended, now - self._newest] if math.isfinite(self._newest) else [0.0])
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
-        """Return whether a message comes well below the rate that was asked for, Hz."""
+        """Return whether the rate of a message is well below the requested one, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
         return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window

@@ -87,7 +87,8 @@ ODOMETRY = ('odom_child_position', 'odom_child_rpy')
 PLANNER = ('d0', 'd1', 'radius')
 
 SPECS = [
-    Spec('rate', 10.0, 'of markers and transforms, while someone looks', Range(1.0, 50.0, 'Hz')),
+    Spec('rate', 10.0, 'rate of markers and transforms, while a '
+                       'viewer subscribes', Range(1.0, 50.0, 'Hz')),
     Spec('odom_tf', AUTO,
          'whether to broadcast odom -> base_link: auto, while no other node publishes on /tf (an '
          'odometry normally does); always; never', ODOM_TF),

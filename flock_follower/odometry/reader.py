@@ -121,19 +121,19 @@ class SourceParams(Checked):
 
     child_position: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0), Range(-10.0, 10.0, 'm'),
-        'place of the child frame of odom on base_link, FLU: of the IMU, where that is what the '
-        'source reports', live=False)
+        'place of the child frame of odom on base_link, FLU: that of the IMU if the source '
+        'reports the pose of the IMU', live=False)
     child_rpy: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0), Range(-2.0 * math.pi, 2.0 * math.pi, 'rad'),
         'roll, pitch, yaw of the child frame of odom on base_link', live=False)
     twist_frame: str = parameter(
         AUTO, CHOICES,
-        'frame of the velocity in odom: child as in REP-105, or odom; none: derive it from the '
-        'positions; auto: find out', live=False)
+        'frame of the velocity in odom: child as in REP-105, or odom; none: derive the velocity '
+        'from the positions; auto: detect the frame', live=False)
     std: tuple[float, ...] = parameter(
         (0.1, 0.05, 0.1, 0.05), Range(0.0, 100.0, above=True),
         'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
-        'rad/s, where odom has no covariances', live=False)
+        'rad/s, if odom has no covariances', live=False)
 
 
 _NO_LEVER: Array = np.zeros(3)

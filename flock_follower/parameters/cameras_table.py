@@ -36,20 +36,21 @@ AHEAD: Final = (0.0, 0.0, 0.0)
 
 CAMERA_SPECS = [
     Spec(NAMES, [''],
-         'names of several cameras, each with parameters camera.NAME...; empty: one camera, that '
-         'of camera_rpy'),
+         'names of several cameras, each with parameters camera.NAME...; empty: a single camera, '
+         'with camera_rpy'),
     Spec('camera.NAME.image', 'NAME/image_raw',
-         'topic of its images; of compressed ones without /compressed'),
-    Spec('camera.NAME.camera_info', 'NAME/camera_info', 'topic of their calibration'),
+         "topic of the camera's images; of compressed images without /compressed"),
+    Spec('camera.NAME.camera_info', 'NAME/camera_info', "topic of the camera's calibration"),
     Spec('camera.NAME.position', list(POSITION),
-         'its place on the body, FLU', Range(unit='m'), fixed_length=True),
+         'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
     Spec('camera.NAME.rpy', list(AHEAD),
-         'its roll, pitch, yaw on the body; zeros look ahead, [0, 0, 1.5708] to the left',
+         'roll, pitch, yaw of the camera on the body; zeros look ahead, [0, 0, 1.5708] to the '
+         'left',
          Range(unit='rad'), fixed_length=True),
-    Spec('camera.NAME.rectified', False, 'its images are undistorted already'),
-    Spec('camera.NAME.time_offset', 0.0, 'as time_offset of one camera',
+    Spec('camera.NAME.rectified', False, 'whether the images are undistorted already'),
+    Spec('camera.NAME.time_offset', 0.0, 'time_offset of this camera',
          Range(-MOST_OFFSET, MOST_OFFSET, 's')),
-    Spec('camera.NAME.readout_time', 0.0, 'as readout_time of one camera',
+    Spec('camera.NAME.readout_time', 0.0, 'readout_time of this camera',
          Range(0.0, LONGEST_READOUT, 's')),
 ]
 #: The parameters of one camera that has no name: their key below camera.NAME, and the default.

@@ -32,9 +32,9 @@ ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.
           'height': Range(-10_000.0, 10_000.0, 'm')}
 SPECS = [
     Spec('connection', 'udpin:127.0.0.1:14540',
-         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
+         'connection to the autopilot: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
          '/dev/DEVICE[,BAUD]'),
-    Spec('autopilot', 'auto', 'its firmware; auto: as its HEARTBEAT says', AUTOPILOTS),
+    Spec('autopilot', 'auto', 'firmware of the autopilot; auto: by its HEARTBEAT', AUTOPILOTS),
     Spec('target_system', 1,
          'MAVLink system id of the autopilot; others are ignored', IDS),
     Spec('source_system', 1, 'own MAVLink system id', IDS),
@@ -51,12 +51,12 @@ SPECS = [
     Spec('stream_rate', 20.0,
          'rate of setpoints between new commands', Range(5.0, 100.0, 'Hz')),
     Spec('telemetry_rate', 50.0,
-         "wanted rate of the autopilot's position and attitude; 20 for 57600 baud",
+         "requested rate of the autopilot's position and attitude; 20 for 57600 baud",
          Range(5.0, 200.0, 'Hz')),
     Spec('forward_odometry', False,
          'send odom to the autopilot as ODOMETRY, for flight without GPS'),
     Spec('odometry_rate', 30.0,
-         'most ODOMETRY messages per second, of 247 bytes each; 10 for 57600 baud',
+         'largest rate of ODOMETRY messages, of 247 bytes each; 10 for 57600 baud',
          Range(10.0, 100.0, 'Hz')),
     Spec('global_origin', [0.0, 0.0, 0.0],
          'latitude, longitude (deg) and height (m) sent to an estimator without an origin (no '
@@ -68,16 +68,16 @@ SPECS = [
          'does not fuse the odometry that is forwarded to it (EKF2_EV_CTRL; VISO_TYPE, '
          'EK3_SRC1_POSXY, EK3_SRC1_VELXY), or does not answer'),
     Spec('takeoff_height', 2.5,
-         'height the takeoff service climbs by', Range(0.5, 30.0, 'm'), live=True),
+         'climb of the takeoff service', Range(0.5, 30.0, 'm'), live=True),
     Spec('velocity_source', 'auto',
          'velocity for v_max and braking; auto: odom once received', VELOCITY_SOURCES),
     Spec('blind_action', 'land',
-         'what follows after 2 s without any velocity, when the stream stops: a landing is '
-         'requested; or silence only, on which PX4 fails over and ArduPilot stays in GUIDED',
+         'action after 2 s without any velocity, when the stream stops: land requests a landing; '
+         'silence requests nothing: PX4 starts its failsafe, ArduPilot stays in GUIDED',
          BLIND_ACTIONS),
     Spec('wind_compensation', 'auto',
-         'offset the steady acceleration by the wind, up to 1 m/s^2; auto: for PX4, which does '
-         'not do so itself', WIND_COMPENSATIONS),
+         'offset the steady acceleration of the wind, up to 1 m/s^2; auto: only for PX4, which '
+         'has no such correction', WIND_COMPENSATIONS),
     *specs_of(GateLimits()),
     *specs_of(EndParams()),
     *specs_of(SourceParams(), 'odom_'),

@@ -166,9 +166,9 @@ class FilterParams(Checked):
 
     acceleration: float = parameter(
         0.5, Range(0.01, 100.0, 'm/s^2'),
-        'how much a neighbour accelerates, standard deviation per axis', live=False)
+        "standard deviation of a neighbour's acceleration per axis", live=False)
     acceleration_time: float = parameter(
-        1.0, Range(0.01, 100.0, 's'), 'in which time its acceleration changes', live=False)
+        1.0, Range(0.01, 100.0, 's'), "correlation time of a neighbour's acceleration", live=False)
     angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
     odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
     initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
@@ -177,7 +177,8 @@ class FilterParams(Checked):
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
-        'a track begins anew only where a neighbour at this speed can be, as the planner has it',
+        "a track restarts only at a place that a neighbour at this speed can reach; the planner's "
+        'leader_speed_max must be the same',
         live=False)
 
 

@@ -135,14 +135,13 @@ _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where l
 @dataclass(frozen=True, eq=False)
 class CellCode:
     """
-    What a marker's cells should show.
+    The code of a marker: the colours of its cells.
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
-    rows. ``bits`` (b,): +1 white, -1 black;
-    ``errors`` of them may be misread.
-    ``others`` (w, b): every other word of the dictionary, and each in its turns. ``windows``:
-    which cells are compared where light is uneven.
+    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors``
+    of them may be misread. ``others`` (w, b): all other codewords of the dictionary, in all
+    rotations. ``windows``: cells that are compared with one another under uneven light.
     """
 
     centers: Array

@@ -116,7 +116,7 @@ class RangingParams(Checked):
 
     tag_position: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0), Range(-5.0, 5.0, 'm'),
-        'place of the own antenna, which ranges are measured from, on the body, FLU', live=False)
+        'place of the own antenna, from which ranges are measured, on the body, FLU', live=False)
     range_noise: float = parameter(
         0.1, Range(0.001, 10.0, 'm'),
         'standard deviation of ranges without a variance', live=False)

@@ -30,9 +30,9 @@ HOLD     all are older than that, the neighbour is         brake to a hover; loo
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
 let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD the vehicle
-moves a little out of the way of the lost neighbor. In SEARCH and HOLD it follows again by itself
-until ``resume_timeout``. After that the state stays, and the planner sends no command until it is
-engaged again.
+moves a little out of the way of the lost neighbor. In SEARCH and HOLD the planner
+follows again by itself until ``resume_timeout``. After that the state stays, and the planner sends
+no command until it is engaged again.
 
 ``mavlink_bridge/state`` reports whether the vehicle flies the planner's commands.
 

@@ -90,7 +90,7 @@ class Altitude(NamedTuple):
 
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return it after following a neighbour, at the own time, for some time, s."""
+        """Return the altitude after ``elapsed`` s of following a neighbour."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
         goal = float(leader.position[2]) + params.altitude_offset
@@ -118,9 +118,9 @@ class Altitude(NamedTuple):
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
-        Return it after meeting followers at one altitude, at the own time, for some time, s.
+        Return the altitude after ``elapsed`` s of meeting other followers at one altitude.
 
-        They follow this vehicle, too. If it took their mean at once, it would follow its own
+        The others follow this vehicle, too. If it took their mean at once, it would follow its own
         motion, and all would drift together. With this slow rate and half of their climb, the
         loop gain is below 1 at every frequency, for every neighbor graph.
         """
@@ -137,7 +137,7 @@ class Altitude(NamedTuple):
                    least: float = -math.inf, most: float = math.inf,
                    coming: float = 0.0) -> tuple[Altitude, float]:
         """
-        Return it, and the vertical acceleration, m/s^2, for the next period.
+        Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
         :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
             lowest and the highest altitude go before.
