@@ -282,16 +282,17 @@ def from_acceleration(message: Any) -> AccelerationState:
 
 
 def with_acceleration(state: OdometryState, acceleration: AccelerationState) -> OdometryState:
-    """Return a neighbour's state with the acceleration that a message gave in its own frame."""
+    """Return a neighbour's state with an acceleration given in the neighbour's frame."""
     return state._replace(
         acceleration=quaternion_to_matrix(state.quaternion) @ acceleration.vector)
 
 
 class Command(NamedTuple):
     """
-    What the planner wants flown: one name from its tick to the setpoint gate.
+    A command of the planner, from its tick to the setpoint gate.
 
-    ``stamp``, ns, is that of what the command rests on, 0 for none; it applies ``ahead`` ns later.
+    ``stamp``, ns, is that of the estimate that the command is based on, 0 without one; the command
+    applies ``ahead`` ns later.
     """
 
     acceleration: ArrayLike

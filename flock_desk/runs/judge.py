@@ -61,7 +61,7 @@ class FigureBound(NamedTuple):
     most: float | None = None
 
     def __str__(self) -> str:
-        """Return it as '≥ 9.9, ≤ 10.1'."""
+        """Return the bounds as text, such as '≥ 9.9, ≤ 10.1'."""
         return ', '.join(f'{sign} {value:g}' for sign, value in (
             ('≥', self.least), ('≤', self.most)) if value is not None)
 

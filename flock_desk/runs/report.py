@@ -189,8 +189,8 @@ def report(folder: Path, title: str, introduction: str, summary: Mapping[str, An
     """
     Judge a summary, write summary.json and report.html to a folder, and return the judgements.
 
-    :param draw: returns the chapters, and imports matplotlib for it.
-    :param warnings: to be read first.
+    :param draw: returns the chapters; imports matplotlib.
+    :param warnings: shown at the top of the report.
     :param parts: summaries of the parts, which are judged and written, too, but not shown.
     :raises OSError: if a file cannot be written.
     """
@@ -210,7 +210,7 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
     Write the page; without matplotlib it has no pictures, and says so.
 
     :param draw: the chapters, or what returns them, and imports matplotlib for it.
-    :param warnings: to be read first.
+    :param warnings: shown at the top of the report.
     :raises OSError: if it cannot be written.
     """
     try:

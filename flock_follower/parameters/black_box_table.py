@@ -35,8 +35,8 @@ SPECS = [
          'largest size of all recordings in the folder; beyond it the oldest files are deleted',
          Range(10.0, 1e8, 'MB')),
     Spec('disk_free', 1000.0,
-         'space kept free on the disk: with less free space the oldest files are deleted; if none '
-         'is left to delete, recording stops', Range(10.0, 1e8, 'MB')),
+         'space kept free on the disk: with less, the oldest files are deleted; if that is not '
+         'enough, recording stops', Range(10.0, 1e8, 'MB')),
     *CAMERA_SPECS,
 ]
 

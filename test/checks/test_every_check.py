@@ -239,7 +239,7 @@ FAULTS: list[Fault] = [
           '[-1.5708, 0.0, -1.5708] in planner', '/**',
           parameter('planner', 'odom_child_rpy', [-1.5708, 0.0, -1.5708])),
     Fault('a recording cut short', BAG, WARNING, 'bag', 'incomplete: the disk is full',
-          'record anew',
+          'record again',
           change(incomplete='the disk is full')),
 ]
 

@@ -299,7 +299,7 @@ class BridgeReport:
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
                    if newest is None or now - newest.time > SILENCE]
         if missing:
-            return f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+            return f'the autopilot sends no {" and no ".join(missing)}: is its estimator ready?'
         distrusted = self._bridge.distrusted(now)
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
