@@ -70,6 +70,8 @@ PARAMETERS = {
     'visualizer': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
+#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
+END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 NUMBERS = ('a_max', 'v_max')
 WHOLE = ('target_system', 'disk_used')
 #: By which argument a node is started or not.
@@ -107,9 +109,10 @@ def start(context: LaunchContext) -> list[Node]:
         files = [] if node in BY_CHOICE else [f'{values["config"]}/follower.yaml']
         if values['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
             files.append(values['cameras'])
+        prefix = values['bridge_prefix'] if node == 'mavlink_bridge' else ''
         started.append(Node(
-            package='flock_follower', executable=node, output='screen',
-            prefix=(values['bridge_prefix'] or None) if node == 'mavlink_bridge' else None,
+            package='flock_follower', executable=node, exec_name=node, output='screen',
+            prefix=f'{END_WITH_LAUNCH} {prefix}',
             respawn=yes(values, 'respawn'), respawn_delay=1.0,
             namespace=values['namespace'], parameters=[*files, parameters],
             remappings=[('image_raw', values['image']),

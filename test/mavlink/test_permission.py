@@ -94,8 +94,10 @@ def test_a_landing_ends_the_permission(events):
 
 def test_a_takeover_bars_offboard_for_ten_seconds():
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
-    assert permission.taken_over(5.0).startswith('the pilot took over 0 s ago')
-    assert permission.taken_over(14.9) and not permission.taken_over(15.0)
+    for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
+        assert permission.taken_over(now).startswith(f'the pilot took over {seconds} s ago')
+    assert permission.taken_over(14.9)
+    assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
 
@@ -114,6 +116,22 @@ def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
     permission = after(ASKED, seen(PILOT), OffboardFailed('offboard refused: denied'))
     assert permission.announced() == 'INACTIVE: offboard refused: denied'
     assert next_permission(permission, seen(OURS)) is permission
+
+
+@pytest.mark.parametrize('received', [0.5, 1.0])
+def test_a_heartbeat_from_before_the_request_shows_nothing(received):
+    assert next_permission(after(ASKED), seen(OURS, received)) == after(ASKED)
+
+
+def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
+    for obeying in (after(ASKED, seen(OURS)), after(ASKED, seen(OURS, airborne=None))):
+        assert next_permission(obeying, OffboardFailed('late')) is obeying
+        assert next_permission(obeying, ENDED).phase is Phase.GIVING_BACK
+        # The vehicle was not asked at all: nothing that streams may go on.
+        assert next_permission(obeying, OffboardFailed('blind', asked=False)).announced() == (
+            'INACTIVE: blind')
+    before = Permission()
+    assert next_permission(before, OffboardFailed('blind', asked=False)) is before
 
 
 @pytest.mark.parametrize('airborne', [False, True, None])  # a false report removes no thrust
