@@ -80,7 +80,7 @@ Look = Callable[[GrayImage], Transform | None]  # returns T_camera_marker
 
 
 class Bounds(NamedTuple):
-    """What a flight must reach; infinite where it need not."""
+    """What a flight must reach; infinite if it need not."""
 
     ratio: float
     """CPU time of default over ours, at least."""
@@ -110,7 +110,7 @@ BACK = camera_mounting([-0.10, 0.0, 0.0], [0.0, 0.0, np.pi])
 
 
 class Figures(NamedTuple):
-    """What one method reached on one flight; NaN where it has no such thing."""
+    """What one method reached on one flight; NaN if it has no such thing."""
 
     cpu_ms_mean: float
     cpu_ms_p50: float

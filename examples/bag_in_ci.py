@@ -16,7 +16,7 @@
 Judge a bag in your own CI by what ``evaluate`` wrote of it; bag_in_ci.yaml is the workflow.
 
     python -m flock_desk.evaluate BAG --output OUT
-    python examples/bag_in_ci.py OUT/summary.json      # exit code 1 where a bound is broken
+    python examples/bag_in_ci.py OUT/summary.json      # exit code 1 if a bound is broken
 
 Bounds on single figures need no Python: ``evaluate --expect bounds.yaml``. Here are also figures
 made of several, and this needs nothing but Python.

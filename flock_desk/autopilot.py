@@ -83,7 +83,7 @@ def loopback_address(text: str) -> tuple[str, int]:
     """
     Return the address of 'HOST:PORT'.
 
-    :raises ValueError: where it is malformed, or not loopback.
+    :raises ValueError: if it is malformed, or not loopback.
     """
     host, _, port = text.rpartition(':')
     if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
@@ -113,7 +113,7 @@ class Endpoint:
 
     :param address: where the bridge listens.
     :param autopilot: the autopilot, or another link of it.
-    :raises OSError: where the socket cannot be made.
+    :raises OSError: if the socket cannot be made.
     """
 
     def __init__(self, address: tuple[str, int], autopilot: Stepped) -> None:

@@ -21,7 +21,7 @@ of ``flock_desk.runs.recorded_flight``. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
   them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
-  (acceleration, yaw and yaw rate in the axes of odom; NaN where it gives none);
+  (acceleration, yaw and yaw rate in the axes of odom; NaN if it gives none);
 - ``summary.json``: the figures; null if the bag lacks the data, as errors without truth. Two runs
   differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
 - ``report.html``: the figures and pictures of the flight in one file.

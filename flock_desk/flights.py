@@ -160,7 +160,7 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
     """
     Return the scenarios of given names and files, in their order; 'all' is all of the package.
 
-    :raises ScenarioError: where one is unknown, wrong, or of the same name as another.
+    :raises ScenarioError: if one is unknown, wrong, or of the same name as another.
     """
     scenarios: dict[str, Scenario] = {}
     for name in dict.fromkeys(names() if 'all' in wanted else wanted):

@@ -114,7 +114,7 @@ class Simulator(FlockNode):
     Steps a flight in real time, and publishes the output of the sensors.
 
     :raises ValueError: a bad parameter, a scenario that cannot be flown, or no external vehicle.
-    :raises OSError: where the socket cannot be made.
+    :raises OSError: if the socket cannot be made.
     """
 
     def __init__(self) -> None:

@@ -93,7 +93,7 @@ class SimulatorOutputs:
 
     @property
     def next_image(self) -> float:
-        """Return when an image is due, s since the start; infinity where none is."""
+        """Return when an image is due, s since the start; infinity without one."""
         return self._pending[0][1].due_ns * 1e-9 if self._pending else math.inf
 
     def send_images(self, now: float, start: float) -> None:

@@ -187,7 +187,7 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
     that put the linear velocity in the header's frame.
 
-    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``, or
+    :raises ValueError: if position, attitude or velocity is not finite, or beyond ``SANE``, or
         the stamp is none.
     """
     pose, twist = message.pose.pose, message.twist.twist
@@ -270,7 +270,7 @@ def from_acceleration(message: Any) -> AccelerationState:
     """
     Return what an AccelWithCovarianceStamped of a neighbour says.
 
-    :raises ValueError: where the acceleration is not finite, or beyond ``SANE``.
+    :raises ValueError: if the acceleration is not finite, or beyond ``SANE``.
     """
     linear = message.accel.accel.linear
     vector = np.array([linear.x, linear.y, linear.z], dtype=float)
@@ -303,7 +303,7 @@ class Command(NamedTuple):
     """rad/s, anticlockwise."""
     separation_axis: Array | None = None
     """Unit vector (3,) away from a neighbour that would come too near: the part of the
-    acceleration along it is cut last. None where nobody does."""
+    acceleration along it is cut last. None if nobody does."""
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
@@ -357,7 +357,7 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     """
     Return the command of a MultiDOFJointTrajectory's first point.
 
-    :raises ValueError: where its frame is another than ``odom_frame``, or something is missing.
+    :raises ValueError: if its frame is another than ``odom_frame``, or something is missing.
     """
     frame = message.header.frame_id
     if frame not in ('', odom_frame):

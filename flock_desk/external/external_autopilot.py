@@ -70,7 +70,7 @@ class ExternalAutopilot:
     Collects the messages of one autopilot, and keeps ``motion`` up to date with them.
 
     :param url: see ``mavlink.transport``; :param parameter: that gave it, for errors.
-    :raises ValueError: where the URL is not one. :raises OSError: where it cannot be opened.
+    :raises ValueError: if the URL is not one. :raises OSError: if it cannot be opened.
     """
 
     def __init__(self, url: str, target_system: int = 1,
@@ -107,7 +107,7 @@ class ExternalAutopilot:
 
         :param why_truth: why an estimate will not do; '': it will.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: where nothing comes within ``timeout`` s, or no truth where it has to.
+        :raises ValueError: if nothing comes within ``timeout`` s, or no truth where it has to.
         """
         deadline = time.monotonic() + timeout
         while wanted():

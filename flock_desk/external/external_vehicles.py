@@ -122,7 +122,7 @@ class ExternalVehicles:
         return '; '.join(problems)
 
     def slow(self, now: float) -> str:
-        """Return, for people, whose simulator is too slow; '' where none is."""
+        """Return, for people, whose simulator is too slow; '' if none is."""
         paces = ((name, link.motion.pace(now - PACE_WINDOW)) for name, link in self._links)
         return '; '.join(
             f'the time of the autopilot of the {name} goes at {pace:.2f} of ours: its simulator '

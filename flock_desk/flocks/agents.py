@@ -114,7 +114,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
-    :raises RuntimeError: where no finite solution goes on.
+    :raises RuntimeError: if no finite solution goes on.
     """
     params = FlockingParams() if params is None else params
     _check_names(model, neighbors, coupling, integrator)
@@ -180,7 +180,7 @@ class _Flock:
                                          self.near(before))
 
     def near(self, x: Array) -> flock_graph.Pairs:
-        """Return the pairs with r^2 < d1, or all where they are few; asked for twice a step."""
+        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
         if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
             self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
                           else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))

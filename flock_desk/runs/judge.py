@@ -79,7 +79,7 @@ def load_bounds(path: str | Path) -> list[FigureBound]:
     Read a file of bounds.
 
     :raises ValueError: naming the file, the key and its fault.
-    :raises OSError: where the file cannot be read.
+    :raises OSError: if the file cannot be read.
     """
     try:
         return parse_bounds(yaml.safe_load(Path(path).read_text(encoding='utf-8')))

@@ -349,7 +349,7 @@ def distance(flight: LiveRecord) -> Figure:
 
 
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
-    """Return the columns drawn; NaN where images are missing, and so no line."""
+    """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column
             for who, places in (('leader', flight.leader), ('follower', flight.follower))
             for name, column in zip('xy', places.T)}

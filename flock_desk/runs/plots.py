@@ -288,7 +288,7 @@ def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> byt
 
 
 def with_gaps(table: Table) -> Mapping[str, Array]:
-    """Return a table with a row of NaN where images are missing, and so no line."""
+    """Return a table with a row of NaN if images are missing, and so no line."""
     breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
     return {name: np.insert(column, breaks, np.nan) for name, column in table.items()}
 

@@ -225,8 +225,8 @@ class Processes:
         """
         Wait until a child has printed a text.
 
-        :raises TimeoutError: where it does not within ``timeout`` seconds.
-        :raises RuntimeError: where the child ends before.
+        :raises TimeoutError: if it does not within ``timeout`` seconds.
+        :raises RuntimeError: if the child ends before.
         """
         def printed() -> bool:
             if text in self.log(name):
@@ -248,7 +248,7 @@ class Processes:
 
         :param given_up: returns why to stop asking, '' to go on.
         :param value: ``('false',)``, or ``()`` for a Trigger.
-        :raises RuntimeError: where it has not succeeded after ``timeout`` seconds; says why.
+        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds; says why.
         """
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout
@@ -268,7 +268,7 @@ class Processes:
                 raise RuntimeError(answer.removeprefix('error: '))
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
-        """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""
+        """Send SIGINT, wait, and return the exit code; None if SIGKILL was needed."""
         child = self.children.pop(name)
         if child.poll() is None:
             child.send_signal(signal.SIGINT)

@@ -66,8 +66,8 @@ class RecordedFlight:
     :param listener: receives the events of the flight.
     :param make: returns an empty message of a type.
     :param cpu_time: see ``Follower``.
-    :raises ValueError: where values do not fit together, or the neighbours file is wrong.
-    :raises OSError: where the neighbours file cannot be read.
+    :raises ValueError: if values do not fit together, or the neighbours file is wrong.
+    :raises OSError: if the neighbours file cannot be read.
     """
 
     def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,

@@ -378,7 +378,7 @@ def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """
     Write a summary as JSON.
 
-    :raises OSError: where it cannot be written.
+    :raises OSError: if it cannot be written.
     """
     with whole_file(path) as file:
         file.write((json.dumps(summary, indent=2, ensure_ascii=False) + '\n').encode())

@@ -78,7 +78,7 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+    :raises ScenarioError: also if it has operations or a flock, which flights in lock step
         alone know.
     """
     scenario = load(name)
@@ -114,7 +114,7 @@ def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
     Return a scenario with some keys of its flock changed, to those of a YAML mapping.
 
     :param path: what to call it in an error.
-    :raises ScenarioError: also where the scenario has no flock.
+    :raises ScenarioError: also if the scenario has no flock.
     """
     if scenario.flock is None:
         raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')

@@ -137,7 +137,7 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> LeaderAnd
     Fly leader and follower for a duration, s; the seed moves the buffeting of their attitudes.
 
     :param swing: the distance that the follower keeps, instead of obeying the flocking law.
-    :raises ValueError: where the duration is not in [0.1, 600] s.
+    :raises ValueError: if the duration is not in [0.1, 600] s.
     """
     Range(0.1, 600.0, 's').check('duration', duration)
     count = round(duration / STEP) + 1

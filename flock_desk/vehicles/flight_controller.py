@@ -48,7 +48,7 @@ ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 
 
 class TrackedSetpoint(NamedTuple):
-    """A setpoint, ENU; NaN where an axis is not given."""
+    """A setpoint, ENU; NaN if an axis is not given."""
 
     position: Array = _NOWHERE
     velocity: Array = _NOWHERE

@@ -107,7 +107,7 @@ class McapFile:
         """
         Write messages as one chunk, in the order of their stamps.
 
-        :raises OSError: where that fails; the file ends where it did before, and only ``close``
+        :raises OSError: if that fails; the file ends where it did before, and only ``close``
             makes sense after it.
         :raises KeyError: for a type that ROS 2 Jazzy does not have.
         """
@@ -140,7 +140,7 @@ class McapFile:
         """
         Write the summary and close the file.
 
-        :raises OSError: where the summary cannot be written; the file is closed all the same.
+        :raises OSError: if the summary cannot be written; the file is closed all the same.
         """
         try:
             self._append(self._end())

@@ -120,7 +120,7 @@ class FlightRecording:
         """
         Write messages and have them on the disk.
 
-        :raises OSError: where that fails; nothing of the messages is kept then, the file is
+        :raises OSError: if that fails; nothing of the messages is kept then, the file is
             closed, and the next ones go into a new one.
         """
         if not messages:
@@ -155,7 +155,7 @@ class FlightRecording:
         """
         Finish the recording under way.
 
-        :raises OSError: where that fails; it can be read all the same.
+        :raises OSError: if that fails; it can be read all the same.
         """
         try:
             self._end()

@@ -118,7 +118,7 @@ class Location(NamedTuple):
     """Where the vehicle is in its envelope."""
 
     height: float | None = None
-    """m; None where it is not known: then nothing bounds it."""
+    """m; None if it is not known: then nothing bounds it."""
     climb_rate: float = 0.0
     """m/s, by the source of the height."""
     offset: Array | None = None

@@ -62,7 +62,7 @@ class GpsFix(NamedTuple):
 
     fixed: bool
     lost: float
-    """When it ceased to, s; minus infinity where it never did."""
+    """When it ceased to, s; minus infinity if it never did."""
     accuracy: float = 0.0
     """Standard deviation of its horizontal position, m; 0 if it is not reported."""
 
@@ -84,7 +84,7 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
     missing = tuple(name for flag, name in _NEEDED.items() if not flags & flag)
     if message.get_type() == 'ESTIMATOR_STATUS':
         return EstimatorStatus(now, flags & _PX4 == _PX4, missing)
-    # It integrates nothing at all where it takes its position for constant.
+    # It integrates nothing at all if it takes its position for constant.
     return EstimatorStatus(now, flags & _ARDUPILOT == _ARDUPILOT
                            and not flags & mavlink.EKF_CONST_POS_MODE, missing)
 
@@ -176,7 +176,7 @@ class Arrivals:
         return sum(now - window < time for time in times)
 
     def rate(self, message_id: int, now: float) -> float:
-        """Return how often a message comes, Hz; 0 where the last is half of RECENT ago."""
+        """Return how often a message comes, Hz; 0 if the last is half of RECENT ago."""
         times = [time for time in self._times.get(message_id, deque()).copy()
                  if now - time < RECENT]
         if len(times) < 2 or now - times[-1] > 0.5 * RECENT:

@@ -224,7 +224,7 @@ class Gate:
         self._sources[source].take_yaw(yaw, time)
 
     def yaw_difference(self, now: float) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
         return self._known(now).yaw_difference(self.limits)
 
     def contradiction(self, now: float) -> str:

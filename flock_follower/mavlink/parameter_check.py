@@ -40,7 +40,7 @@ RETRY_PERIOD: Final[float] = 1.0
 ATTEMPTS: Final[int] = 3
 #: Questions under way at a time: slow links have other things to carry.
 AT_ONCE: Final[int] = 2
-#: Entries after this comment matter only where odometry is forwarded.
+#: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: How the comment of an entry begins of which any other value but 0 will do.
 ANY_BUT_ZERO: Final[str] = 'Any but 0'
@@ -201,7 +201,7 @@ class Rule(NamedTuple):
     advice: str
     """What follows NAME = VALUE: why, and what to set."""
     forwarding: bool = False
-    """Whether it matters only where odometry is forwarded."""
+    """Whether it matters only if odometry is forwarded."""
 
 
 _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if the bridge died; '

@@ -139,7 +139,7 @@ class DisturbanceObserver:
         Take what has happened since the last step, until ``now``, s.
 
         :param sent: acceleration (3,), m/s^2, that was flown; None: none of ours, which forgets.
-        :param velocity: measured (3,), m/s; None where none is known, which waits.
+        :param velocity: measured (3,), m/s; None without one, which waits.
         """
         elapsed, self._time = now - self._time, now
         if sent is None:
@@ -186,7 +186,7 @@ class Setpoint(NamedTuple):
     acceleration: Array
     """(3,), m/s^2."""
     yaw: float | None
-    """rad; None where none is known."""
+    """rad; None without one."""
     limited: str
     """What limited it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
 

@@ -87,7 +87,7 @@ class SetpointThread:
         Callable from any thread, and never waits. What the action raises goes to ``on_error``.
 
         :param refuse: called instead of the action if the thread ends before its turn.
-        :return: False where it will not be run: too many wait, or the thread has ended.
+        :return: False if it will not be run: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False

@@ -101,7 +101,7 @@ class Attitude(NamedTuple):
 
 
 class Battery(NamedTuple):
-    """BATTERY_STATUS or SYS_STATUS; NaN where unknown."""
+    """BATTERY_STATUS or SYS_STATUS; NaN if unknown."""
 
     time: float
     voltage: float
@@ -113,7 +113,7 @@ class Battery(NamedTuple):
     temperature: float
     """Degrees Celsius"""
     cell_voltages: tuple[float, ...]
-    """V, empty where the autopilot knows only the total."""
+    """V, empty if the autopilot knows only the total."""
 
 
 class Telemetry:
@@ -235,7 +235,7 @@ class Telemetry:
         return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
 
     def altitude(self, now: float) -> float | None:
-        """Return the height above the origin of the local frame, m; None where not fresh."""
+        """Return the height above the origin of the local frame, m; None if not fresh."""
         known = self.local_position
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
@@ -354,12 +354,12 @@ class AutopilotEstimate(NamedTuple):
 
 def estimate(position: LocalPosition, attitude: Attitude, age: float) -> AutopilotEstimate | None:
     """
-    Return the odometry at the time of a position, None where no attitude belongs to it.
+    Return the odometry at the time of a position, None if no attitude belongs to it.
 
     The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
     turned on by its rates to the time of the position, where the autopilot has stamped both.
 
-    :param age: of the position when it came, s; 0 where it is not known.
+    :param age: of the position when it came, s; 0 if it is not known.
     """
     if abs(position.time - attitude.time) > ATTITUDE_TIMEOUT:
         return None

@@ -41,12 +41,12 @@ from flock_follower.ranges import Range
 
 #: Time between two attempts to reopen a lost port, s.
 RETRY_PERIOD: Final[float] = 0.5
-#: A line is congested where what waits to be sent takes longer than this, s.
+#: A line is congested if what waits to be sent takes longer than this, s.
 LONGEST_BACKLOG: Final[float] = 0.02
 #: A TCP connection without traffic for this long, ms, is closed; size of its buffer, bytes.
 LONGEST_TCP_DELAY: Final[int] = 1000
 TCP_BUFFER: Final[int] = 16384
-#: It is congested where more than this is not acknowledged, bytes.
+#: It is congested if more than this is not acknowledged, bytes.
 TCP_BACKLOG: Final[int] = 1000
 #: Bytes read at once.
 MOST_READ: Final[int] = 2048
@@ -350,8 +350,8 @@ def open_transport(url: str) -> Transport:
 
     A serial device that is not there, and a TCP port where nobody listens, are waited for.
 
-    :raises ValueError: where the URL is not one of the known forms.
-    :raises OSError: where a UDP port cannot be opened; the message names the URL.
+    :raises ValueError: if the URL is not one of the known forms.
+    :raises OSError: if a UDP port cannot be opened; the message names the URL.
     """
     network = re.fullmatch(r'(udpin|udpout|tcp):([^:\s]+):(\d{1,5})', url)
     if network:

@@ -65,7 +65,7 @@ class Velocity(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What one source says of the vehicle's motion; an age is infinite where it never said."""
+    """What one source says of the vehicle's motion; an age is infinite if it never said."""
 
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     """(3,), m/s."""
@@ -77,7 +77,7 @@ class Motion(NamedTuple):
     """s."""
 
     def fresh_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity; None where it is not fresh, or not three finite numbers."""
+        """Return the velocity; None if it is not fresh, or not three finite numbers."""
         if not fresh(self.velocity_age, limits.odom_timeout):
             return None
         vector = finite_vector(self.velocity)
@@ -85,7 +85,7 @@ class Motion(NamedTuple):
         return None if vector is None else Velocity(vector, margin)
 
     def fresh_yaw(self, limits: GateLimits) -> float | None:
-        """Return the yaw, rad; None where it is not fresh, or not finite."""
+        """Return the yaw, rad; None if it is not fresh, or not finite."""
         usable = fresh(self.yaw_age, limits.odom_timeout) and math.isfinite(self.yaw)
         return self.yaw if usable else None
 
@@ -146,7 +146,7 @@ class KnownMotion:
         return turned is not None and abs(turned) > limits.yaw_disagreement
 
     def yaw_difference(self, limits: GateLimits) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
         mine, own = self.odom.fresh_yaw(limits), self.autopilot.fresh_yaw(limits)
         return None if mine is None or own is None else wrap_angle(mine - own)
 
@@ -174,7 +174,7 @@ def refusal(age: float, timeout: float) -> str:
 
 
 def finite_vector(value: ArrayLike) -> Array | None:
-    """Return a copy as an array (3,), None where it is not three finite numbers."""
+    """Return a copy as an array (3,), None if it is not three finite numbers."""
     try:
         vector = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -206,7 +206,7 @@ class VelocityComparison:
         """
         Take what one is faster than the other at ``now``, s, as a vector (3,), m/s.
 
-        :param difference: None where one of them is not fresh.
+        :param difference: None if one of them is not fresh.
         :param tolerance: largest average difference, m/s.
         :param flying: whether the vehicle flies by them; else nothing is remembered.
         """
@@ -230,7 +230,7 @@ class VelocityComparison:
         return float(np.linalg.norm(self._average))
 
     def disagreeing_for(self, now: float) -> float:
-        """Return how long ago they began to disagree, s; minus infinity where they agree."""
+        """Return how long ago they began to disagree, s; minus infinity if they agree."""
         return now - self._since
 
 

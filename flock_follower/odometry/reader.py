@@ -84,7 +84,7 @@ class UpAxis:
 
     @property
     def axis(self) -> str:
-        """Return the axis that points up, 'x', '-x', 'y', ..., or '' where none does."""
+        """Return the axis that points up, 'x', '-x', 'y', ..., or '' if none does."""
         k = max(range(3), key=lambda axis: abs(self._up[axis]))
         upward = self._up[k]
         return '' if abs(upward) < UPWARD else ('-' if upward < 0.0 else '') + 'xyz'[k]

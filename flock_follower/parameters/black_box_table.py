@@ -45,7 +45,7 @@ def build(values: dict[str, Any]) -> dict[str, Any]:
     """
     Return the values.
 
-    :raises ValueError: where two cameras cannot be two.
+    :raises ValueError: if two cameras cannot be two.
     """
     cameras(values)
     return values

@@ -105,7 +105,7 @@ def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict
     """
     Return one of several cameras, or the first, and the values as if it were the only one.
 
-    :raises ValueError: where none of them has that name.
+    :raises ValueError: if none of them has that name.
     """
     configured = cameras(values)
     found = next((camera for camera in configured if name in ('', camera.name)), None)

@@ -88,7 +88,7 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     """
     Return latitude and longitude, deg, and height, m, or None for zeros.
 
-    :raises ValueError: where they are no place on Earth.
+    :raises ValueError: if they are no place on Earth.
     """
     if not any(values):
         return None

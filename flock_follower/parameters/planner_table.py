@@ -48,8 +48,8 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     Return the parameters of the core.
 
     :param name: of this vehicle; the neighbours' file may contain it, too.
-    :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
-    :raises OSError: where it cannot be read.
+    :raises ValueError: if they do not fit together, or the neighbours' file is wrong.
+    :raises OSError: if it cannot be read.
     """
     cameras(values)
     return filled(PlannerParams(), values, vehicles={

@@ -58,7 +58,7 @@ class CameraModel:
     The intrinsic calibration of one camera.
 
     :param matrix: K, shape (3, 3), px.
-    :param distortion: D; shorter is filled up with zeros where the model allows it (none at all,
+    :param distortion: D; shorter is filled up with zeros if the model allows it (none at all,
         or plumb_bob's first four), surplus zeros at the end are ignored.
     :param model: a key of ``DISTORTION_MODELS``; empty means plumb_bob.
     :param width: image width, px.
@@ -76,7 +76,7 @@ class CameraModel:
     #: K[:2, :2].T and K[:2, 2].
     _transposed: Array = field(init=False, repr=False)
     _middle: Array = field(init=False, repr=False)
-    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None where both are 0.
+    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None if both are 0.
     _aside: Array | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class CameraModel:
 
         :param x_offset: first column of the region, full-resolution px; y_offset likewise.
         :param width: width of the region before binning, px; height likewise.
-        :raises ValueError: where the region is not inside the image.
+        :raises ValueError: if the region is not inside the image.
         """
         if (x_offset < 0 or y_offset < 0 or min(binning_x, binning_y) < 1
                 or not 0 < width <= self.width - x_offset
@@ -166,7 +166,7 @@ class CameraModel:
         """
         Return the pixels (N, 2) of points (N, 3) in the optical frame, m.
 
-        NaN where a point is behind the camera or so far aside that the distortion folds back.
+        NaN if a point is behind the camera or so far aside that the distortion folds back.
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         return self.distort(self._normalized(p)[0])
@@ -175,7 +175,7 @@ class CameraModel:
         """
         Return the pixels (N, 2) of normalised coordinates (N, 2) = (X/Z, Y/Z).
 
-        NaN where the distortion folds back.
+        NaN if the distortion folds back.
         """
         squares = xy * xy
         r2 = squares[:, 0] + squares[:, 1]
@@ -228,7 +228,7 @@ class CameraModel:
         """
         Return the normalised coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
 
-        Newton's method on the exact distortion, to 1e-12; NaN where no point projects there.
+        Newton's method on the exact distortion, to 1e-12; NaN if no point projects there.
         """
         offset = np.asarray(pixels, dtype=float).reshape(-1, 2) - self.matrix[:2, 2]
         target = offset @ np.linalg.inv(self.matrix[:2, :2]).T
@@ -250,7 +250,7 @@ class CameraModel:
         return xy
 
     def _normalized(self, points: Array) -> tuple[Array, Array]:
-        """Return (X/Z, Y/Z) (N, 2), NaN where it is not projected, and depths (N, 1), m."""
+        """Return (X/Z, Y/Z) (N, 2), NaN if it is not projected, and depths (N, 1), m."""
         depth = points[:, 2:]
         if not depth.min(initial=1.0) > 1e-9:
             depth = np.where(depth > 1e-9, depth, np.nan)

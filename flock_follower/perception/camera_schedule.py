@@ -90,7 +90,7 @@ class View(NamedTuple):
         """
         Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
 
-        :param reference: the point (3,) on the body; :param estimate: its state, where known: else
+        :param reference: the point (3,) on the body; :param estimate: its state, if known: else
             it is taken to fly along.
         """
         to_camera = self.T_smooth_camera.rotation.T
@@ -290,7 +290,7 @@ class CameraSchedule:
 
 
 def _waited(searched: float | None, stamp: float) -> float:
-    """Return since when images were not searched, s; infinite where never."""
+    """Return since when images were not searched, s; infinite if never."""
     return math.inf if searched is None or stamp < searched else stamp - searched
 
 

@@ -86,7 +86,7 @@ class EdgeFit(NamedTuple):
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
     weights: Array
-    """(n,), 1/px^2: 0 where an edge was not found."""
+    """(n,), 1/px^2: 0 if an edge was not found."""
 
 
 def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -173,7 +173,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], smear: float) -> EdgeFit | None:
-    """Return the fit that ends with a step, None where that leaves a direction open."""
+    """Return the fit that ends with a step, None if that leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
     covariance = normal_covariance(last.information)
@@ -193,7 +193,7 @@ class _Step(NamedTuple):
     """
     A least-squares step (8,), the motion of the edges, (n,), px, and their residuals, px^2.
 
-    ``weights`` (n,): how much each edge counts, 0..1, 0 where it was not found; ``variance``
+    ``weights`` (n,): how much each edge counts, 0..1, 0 if it was not found; ``variance``
     (2,): of where an edge of either axis is, px^2. ``information`` (8, 8) of the step.
     """
 

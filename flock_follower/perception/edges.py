@@ -60,7 +60,7 @@ def normal_covariance(information: Array) -> Array | None:
     """
     Return the inverse (n, n), symmetric and positive definite, of a symmetric matrix (n, n).
 
-    None where that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
+    None if that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
     """
     solved, inverse = cv2.invert(information, flags=_CHOLESKY)
     # In units in which each unknown alone has variance 1, the trace of the inverse bounds the
@@ -160,7 +160,7 @@ def within_reason(pose: Transform) -> bool:
 
 def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:
     """
-    Return the edges as a pose, ``T_camera_body``, has them; None where the lens does not see all.
+    Return the edges as a pose, ``T_camera_body``, has them; None if the lens does not see all.
 
     All markers of the model must face the camera.
     """
@@ -224,7 +224,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
     """
     Return where brightness rises most steeply along each line's normal.
 
-    None where too few edges, or too faint ones, are there. ``spacing``, px, between samples
+    None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
     across edges of either axis.
     """
     model = lines.model
@@ -255,7 +255,7 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
     """
     Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
 
-    The image's edge repeats outside. None where hardly anything is inside. ``widest`` is the
+    The image's edge repeats outside. None if hardly anything is inside. ``widest`` is the
     longest step, px.
     """
     # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
@@ -320,7 +320,7 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
 
 
 def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
-    """Return the median variance of the known edges of either axis, px^2; 0 where none is."""
+    """Return the median variance of the known edges of either axis, px^2; 0 without one."""
     first, second = known
     return (median(variance[first]) if len(first) else 0.0,
             median(variance[second]) if len(second) else 0.0)

@@ -168,7 +168,7 @@ def draw_marker(dictionary: str, marker_id: int, side_px: int, border_bits: int 
 @lru_cache(maxsize=64)
 def marker_code(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     """
-    Return a marker's cells (n, n), the border included, first row on top, True where white.
+    Return a marker's cells (n, n), the border included, first row on top, True for white ones.
 
     :raises ValueError: for an unknown dictionary or id.
     """
@@ -178,7 +178,7 @@ def marker_code(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
 @lru_cache(maxsize=16)
 def dictionary_words(dictionary: str) -> NDArray[np.bool_]:
     """
-    Return the inner cells of all markers, (size, b, b), True where white.
+    Return the inner cells of all markers, (size, b, b), True for white ones.
 
     :raises ValueError: for an unknown dictionary.
     """
@@ -290,7 +290,7 @@ def load(path: str | Path) -> NeighborConfig:
     Read a neighbours file.
 
     :raises ValueError: naming the file, the key, its value and the valid range.
-    :raises OSError: where the file cannot be read.
+    :raises OSError: if the file cannot be read.
     """
     text = Path(path).read_text(encoding='utf-8')
     try:

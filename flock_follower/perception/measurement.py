@@ -171,7 +171,7 @@ SIGMA_OUTLINE = 0.8
 def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
                  starts: list[Transform], expected: PosePrior) -> Measurement | None:
     """
-    Return the neighbour ``name`` by four corners of its marker, or None where no pose suits them.
+    Return the neighbour ``name`` by four corners of its marker, or None if no pose suits them.
 
     :param corners: (4, 2), px, from top-left on, clockwise.
     :param starts: poses ``T_camera_body`` to start from, at least one.

@@ -130,7 +130,7 @@ _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
 _TURNING = np.r_[ATTITUDE, RATE]
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
 GATE = 16.27
-#: A measurement is refused where its chi^2 is so many times the gate's: 13 standard deviations.
+#: A measurement is refused if its chi^2 is so many times the gate's: 13 standard deviations.
 WILD = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
@@ -200,7 +200,7 @@ class NeighborFilter:
 
     def predict(self, stamp: float) -> Estimate | None:
         """
-        Return the state expected at a stamp, s, or None where no track reaches there.
+        Return the state expected at a stamp, s, or None if no track reaches there.
 
         The filter itself is not altered. A stamp before the newest measurement gives None.
         """
@@ -433,6 +433,6 @@ def _to_body(lever: Array) -> Array:
 
 
 def _distance(innovation: Array, spread: Array) -> float:
-    """Return the squared Mahalanobis distance; infinity where the spread (n, n) is singular."""
+    """Return the squared Mahalanobis distance; infinity if the spread (n, n) is singular."""
     solved, solution = cv2.solve(spread, innovation[:, None])
     return float(innovation.dot(solution[:, 0])) if solved else math.inf

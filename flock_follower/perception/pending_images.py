@@ -129,7 +129,7 @@ class Perceiver:
         """
         Take a CameraInfo; return whether it holds another calibration than the one before.
 
-        :raises ValueError: where it is unusable; no image is processed until a usable one comes.
+        :raises ValueError: if it is unusable; no image is processed until a usable one comes.
         """
         roi = message.roi
         window = (roi.x_offset, roi.y_offset, roi.width or message.width,
@@ -180,7 +180,7 @@ class Perceiver:
         return self._pending.pop(0) if len(self._pending) > most else None
 
     def due(self, now: float) -> PendingImage | None:
-        """Return the next image to process now, and forget it; None where it has to wait."""
+        """Return the next image to process now, and forget it; None if it has to wait."""
         for k, image in enumerate(self._pending):
             camera = self._cameras[image.camera]
             awaited = camera.model is None or self.tracker.missing(

@@ -54,7 +54,7 @@ SIGMA_FLOOR = 0.05
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
-#: A pose is accepted where more than this share of the edges agrees, to within this RMS, px.
+#: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
 MIN_INLIERS = 0.5
 MAX_RMS = 0.4
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
@@ -85,7 +85,7 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbour close to where it is expected, or None where its markers are not there.
+    Return a neighbour close to where it is expected, or None if its markers are not there.
 
     :param spacing: that of its last measurement.
     :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
@@ -135,7 +135,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
            expected: PosePrior) -> Measurement | None:
     """
-    Return a neighbour one of whose markers was detected, or None where no pose suits it.
+    Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.

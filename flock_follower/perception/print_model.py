@@ -59,7 +59,7 @@ class Windows(NamedTuple):
     Windows on the c cells of a marker.
 
     ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
-    than k; ``white`` and ``black`` (w, k) are 1 where a cell should have that colour, else 0, and
+    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that colour, else 0, and
     0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
     where it is in fewer than p.
     """
@@ -229,7 +229,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     Return by how many cells, to the right and down, a marker is off where it is expected.
 
     Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
-    None where nothing resembles it.
+    None if nothing resembles it.
     """
     pattern = np.concatenate([code.bits, -np.ones(code.border),
                               np.ones(len(pixels) - code.bits.size - code.border)])
@@ -366,7 +366,7 @@ def _edges(code: Any) -> list[_Edge]:
     """
     Return places and tangents in the marker's frame, room, and axis; lengths in cells.
 
-    ``code`` (c, c) is True where white, its first row on top.
+    ``code`` (c, c) is True for white cells, its first row on top.
     """
     cells = len(code)
     edges: list[_Edge] = []

@@ -181,7 +181,7 @@ class SmearFit(NamedTuple):
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
                 start: Transform) -> SmearFit | None:
     """
-    Return the pose of a marker near ``start``, ``T_camera_body``, or None where it is not there.
+    Return the pose of a marker near ``start``, ``T_camera_body``, or None if it is not there.
 
     ``start`` may be off by two cells and a half, and a little in all else.
     """
@@ -317,7 +317,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
-    """Return a fit, None where it does not show the marker's code."""
+    """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))

@@ -198,7 +198,7 @@ class Tracker:
         """
         Return the estimates of the neighbours from an image (H, W) uint8 of a stamp, s.
 
-        :raises ValueError: where the image is not of the camera's size, or not grey.
+        :raises ValueError: if the image is not of the camera's size, or not grey.
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')

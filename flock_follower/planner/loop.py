@@ -63,7 +63,7 @@ class PlannerLoop:
         """Fields of view of the cameras; () if unknown."""
         self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None
-        """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
+        """Height at which the vehicle was armed, in the frame of the odometry, m, if known."""
         self._require_bridge = require_bridge
         self.engaged = False
         """Whether commands are requested; set by :meth:`engage`."""

@@ -73,7 +73,7 @@ class Altitude(NamedTuple):
     thrust_bias: float = 0.0
     """The integral, m/s^2."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
+    """Vertical velocity of the neighbour that is followed, m/s; None without one."""
 
     @classmethod
     def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:

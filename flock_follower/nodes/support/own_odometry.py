@@ -37,7 +37,7 @@ class OwnOdometry:
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
     :param report: counts dropped messages, as (reason, detail).
-    :raises ValueError: where a parameter is out of range.
+    :raises ValueError: if a parameter is out of range.
     """
 
     def __init__(self, node: FlockNode, values: Mapping[str, Any],
