@@ -16,7 +16,7 @@
 An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
 
 ``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and connects to a bridge that
-listens there. It is for tests and demonstrations, and refuses any address but loopback.
+listens there. The program is for tests and demonstrations; it refuses any address but loopback.
 """
 
 from __future__ import annotations

@@ -195,10 +195,10 @@ def band_exits(flights: Flights) -> list[BandExit]:
 
 def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float, float]:
     """
-    Return the greatest of all handovers of a run, (k,) each.
+    Return the greatest values over all handovers of a run; the inputs are (k,) each.
 
-    They are the change of height in the first second, the vertical speed after it, and the change
-    of height until the vehicle flies setpoints no longer.
+    The values are the change of height in the first second, the vertical speed after it, and the
+    change of height until the vehicle no longer flies setpoints.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
     early = late = change = 0.0

@@ -15,8 +15,8 @@
 """
 The link on which an external autopilot reports the place of its vehicle.
 
-A thread of its own receives, since messages of ground truth carry no time: they count as of their
-arrival. It requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+A separate thread receives, since messages of ground truth have no time: their time is that of
+arrival. The link requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
 nothing else.
 """
 

@@ -15,8 +15,8 @@
 """
 The vehicles that external autopilots fly in one flight: the follower, perhaps its leader.
 
-Each has a link of its own. They share a frame, ENU from the follower's first reported place, since
-both truths are latitude, longitude and height.
+Each has its own link. Both vehicles share a frame, ENU from the follower's first reported place,
+since both truths are latitude, longitude and height.
 """
 
 from __future__ import annotations

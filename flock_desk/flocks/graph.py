@@ -114,7 +114,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     :param velocities: (k, n), m/s, in the same frame.
     :param coupling: 'flock' scales separation and cohesion with the L of the whole flock, as the
         paper does; 'pair' with each pair's own |v_i - v_j| / sqrt(2), which two agents can know
-        by themselves. The same for two agents; nothing is proven of it for more.
+        by themselves. Both are equal for two agents; for more, nothing is proven of 'pair'.
     :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
     :raises ValueError: for another coupling, another number of agents than the graph's, other
         shapes, or values not finite or beyond 1e100.

@@ -153,7 +153,7 @@ class Evaluation:
     incomplete: str = ''
     """Why the bag was never finished, '' if it was."""
     findings: list[Finding] = field(default_factory=list)
-    """Those of the rules of ``check`` in the bag; none if they were not applied."""
+    """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
     images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)

@@ -51,7 +51,7 @@ def claim_domain() -> int:
     """
     Return a ROS domain id that no other process of this package on this machine uses.
 
-    It is in 1 to 100, the range that is valid on every platform.
+    The id is in 1 to 100, the range that is valid on every platform.
 
     :raises RuntimeError: if all of them are in use.
     """
@@ -89,8 +89,8 @@ def free_udp_port() -> int:
     """
     Return a UDP port of the loopback interface that is free now.
 
-    It is above the ephemeral ports: otherwise another process, such as DDS, could receive the same
-    port before it is used.
+    The port is above the ephemeral ports: otherwise another process, such as DDS, could receive
+    the same port before it is used.
     """
     chance = random.SystemRandom()
     while True:

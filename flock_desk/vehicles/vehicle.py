@@ -15,8 +15,8 @@
 """
 A quadrotor that flies acceleration setpoints: thrust, tilt, gravity and the lags in between.
 
-Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It flies
-one vehicle, or as many as its arrays have rows, each for itself.
+Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It has
+one vehicle, or as many independent ones as its arrays have rows.
 """
 
 from __future__ import annotations

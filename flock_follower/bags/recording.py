@@ -70,11 +70,11 @@ class Limits:
 
 class FlightRecording:
     """
-    The recordings in a folder, and the one under way, which begins with the first message.
+    The recordings in a folder, and the current one, which begins with the first message.
 
-    Those that were broken off are finished. ``now`` is s of a monotonic clock throughout.
+    Interrupted recordings are completed. ``now`` is s of a monotonic clock throughout.
 
-    :param folder: for the recordings of one vehicle; made where it is not there.
+    :param folder: for the recordings of one vehicle; created if missing.
     :param clock: the time of day, s since 1970.
     :raises OSError: it cannot be read or made, or another process records there.
     """

@@ -65,7 +65,7 @@ def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]
     """
     Return the shift of the scene right and down, px of images of that width, and its quality.
 
-    It is the median over the parts of the image: the leader may fill one of them.
+    The shift is the median over the parts of the image: the leader may fill one of them.
     """
     if before.shape != after.shape:
         return 0.0, 0.0, 0.0

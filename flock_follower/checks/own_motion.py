@@ -136,7 +136,7 @@ def _twist(motion: OwnMotion) -> Finding:
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
         return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
-                       f'{DERIVED}; look at the source')
+                       f'{DERIVED}; check the velocity of the odometry source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:

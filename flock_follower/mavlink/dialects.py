@@ -81,9 +81,9 @@ class Dialect:
     setpoints_end_takeoff: bool
     """Whether a setpoint during a take-off ends it, and one on the ground has no effect."""
     stream_before_offboard: float
-    """Time for which setpoints must have been sent before it accepts offboard mode, s."""
+    """Time for which setpoints must be sent before the autopilot accepts offboard mode, s."""
     compensates_wind: bool
-    """Whether it controls the acceleration in a closed loop, so that wind does not move it."""
+    """Whether the autopilot controls accelerations in a closed loop, which rejects wind."""
     bytewise_parameters: bool
     """Whether PARAM_VALUE carries integers as their bytes, else as a float of their value."""
     odometry_frame: int

@@ -132,8 +132,8 @@ def approach_speed(distance: float, deceleration: float) -> float:
     """
     Return the largest speed, m/s, towards a bound from which the vehicle still stops before it.
 
-    It flies on for REACTION_TIME and then brakes; beyond the bound the speed is negative: it
-    returns.
+    The vehicle flies on for REACTION_TIME and then brakes. Beyond the bound the speed is
+    negative: the vehicle returns.
 
     :param distance: to the bound, m; negative beyond it.
     :param deceleration: m/s^2.

@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-The setpoint gate: whether a setpoint may be sent (``permission``), and which one.
+The setpoint gate decides whether a setpoint may be sent (``permission``), and which one.
 
-It stores the newest of each input with its time, and passes them to ``setpoint_rules.decide``.
+The gate stores the newest of each input with its time, and passes them to
+``setpoint_rules.decide``.
 Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a clock.
 """
 

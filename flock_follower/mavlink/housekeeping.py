@@ -90,11 +90,11 @@ class TimeSync:
 
     def age(self, time_boot_ms: int, now: int) -> float:
         """
-        Return how old, s, a message received now and stamped at ``time_boot_ms`` is at most.
+        Return the largest possible age, s, of a message received now and stamped ``time_boot_ms``.
 
         An answer is written after its question, so the autopilot's clock is ahead of ours by at
         most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
-        to the autopilot, as control loops through it do. It is 0 if nothing is known: without a
+        to the autopilot, as control loops through it do. The age is 0 if unknown: without a
         stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
         ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
         that is behind that clock by any time is as old as it says.

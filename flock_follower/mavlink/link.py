@@ -236,7 +236,7 @@ class Link:
     A link over a transport to the autopilot ``target_system``, ``target_component``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
-    :param autopilot: its firmware, see ``dialects.dialect_of``.
+    :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
     :param signing: if given, every message is signed and unsigned ones are dropped.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     """

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The thread that keeps the setpoints flowing: listens to the autopilot, and runs the cycles.
+The setpoint thread: receives the autopilot's messages, and runs the cycles of the bridge.
 
-It runs on the monotonic clock and waits for neither a ROS executor nor ``/clock``. When it hangs
-all the same, the HEARTBEATs it sends stop too, so that the autopilot notices.
+The thread uses the monotonic clock and waits for neither a ROS executor nor ``/clock``. If the
+thread blocks, its HEARTBEATs stop, too, so that the autopilot detects it.
 """
 
 from __future__ import annotations

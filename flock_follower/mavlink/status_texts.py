@@ -16,8 +16,8 @@
 Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
-refuses a mode. It reports its arming checks by EVENTs on every link: one for each check that
-fails, with the modes that it concerns, between two summaries; on a change, and on
+refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
+with the modes concerned, between two summaries. PX4 sends them after a change, and after
 MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
 here. Measured on 1.16.
 """

@@ -15,7 +15,7 @@
 """
 Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-It publishes nothing and sets nothing; it requests the parameters of our nodes.
+The observer publishes nothing and sets nothing; it requests the parameters of our nodes.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ REP-105 says the child frame. Some sources use the header's frame, others send n
 wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
 the displacement. The evidence for one reading adds up, window by window, if the readings differ
 (with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING`` windows in a row, at
-first or later, the velocity is dropped. It is used again once it agrees at speed in as many
-windows, or at rest in ``EXPIRES`` windows.
+first or later, the velocity is dropped. The velocity is used again once it agrees in as
+many windows in motion, or in ``EXPIRES`` windows at rest.
 
 Before the frame is found, REP-105's child frame is used while both readings are the same, and the
 likelier reading once the evidence favours one. Otherwise the velocity is derived from the

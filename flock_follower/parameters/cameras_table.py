@@ -103,7 +103,7 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
 
 def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
     """
-    Return one of several cameras, or the first, and the values as if it were the only one.
+    Return a camera by name, or the first one, and the values for a system of only this camera.
 
     :raises ValueError: if none of them has that name.
     """

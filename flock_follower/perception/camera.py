@@ -27,8 +27,9 @@ With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (
 - equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
   (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
 
-They are written out here, not taken from cv2, because its undistortion stops early, its accuracy
-option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians otherwise.
+The models are written out here, not taken from cv2, because its undistortion stops early, its
+accuracy option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians
+otherwise.
 """
 
 from __future__ import annotations

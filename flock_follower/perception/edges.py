@@ -19,7 +19,7 @@ Brightness profiles are taken across the known edges between black and white. Th
 profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
 between black and white, the peak hardly moves if blur dims a narrow cell.
 
-``solve_normal`` and ``normal_covariance`` serve every fit. They solve normal equations of least
+``solve_normal`` and ``normal_covariance`` serve every fit. Both solve normal equations of least
 squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
 answers equations that only rounding keeps from being singular, and their inverse is no covariance.
 

@@ -89,7 +89,7 @@ class Candidate:
         self.measured = 0
         """Measurements taken in."""
         self.alone = 0
-        """Those of them since the primary track was measured last."""
+        """Measurements since the last one of the primary track."""
         self.beside = False
         """Whether the primary track was ever measured in the same image."""
 

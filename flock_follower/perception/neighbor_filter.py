@@ -339,8 +339,8 @@ class NeighborFilter:
         """
         Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
 
-        It corrects the state only along the line between the two: an uncertain direction would
-        otherwise change the state across it, too. ``range_gate`` handles outliers. No track
+        The update corrects the state only along the line between the two: an uncertain direction
+        would otherwise change the state across it, too. ``range_gate`` handles outliers. No track
         begins with a distance.
 
         :param own_position: where it was measured (3,), m, in odom.

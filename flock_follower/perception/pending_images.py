@@ -15,8 +15,8 @@
 """
 Perception from messages to messages: calibrations, odometry, and the queue of images.
 
-An image is processed as soon as odometry has reached its stamp. It waits for that as long as
-images of late had to, a little longer, and never longer than ``max_wait``.
+An image is processed as soon as odometry has reached its stamp. It waits a little longer
+than recent images had to, and never longer than ``max_wait``.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@
 Tracks a neighbour that is out of sight by distances that a radio measures.
 
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
-is learnt. Out of sight, a second filter continues from the state of the first. It is separate: a
-later sighting is taken in as if there had been no ranges. Ranges bound the state along the line of
-sight. Across it, the uncertainty grows with the neighbour's possible motion; once it exceeds the
-distance, the direction is unknown.
+is learnt. Out of sight, a second filter continues from the state of the first. The second filter
+is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
+line of sight. Across it, the uncertainty grows with the neighbour's possible motion; once it
+exceeds the distance, the direction is unknown.
 
 ``RangeBias`` learns the constant error of ranges (mostly antenna delays), a slow random walk,
 while the marker gives the true distance. Its arrays are (n,).

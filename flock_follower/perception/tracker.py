@@ -114,8 +114,8 @@ class Tracker:
     """
     The neighbours of one drone, seen by one camera or several.
 
-    It needs every odometry message, and each image once :meth:`missing` returns None for its
-    stamp. Cameras have names; a single camera has the name ''.
+    The tracker needs every odometry message, and each image once :meth:`missing` returns None for
+    its stamp. Cameras have names; a single camera has the name ''.
 
     :param cameras: of one its place on the body (optical), of several each by its name.
     :param time_offset: of one: finds out by how much the images' stamps are off.

@@ -50,8 +50,9 @@ class PlannerLoop:
     """
     Gathers inputs, and passes them to one step of the core per tick.
 
-    It is active while it is engaged and the bridge reports that it flies the commands. ``memory``
-    is the state that the last step left; ``missed`` counts the ticks that did not come in time.
+    The planner is active while it is engaged and the bridge reports that it flies the commands.
+    ``memory`` is the state that the last step left; ``missed`` counts the ticks that did not come
+    in time.
 
     :param require_bridge: whether the bridge has to report that; else engaging is enough.
     """

@@ -120,7 +120,7 @@ class Memory(NamedTuple):
     flock: Mapping[str, Neighbor] = NONE
     """The neighbors at hand and those lost since: to keep clear of."""
     ranged: Mapping[str, Neighbor] = NONE
-    """Those of which no more than the distance is known at present."""
+    """The neighbors of which only the distance is known at present."""
     motions: Mapping[str, SmoothedMotion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE

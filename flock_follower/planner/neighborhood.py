@@ -61,7 +61,7 @@ class Neighborhood(NamedTuple):
     level: Neighbor | None
     """The neighbor whose altitude it follows."""
     peers: Sequence[Neighbor] = ()
-    """Those at the ends of its edges, to meet at one altitude, if no leader is at hand."""
+    """The neighbors at its edges, to meet at one altitude, if no leader is at hand."""
 
 
 NOBODY = Neighborhood((), {}, frozenset(), None, None)
@@ -161,7 +161,7 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 
     The search begins within ``coast_timeout``, if all other neighbors are only received: a vehicle
-    that has another one in view stays with that. It ends when a leader is at hand again.
+    that has another one in view stays with that. The search ends when a leader is at hand again.
     """
     last = memory.leader
     if last is None or any(n.member.role == LEADER for n in neighbors.flock):

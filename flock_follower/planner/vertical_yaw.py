@@ -16,7 +16,7 @@
 Altitude and yaw control: the altitude to hold, the vertical acceleration and the yaw.
 
 The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
-loses one that climbs or descends. It is controlled with the characteristic polynomial
+loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
 s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, with an integral that corrects errors of
 the autopilot's hover thrust.
 
