@@ -119,10 +119,10 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
 
 def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams) -> float:
     """
-    Return W, which falls strictly along every solution of the law, whatever the flock.
+    Return W, which strictly decreases along every solution of the law, for any flock.
 
     W = L + 1/2 sum_{i>j} [F(r^2 - d0) + F(d1 - r^2)], where F(g) is g^(1 - theta) / (theta - 1)
-    (1/g for theta = 2), or ln((d1 - d0) / g) for theta = 1. It is positive, and infinite where
+    (1/g for theta = 2), or ln((d1 - d0) / g) for theta = 1. W is positive, and infinite if
     any pair is outside the band; the paper's E tends to minus infinity instead.
 
     :param positions: (k, n), n = 2 or 3, m.

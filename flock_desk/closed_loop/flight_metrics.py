@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How well flights went: the figures of each run from engaging on, and of all runs of a scenario.
+Figures of flights: of each run from the engagement on, and of all runs of a scenario.
 
 All is true, not estimated. A row of ``measure`` is a follower. Of a flock, ``of_runs`` puts the
 rows of its followers together run by run: the worst of them if safety or a share of runs asks for

@@ -61,9 +61,9 @@ class RenderedImage(NamedTuple):
 
     stamp_ns: int
     due_ns: int
-    """When it is delivered."""
+    """Time of delivery."""
     time: float
-    """Of the scenario at the stamp, s; negative before it begins."""
+    """Scenario time at the stamp, s; negative before the scenario begins."""
     pixels: NDArray[np.uint8]
     follower: Odometry
     leader: Odometry | None

@@ -38,7 +38,7 @@ LOST: Final[float] = 10.0
 PACE_WINDOW: Final[float] = 5.0
 """s over which the time of an autopilot is compared with ours."""
 SLOW: Final[float] = 0.95
-"""Of the own clock's pace: a slower simulator is less agile than its model."""
+"""Least pace relative to the own clock: a slower simulator is less agile than its model."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 

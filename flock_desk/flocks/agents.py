@@ -78,7 +78,7 @@ class Simulation:
     graph: Graph | None = field(default=None, repr=False)
     """The neighbour graph at the end, where the model acts on one; its edges only ever join."""
     joined: Array | None = field(default=None, repr=False)
-    """When each of the graph's edges joined (edges,), s."""
+    """Time at which each edge of the graph was added (edges,), s."""
 
     @cached_property
     def metrics(self) -> Metrics:

@@ -68,7 +68,7 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     """
     Return the topics of a bag that a follower uses, and the truth.
 
-    Of images that are there raw and compressed the raw ones are used.
+    If the bag has raw and compressed images, the raw ones are used.
 
     :param remaps: their names in the bag, by ours, if they differ.
     :param several: cameras with topics of their own, in place of the only one.

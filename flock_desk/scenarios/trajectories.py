@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How the two vehicles of a rendered flight move: a leader on a winding course and its follower.
+Trajectories of a rendered flight: a leader on a winding course and its follower.
 
 The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form
 and the course goes on for as long as wanted, forwards. The follower is flown in closed loop by
@@ -122,7 +122,7 @@ class Swing:
     period: float
     """s."""
     phase: float
-    """At time 0, rad: 0 is nearest, and leaving."""
+    """Phase at time 0, rad; 0: nearest, and moving away."""
 
     def at(self, time: float) -> tuple[float, float, float]:
         """Return the distance, m, and its first two derivatives at a time, s."""

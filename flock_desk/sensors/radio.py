@@ -30,12 +30,12 @@ Message = TypeVar('Message')
 
 class Radio(Generic[Message]):
     """
-    Messages within flocks of m; no flock receives those of another.
+    Messages within flocks of m vehicles; no flock receives messages of another.
 
-    :param company: m.
-    :param delay: from sending to arrival, s.
+    :param company: m, the number of vehicles in each flock.
+    :param delay: time from sending to arrival, s.
     :param loss: share of messages that do not arrive at one of the receivers.
-    :param generators: of chance, one for each follower, flock by flock.
+    :param generators: random generators, one for each follower, flock by flock.
     """
 
     def __init__(self, company: int, delay: float, loss: float,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How simulated followers see others in lock step: the view of a camera, and measurement noise."""
+"""Simulated detection in lock step: the field of view of a camera, and measurement noise."""
 
 from __future__ import annotations
 

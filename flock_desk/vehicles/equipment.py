@@ -41,12 +41,12 @@ CURRENT: Final[float] = 18.0  # A in flight
 
 
 class BarometerErrors(NamedTuple):
-    """How a barometer errs; standard deviations, m, of its height."""
+    """Errors of a barometer: standard deviations of its height, m."""
 
     noise: float = 0.05
     """White, of each sample."""
     drift: float = 0.1
-    """Of weather and temperature, zero at the start; first-order Gauss-Markov ..."""
+    """Drift by weather and temperature, zero at the start; first-order Gauss-Markov ..."""
     drift_time: float = 300.0
     """... with this time constant, s."""
 

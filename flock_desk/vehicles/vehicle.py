@@ -40,7 +40,7 @@ _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class VehicleParams:
-    """How the vehicle answers; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
+    """Dynamics of the vehicle; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
 
     attitude_time: float = 0.15
     """Time constant of tilting, s."""

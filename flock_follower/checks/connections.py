@@ -171,7 +171,7 @@ def _files(seen: Observations) -> Iterator[Finding]:
     """Report parameter files that match no node, or that were not loaded."""
     for problem in seen.file_problems:
         yield error('parameter file', problem, 'one section for each node, by its full name',
-                    'name the sections /**/planner, or as the nodes are called')
+                    'name each section /**/planner, or by the full name of the node')
     for node, values in seen.file_parameters.items():
         running = seen.parameters.get(node, {})
         other = [f'{name} is {running[name]!r}, the file says {value!r}'

@@ -84,7 +84,7 @@ def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]
 
 class AxesFit(NamedTuple):
     """
-    How well rotation explains the shifts: shares of their squares, 1 is all of it.
+    Shares of the squared shifts that rotation explains, up to 1.
 
     ``configured`` is the share with the configured axes, ``best`` that with the best rotation
     ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset

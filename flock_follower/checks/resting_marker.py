@@ -15,10 +15,10 @@
 """
 A marker at rest, seen by a moving camera: it shows its size, and how the camera is mounted.
 
-By odometry and image it must stay in place. If it approaches by more, or less, than the camera
-moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns, the
-mounting is wrong. With y from the camera to the marker as seen, q the position of the camera by
-odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
+By odometry and image the marker must stay in place. If it approaches by more, or less, than the
+camera moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns,
+the mounting is wrong. With y from the camera to the marker as seen, q the position of the camera
+by odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
 
     y = c - s q - turn x y - ...    (least squares; c is s times the position of the marker)
 

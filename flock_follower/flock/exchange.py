@@ -331,8 +331,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the own frame, one state per vehicle.
 
-        Each has the stamp of its state; the covariances are those of its prediction to ``now``.
-        Of several states of one vehicle the most certain one is used: they may share errors.
+        Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
+        several states of one vehicle are known, the most certain one is used: their errors may be
+        correlated.
         """
         for sender in list(self.senders.values()):
             if now - sender.received > FORGOTTEN:

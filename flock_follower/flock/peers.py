@@ -275,7 +275,7 @@ class Sender:
     name: str
     states: dict[str, OdometryState] = field(default_factory=dict)
     ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
-    """Of its last messages on reception, s."""
+    """Ages of its last messages on reception, s."""
     doubted: set[str] = field(default_factory=set)
     """Vehicles whose newest states do not fit the alignment: the next ones will decide."""
     received: int = 0
@@ -322,8 +322,8 @@ def aged(state: OdometryState, now: int) -> OdometryState:
     """
     Return a state with the covariances of its prediction to a time, ns.
 
-    Its user predicts it with its velocity, and does not know the vehicle's acceleration since. The
-    stamp stays that of the state.
+    The receiver predicts the state with its velocity, without the vehicle's later acceleration.
+    The stamp stays that of the state.
     """
     age = max((now - state.stamp) / NANOSECONDS, 0.0)
     pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()

@@ -237,7 +237,7 @@ class HeightEstimator:
 
     def __init__(self) -> None:
         self.steps = 0
-        """How often the sensor has jumped, and the reference with it."""
+        """Number of jumps of the sensor, and so of the reference."""
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None

@@ -62,7 +62,7 @@ class GpsFix(NamedTuple):
 
     fixed: bool
     lost: float
-    """When it ceased to, s; minus infinity if it never did."""
+    """When the fix was lost, s; minus infinity if never."""
     accuracy: float = 0.0
     """Standard deviation of its horizontal position, m; 0 if it is not reported."""
 
@@ -71,7 +71,7 @@ class EstimatorStatus(NamedTuple):
     """ESTIMATOR_STATUS of PX4, EKF_STATUS_REPORT of ArduPilot."""
 
     time: float
-    """When it came, s."""
+    """Time of reception, s."""
     has_velocity: bool
     """Whether the estimator has a horizontal velocity, and something it rests on."""
     missing: tuple[str, ...]
@@ -147,7 +147,7 @@ LONGEST_WAIT: Final[float] = 30.0
 
 
 class Arrivals:
-    """When the messages of one autopilot came, by MAVLink's message id; times in s."""
+    """Times of reception, s, of the messages of one autopilot, by message id."""
 
     def __init__(self) -> None:
         self._times: dict[int, deque[float]] = {}
@@ -197,7 +197,7 @@ class Arrivals:
 
 class AskAgain:
     """
-    When to ask again for messages that come too seldom: soon, but less and less often in vain.
+    Schedule of repeated requests for messages at too low a rate; the period grows without success.
 
     Another one on the same line may have set other rates (MAVProxy does, every 15 s): asking
     helps. A line that cannot carry more is only filled by asking.

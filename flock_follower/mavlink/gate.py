@@ -77,9 +77,9 @@ class AcceptedCommand:
 
     command: Command
     time: float
-    """When it applies, s."""
+    """Time at which the command applies, s."""
     source_time: float
-    """When the image it rests on was taken, s."""
+    """Time of the image that the command is based on, s."""
 
 
 class Gate:
@@ -105,7 +105,7 @@ class Gate:
         self.new_command = False
         """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
-        """When a command was accepted last, s."""
+        """Time of the last accepted command, s."""
         self.permission = Permission()
         self.active_since = math.inf
         """Since when it is ACTIVE, s; infinite while it is not."""

@@ -60,7 +60,7 @@ class Sample(NamedTuple):
     way: int
     """There and back, ns."""
     time: int
-    """When it came, ns."""
+    """Time of reception, ns."""
 
 
 class TimeSync:

@@ -62,7 +62,7 @@ class ForwardedOdometry(NamedTuple):
     """One odometry in ENU and FLU."""
 
     time: float
-    """Of its stamp, s on our monotonic clock."""
+    """Time of the stamp, s on our monotonic clock."""
     position: Array
     """(3,), m, ENU."""
     quaternion: Array

@@ -73,7 +73,7 @@ class SetpointThread:
             end.setblocking(False)
         self._last_cycle = -math.inf
         self.late = 0
-        """How many cycles began more than a period late."""
+        """Number of cycles that began more than a period late."""
 
     def start(self) -> None:
         """Start the thread."""

@@ -168,7 +168,7 @@ class ArmingChecks:
 
     def __init__(self) -> None:
         self.time = -math.inf
-        """When it was complete, s."""
+        """Time of completion, s."""
         self._failures: tuple[Failure, ...] = ()
         self._coming: list[Failure] | None = None
 
@@ -231,7 +231,7 @@ class AutopilotText(NamedTuple):
     """One whole text."""
 
     time: float
-    """When it was complete, s."""
+    """Time of completion, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str
@@ -239,7 +239,7 @@ class AutopilotText(NamedTuple):
 
 class _Unfinished(NamedTuple):
     time: float
-    """When the newest of its chunks came, s."""
+    """Time of its newest chunk, s."""
     severity: int
     text: str
     next_chunk: int

@@ -57,7 +57,7 @@ LANDED_OLDEST: Final[float] = 3.0
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: How often barometer and rangefinder are asked for, Hz.
 HEIGHT_RATE: Final[float] = 20.0
-#: It has rebooted where two messages of a kind in a row are stamped by more than this earlier, ms.
+#: The autopilot has rebooted if stamps of two consecutive messages go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
 _UNKNOWN_TEMPERATURE = 32767  # 0.01 degC
@@ -341,7 +341,7 @@ class AutopilotEstimate(NamedTuple):
     """Odometry: position and attitude in ENU, twist in FLU."""
 
     time: float
-    """When it was valid, s on our monotonic clock."""
+    """Time of validity, s on our monotonic clock."""
     position: Array
     """(3,), m, ENU."""
     quaternion: Array

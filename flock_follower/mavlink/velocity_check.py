@@ -61,11 +61,11 @@ class Velocity(NamedTuple):
     vector: Array
     """(3,), m/s."""
     margin: float
-    """By how much its age prolongs time constants, s."""
+    """Increase of time constants by the age of the velocity, s."""
 
 
 class Motion(NamedTuple):
-    """What one source says of the vehicle's motion; an age is infinite if it never said."""
+    """The vehicle's motion by one source; an age is infinite before its first message."""
 
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     """(3,), m/s."""
@@ -95,11 +95,11 @@ class KnownMotion:
     """The vehicle's motion by both sources, and for how long each has been invalid."""
 
     odom: Motion
-    """By the odometry."""
+    """Motion by the odometry."""
     autopilot: Motion
-    """By the autopilot's own estimate."""
+    """Motion by the autopilot's own estimate."""
     source: str
-    """'odom' or 'autopilot': whose velocity judges a command and has to be fresh."""
+    """'odom' or 'autopilot': source of the velocity that is required for commands."""
     disagreeing_for: float = -math.inf
     """How long ago the velocities began to disagree, s; negative: they agree."""
     distrusted_for: float = -math.inf

@@ -72,7 +72,7 @@ class _WhiteJerk:
         self._jerk, self._initial = jerk, (rate**2, 0.0, acceleration**2)
         self.stamp: float | None = None
         self.variance, self._least, self._most = (std**2 for std in noise)
-        """Of a measurement along an axis, and its limits."""
+        """Variance of a measurement along an axis, and its limits."""
         # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
         # plain numbers: at hundreds of messages per second matrices so small cost more.
         self._covariance = (0.0,) * 6
@@ -266,7 +266,7 @@ class TwistFrame:
         self.found = ''
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
-        """By how much, m/s, the reading in use was off in the window that last contradicted it."""
+        """Error of the frame in use, m/s, in the window that last contradicted it."""
         self._before = ''  # the frame found before the velocity was dropped
         self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped

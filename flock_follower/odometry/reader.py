@@ -111,7 +111,7 @@ NO_VELOCITY = 1e3
 @dataclass(frozen=True)
 class SourceParams(Checked):
     """
-    How the odometry is to be read.
+    Parameters of the odometry source.
 
     ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of its child frame on
     base_link (FLU); ``twist_frame`` is the frame of its velocity, or 'auto'. ``std`` (4) are the

@@ -56,7 +56,7 @@ class View(NamedTuple):
 
     own: OdometrySample
     rotation: Array
-    """Of the body, to odom, (3, 3)."""
+    """Rotation of the body, to odom, (3, 3)."""
     T_smooth_camera: Transform
     delay: float = 0.0
 
@@ -155,7 +155,7 @@ class Sought(NamedTuple):
     near: Sequence[str]
     anywhere: Sequence[str]
     number: int
-    """How many they are."""
+    """Number of neighbours to search for."""
 
 
 class Look(NamedTuple):
@@ -165,7 +165,7 @@ class Look(NamedTuple):
     camera: MountedCamera
     model: CameraModel
     views: dict[float, View]
-    """By how long after the stamp, s."""
+    """Delay of the exposure after the stamp, s."""
     expected: dict[str, PosePrior]
     sought: Sought
 

@@ -260,7 +260,7 @@ class MarkedNeighbor:
     role: str = 'leader'
     """One of ``ROLES``."""
     radius: float = 0.0
-    """Of its hull, m."""
+    """Radius of its hull, m."""
     tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 

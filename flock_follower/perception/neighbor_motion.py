@@ -150,7 +150,7 @@ INITIAL_RATE = 0.5
 @dataclass(frozen=True)
 class FilterParams(Checked):
     """
-    How neighbours move, and when to doubt a measurement.
+    Motion model of neighbours, and limits for measurements.
 
     ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the

@@ -184,7 +184,7 @@ class Tracker:
         """
         Return whether to process the image of a stamp, s: else it need not even be decoded.
 
-        With one camera always; with several, if a neighbour may be in it.
+        With one camera always; with several cameras, only if a neighbour may be in the image.
         """
         if len(self.cameras) == 1:
             return True

@@ -94,7 +94,7 @@ class Edges(NamedTuple):
     near: float
     far: float = math.inf
     margin: float = 0.0
-    """Of each edge, m."""
+    """Margin to each edge, m."""
     spread: float = 0.0
     """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
@@ -113,7 +113,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
-    Without a direction, or if something is not finite, there are none.
+    Without a direction, or with a value that is not finite, the list is empty.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.

@@ -111,7 +111,7 @@ class Neighbor(NamedTuple):
     received: bool = False
     """Whether another vehicle reported it; else the own camera sees it."""
     member: Member = SEEN_DEFAULT
-    """Its role and size, known beforehand."""
+    """Role and size of the neighbor, from its file."""
 
 
 Moving = TypeVar('Moving', OwnState, Neighbor)

@@ -66,7 +66,7 @@ class Bound(NamedTuple):
     least: float
     reason: str
     distance: float = 0.0
-    """From the neighbor that causes it, m."""
+    """Distance of the neighbor that causes the bound, m."""
     seen: bool = True
     """Whether that neighbor is in sight."""
 

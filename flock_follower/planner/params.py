@@ -66,7 +66,7 @@ RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no 
 @dataclass(frozen=True)
 class GuardParams(Checked):
     """
-    How the guard holds the band.
+    Parameters of the guard.
 
     :raises ValueError: naming the parameter, its value and the valid range.
     """

@@ -102,7 +102,7 @@ class _Line(NamedTuple):
     high: float
     """At most ``low`` where the line misses what the discs share."""
     gap: float
-    """By how much it misses; at most 0 if it does not."""
+    """Distance by which the line misses the discs; at most 0 if it meets them."""
 
     @classmethod
     def of(cls, normal: complex, level: float, discs: Discs) -> _Line:

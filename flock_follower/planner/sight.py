@@ -88,7 +88,7 @@ class FieldOfView(NamedTuple):
 
 
 View = tuple[FieldOfView, ...]
-"""Of all cameras; () if unknown."""
+"""Fields of view of all cameras; () if unknown."""
 
 
 def visible(view: View, offset: Array, yaw: float, forward: float, margin: float) -> bool:

@@ -69,7 +69,7 @@ class Altitude(NamedTuple):
     highest: float
     """m."""
     climb: float = 0.0
-    """How fast ``held`` changes, m/s."""
+    """Rate of ``held``, m/s."""
     thrust_bias: float = 0.0
     """The integral, m/s^2."""
     neighbor_climb: float | None = None

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters that other nodes fly with, as a file of parameters that ``evaluate`` takes."""
+"""Writes the parameters of the flying nodes to a parameter file for ``evaluate``."""
 
 from __future__ import annotations
 
