@@ -69,11 +69,11 @@ class Shape(NamedTuple):
     """The name of a constant of ``visualization_msgs/Marker``."""
     color: Color
     size: tuple[float, float, float]
-    """Lengths along the axes; of lines the width first, of text the height last."""
+    """Lengths along the axes; the first is the width of lines, the last the height of text."""
     position: Array = np.zeros(3)
     quaternion: Array = IDENTITY_QUATERNION
     points: Array = np.zeros((0, 3))
-    """Of lines and arrows (n, 3); then position and quaternion are left alone."""
+    """Points of lines and arrows (n, 3); then position and quaternion are not used."""
     text: str = ''
 
 

@@ -135,7 +135,7 @@ def _twist(motion: OwnMotion) -> Finding:
         return error(what, f'read in {twist.wanted}, the positions say {twist.found}', wanted,
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
-        return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
+        return warning(what, f'off by {twist.contradiction:.2f} m/s in either frame', wanted,
                        f'{DERIVED}; check the velocity of the odometry source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
@@ -150,17 +150,17 @@ def _lacking(motion: OwnMotion) -> Iterator[Finding]:
     zero = 'angular velocity' in missing
     yield judged(False, zero, 'odom angular rate', 'always zero' if zero else
                  f'up to {math.degrees(fastest):.0f} deg/s', 'that of the gyroscope',
-                 'works: derived from the attitudes, which is noisier; have it sent if its source '
-                 'can')
+                 'works: derived from the attitudes, which is noisier; let the source send it if '
+                 'possible')
     parts = sorted({name.rsplit(' ', 1)[-1] for name in missing if 'covariance' in name})
     yield judged(False, bool(parts), 'odom covariances',
-                 f'none, or not all, of {" and ".join(parts)}' if parts else 'there',
+                 f'incomplete for {" and ".join(parts)}' if parts else 'there',
                  'those of its filter',
-                 'works: odom_std stands in; set that to what your odometry errs by')
+                 'works: odom_std is used instead; set it to the errors of your odometry')
 
 
 def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterator[Finding]:
-    """Check that up is up and ahead is ahead, the time offset and the focal length."""
+    """Check the vertical and forward axes, the time offset and the focal length."""
     up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
@@ -181,15 +181,16 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
                     'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its '
                     'attitude on the body, see docs/sensors.md')
     elif turned and fit is not None and fit.turn[2, 2] < -0.5:
-        yield error(what, 'images turn the other way round: its z is down', wanted,
+        yield error(what, 'images turn the other way round: z of base_link is down', wanted,
                     'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
                     'the camera upside down (camera_rpy)?')
         return
     else:
         yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,
-                     'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
+                     'hold the vehicle level; else set the pose of the IMU on the body '
+                     '(odom_child_rpy)')
     if fit is None:
-        yield unmeasured('odom ahead', 'turned too little: turn it by hand, 30 deg', TURN_MOVES)
+        yield unmeasured('odom ahead', 'turned too little: turn the vehicle by 30 deg', TURN_MOVES)
         yield unmeasured('camera time offset', 'turned too little', IN_TIME)
         return
     what, share = 'odom ahead', f'turning explains {max(fit.configured, 0.0):.0%} of it'
@@ -199,7 +200,7 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
     elif fit.configured >= EXPLAINED:
         yield ok(what, share, TURN_MOVES)
     elif not turned:
-        yield unmeasured(what, f'{share}; turn it by hand', TURN_MOVES)
+        yield unmeasured(what, f'{share}; turn the vehicle by hand', TURN_MOVES)
     period = motion.source.period
     if fit.best >= EXPLAINED and period <= SLOW:
         yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))

@@ -142,7 +142,7 @@ FAULTS: list[Fault] = [
           pictures(fault="encoding = '16UC1': must be one of mono8, ...")),
     Fault('a cap before the lens', BOTH, ERROR, 'images', 'black', 'take off the cap',
           pictures(brightness=3.0, contrast=1.0, markers={})),
-    Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'however it is read',
+    Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
           rows(slice(9, 12), [1.5, 1.5, 0.0])),
     Fault('no angular rates', BOTH, WARNING, 'odom angular rate', 'always zero', 'derived from',
@@ -301,8 +301,8 @@ def unreliable(seen: Observed) -> None:
     seen.topic('command/trajectory').subscribers[0].reliable = True
 
 
-@fault('use_sim_time forgotten', LIVE, ERROR, 'clock', '/clock is published, planner goes by the '
-       'time of day', 'use_sim_time:=true')
+@fault('use_sim_time forgotten', LIVE, ERROR, 'clock',
+       '/clock is published, but use_sim_time is false in planner', 'use_sim_time:=true')
 def time_of_day(seen: Observed) -> None:
     seen.clock = True
     for node, own in seen.parameters.items():
@@ -348,7 +348,8 @@ def turned(seen: Observed) -> None:
     seen.autopilot = []
 
 
-@fault('north, east, down', BOTH, ERROR, 'odom up', 'its z is down', 'instead of NED and FRD')
+@fault('north, east, down', BOTH, ERROR, 'odom up', 'z of base_link is down',
+       'instead of NED and FRD')
 def north_east_down(seen: Observed) -> None:
     for row in seen.rows:
         for y in (3, 6, 10, 13):  # position, attitude, velocity, rates: half a turn about x
@@ -422,7 +423,7 @@ def elsewhere(seen: Observed) -> None:
 
 
 @fault('odom that a node does not listen to', LIVE, ERROR, 'odom wiring',
-       'planner does not listen to /odom', '-r odom:=/odom')
+       'planner does not subscribe to /odom', '-r odom:=/odom')
 def wiring(seen: Observed) -> None:
     topic = seen.topic('odom')
     topic.subscribers = [end for end in topic.subscribers if end.node != '/planner']
