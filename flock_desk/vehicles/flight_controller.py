@@ -214,7 +214,7 @@ class FlightController(ABC):
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 
     def unfit(self, now: float) -> list[str]:
-        """Return the conditions that keep it from arming."""
+        """Return the conditions that prevent arming."""
         return self.missing(self.mode, now, self.PROFILE.arming)
 
     def command_mode(self, params: tuple[float, ...], now: float) -> list[int]:

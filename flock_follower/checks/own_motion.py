@@ -123,7 +123,7 @@ def _frames(seen: Observations) -> Finding:
         return error(what, f'changed {len(seen.frames) - 1} times, now {measured}', wanted,
                      'is it published by two sources? Every change starts perception anew')
     return judged(False, not header, what, measured, wanted,
-                  'have its source fill header.frame_id')
+                  'let the odometry source fill header.frame_id')
 
 
 def _twist(motion: OwnMotion) -> Finding:
@@ -182,8 +182,8 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
                     'attitude on the body, see docs/sensors.md')
     elif turned and fit is not None and fit.turn[2, 2] < -0.5:
         yield error(what, 'images turn the other way round: z of base_link is down', wanted,
-                    'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
-                    'the camera upside down (camera_rpy)?')
+                    'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; '
+                    'or is the camera upside down (camera_rpy)?')
         return
     else:
         yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,

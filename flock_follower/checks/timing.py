@@ -91,7 +91,7 @@ def _stream(name: str, topic: TopicSeen, newest: float, live: bool,
                      rate, wanted, limits.faster)
     if zeros := topic.stamps.count(0.0):
         yield error(f'{name} stamps', f'{zeros} of {len(topic.stamps)} are zero',
-                    'the time of the measurement', 'have its driver fill header.stamp')
+                    'the time of the measurement', 'let the driver fill header.stamp')
         return
     disorder = float(np.mean(np.diff(topic.stamps) <= 0.0)) if len(topic.stamps) > 1 else 0.0
     if disorder > DISORDER:

@@ -357,8 +357,8 @@ class Planner(FlockNode):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
         if view or self._decision is None or self._decision.state is State.IDLE:
             return None
-        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
-                      'the camera sees')
+        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
+                      'that keep the leader in the image')
 
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:

@@ -376,7 +376,7 @@ def _pose(message: Any) -> tuple[Array, Array]:
     q = pose.orientation
     attitude = [q.x, q.y, q.z, q.w]
     if not any(attitude):
-        raise ValueError('quaternion = 0: the source says that it is lost')
+        raise ValueError('quaternion = 0: the source has lost its pose')
     position, sane = _vector(pose.position)
     if not sane:
         raise ValueError(f'position = {position.tolist()}: must be finite, and within {SANE:g}')

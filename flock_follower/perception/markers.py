@@ -280,7 +280,7 @@ class NeighborConfig:
     neighbors: tuple[MarkedNeighbor, ...]
 
     def by_marker(self) -> dict[int, MarkerOf]:
-        """Return the markers, and who carries them, by marker id."""
+        """Return the markers with their neighbours, by marker id."""
         return {marker.marker_id: MarkerOf(neighbor, marker)
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
