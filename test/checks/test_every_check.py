@@ -200,8 +200,8 @@ FAULTS: list[Fault] = [
           'processor time',
           delayed('odom', 0.3)),
     Fault('little processor time left', LIVE, WARNING, 'processor', '20% of 4 cores left',
-          'end what', machine(idle=0.2)),
-    Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end what',
+          'end programs', machine(idle=0.2)),
+    Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end programs',
           machine(idle=0.02)),
     Fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_',
           machine(shared_memory_free=2.0)),
@@ -230,7 +230,7 @@ FAULTS: list[Fault] = [
     Fault('two odometries', LIVE, ERROR, 'odom', '2 publishers on /odom', 'end all but one',
           publisher('odom', '/wheels')),
     Fault('a file of parameters that matches nobody', LIVE, ERROR, 'parameter file',
-          'none for /planner', 'name the sections',
+          'none for /planner', 'name each section',
           change(file_problems=['mine.yaml: holds parameters for /planers, none for /planner'])),
     Fault('a file of parameters that was not taken', LIVE, ERROR, 'parameter file',
           'planner has not taken it: v_max is 0.5, the file says 0.3', '--params-file',
@@ -288,7 +288,7 @@ def poses(seen: Observed) -> None:
 
 
 @fault('a source that sends nothing', LIVE, ERROR, 'odom', '/vio publishes /odom, and sends '
-       'nothing', 'is it initialised')
+       'nothing', 'initialised?')
 def silent(seen: Observed) -> None:
     seen.topic('odom').arrivals = seen.topic('odom').stamps = []
     seen.rows = []
@@ -358,7 +358,7 @@ def north_east_down(seen: Observed) -> None:
 
 
 @fault('compressed images, and raw ones wanted', LIVE, ERROR, 'images wiring',
-       'relative_pose does not listen', 'image_transport:=compressed')
+       'relative_pose does not subscribe', 'image_transport:=compressed')
 def other_transport(seen: Observed) -> None:
     topic = lose(seen, 'image_raw')
     topic.subscribers, topic.publishers[0].type = [], COMPRESSED
