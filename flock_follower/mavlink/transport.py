@@ -145,7 +145,7 @@ class SerialTransport(_Line):
     """
     A serial port in raw mode, opened whenever the device is there and no other process has it.
 
-    A second process would take away a share of the bytes received, and send among ours.
+    A second process would receive a part of our bytes, and send its bytes between ours.
     """
 
     def __init__(self, url: str, device: str, baud: int) -> None:
