@@ -67,7 +67,7 @@ _OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_'
 
 
 class SensorAltitude(NamedTuple):
-    """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude that does not depend on odometry."""
+    """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude independent of odometry."""
 
     time: float
     altitude: float

@@ -19,9 +19,9 @@ Sources differ (see docs/sensors.md): their child frame is an IMU or a camera in
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
 their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 
-The attitudes show which axis of base_link points up: in flight it is z. If it is another one, the
-pose of the child frame on base_link is set wrongly. The axis that points ahead cannot be seen so,
-as a quadrotor flies to all sides.
+The attitudes show which axis of base_link points up: in flight it is z. If another axis points up, the
+pose of the child frame on base_link is set wrongly. The forward axis cannot be found in this
+way, because a quadrotor flies in all directions.
 """
 
 from __future__ import annotations
