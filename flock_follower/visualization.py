@@ -62,7 +62,7 @@ STATES: Mapping[str, Color] = {
 
 
 class Shape(NamedTuple):
-    """One shape; ``name`` tells it from others, and replaces the one drawn before."""
+    """One shape; it replaces the shape of the same ``name`` that was drawn before."""
 
     name: str
     kind: str

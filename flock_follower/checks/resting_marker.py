@@ -15,10 +15,10 @@
 """
 A marker at rest, seen by a moving camera: it shows its size, and how the camera is mounted.
 
-By odometry and image it must stay in place. If it approaches by more, or less, than the camera
-moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns, the
-mounting is wrong. With y from the camera to the marker as seen, q the position of the camera by
-odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
+By odometry and image the marker must stay in place. If it approaches by more, or less, than the
+camera moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns,
+the mounting is wrong. With y from the camera to the marker as seen, q the position of the camera
+by odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
 
     y = c - s q - turn x y - ...    (least squares; c is s times the position of the marker)
 
@@ -192,7 +192,7 @@ def _mounting(fit: RestFit, rpy: list[float]) -> Finding:
                               @ quaternion_to_matrix(quaternion_from_rpy(*rpy)))
     shown = ','.join(str(round(angle, 3) + 0.0) for angle in fitting.tolist())
     return judged(
-        off > BAD_LOOKS, True, what, f'camera {looks} than told', _MOUNTED,
+        off > BAD_LOOKS, True, what, f'camera {looks} than configured', _MOUNTED,
         f'camera_rpy:=[{shown}] would fit, in relative_pose and planner; or is the pose of the '
         'odometry on the body (odom_child_rpy) wrong?')
 
@@ -246,7 +246,7 @@ def fit_rest(seen: Sightings, own: OwnPath) -> RestFit | None:
         weights = (robust / variance)[:, None, None]
         information = np.sum(np.swapaxes(design, 1, 2) @ (weights * design), axis=0) + prior
         moment = np.sum(np.swapaxes(design, 1, 2) @ (weights * y[:, :, None]), axis=0)[:, 0]
-        # The prior is of the whole turn, not of what is added to it, and of s - 1.
+        # The prior is of the whole turn, not of its increment, and of s - 1.
         moment[6] += prior[6, 6]
         moment[7:10] -= prior[7:10, 7:10] @ turn
         solution = np.linalg.solve(information, moment)

@@ -331,8 +331,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the own frame, one state per vehicle.
 
-        Each has the stamp of its state; the covariances are those of its prediction to ``now``.
-        Of several states of one vehicle the most certain one is used: they may share errors.
+        Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
+        several states of one vehicle are known, the most certain one is used: their errors may be
+        correlated.
         """
         for sender in list(self.senders.values()):
             if now - sender.received > FORGOTTEN:
@@ -385,7 +386,7 @@ class Sharing:
             return OWN_FUTURE
         active = [s for s in self.status(now) if s.silent <= MESSAGE_AGE_MAX]
         if not active:
-            return 'nobody else talks'
+            return 'no other sender'
         return '' if any(not s.why for s in active) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in active)
 

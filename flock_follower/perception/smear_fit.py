@@ -93,7 +93,7 @@ class SmearModel:
 
 @lru_cache(maxsize=64)
 def smear_model(marker: Marker, dictionary: str) -> SmearModel:
-    """Return what it takes to smear a marker."""
+    """Return the model of a smeared marker."""
     code = marker_code(dictionary, marker.marker_id)
     n = len(code)
     cell = marker.side_length / n
@@ -157,7 +157,7 @@ _LONGEST_TURN = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
 _LONGEST_STEP = 0.5  # and so does one by this share of the distance
 _MIN_INSIDE = 0.8  # share of the samples that must be in the image
 _BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
-_FLOOR = 1.0  # grey levels: no sample is believed to be better
+_FLOOR = 1.0  # grey levels: least standard deviation of a sample
 _ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
 #: Of the pose (6), the response (3) and the smear (2), which a smear of 0 leaves open.
 _PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
@@ -181,7 +181,7 @@ class SmearFit(NamedTuple):
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
                 start: Transform) -> SmearFit | None:
     """
-    Return the pose of a marker near ``start``, ``T_camera_body``, or None where it is not there.
+    Return the pose of a marker near ``start``, ``T_camera_body``, or None if it is not there.
 
     ``start`` may be off by two cells and a half, and a little in all else.
     """
@@ -228,9 +228,9 @@ def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, 
 
 class _Descent(NamedTuple):
     """
-    What is left, (s,), grey levels, after a step, and what the step rests on.
+    Residuals, (s,), grey levels, after a step, and the inputs of the step.
 
-    ``light``: what black and white are apart.
+    ``light``: difference between white and black.
     """
 
     residual: Array
@@ -317,7 +317,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
-    """Return a fit, None where it does not show the marker's code."""
+    """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))

@@ -175,7 +175,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     """
     Return the least height, m, at which to let a closing neighbor pass that is out of sight.
 
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, there is none: -inf. The default
+    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
     of ``altitude_max`` is no ceiling.
 
     :param held: altitude to hold, m.

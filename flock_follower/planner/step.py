@@ -110,7 +110,7 @@ class Decision(NamedTuple):
 
 
 class _Mode(NamedTuple):
-    """The state of one step, and what it rests on."""
+    """The state of one step, and the inputs that it depends on."""
 
     state: State
     reason: str
@@ -332,7 +332,7 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
     command = limit_horizontal(unlimited, vertical, velocity, *limits, params.period, rising)
     if params.guard and (mode.state is not State.SEARCH or memory.flock):
         command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # What is still to be flown is a guess: the measured velocity is limited, too.
+    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = strongest
     final = limit_command(command.acceleration, me.velocity, *limits, params.period,
@@ -370,7 +370,7 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
               leader: Neighbor | None, params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means, and what it does about neighbors not seen."""
+    """Return warnings: neighbors that it cannot follow, and the reaction to lost ones."""
     if mode.state is State.TRACK:
         search = '' if leader is None else (
             f'looks for {leader.name}, not known of for {me.stamp - leader.stamp:.1f} s')

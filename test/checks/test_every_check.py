@@ -112,7 +112,7 @@ def stamped(name: str, seconds: float) -> Change:
 
 FAULTS: list[Fault] = [
     Fault('a state that is not latched', LIVE, ERROR, 'mavlink_bridge/state QoS',
-          '/planner hears nothing: /mavlink_bridge sends volatile', 'change the QoS',
+          '/planner receives nothing: /mavlink_bridge sends volatile', 'change the QoS',
           change(lambda seen: seen.topic('mavlink_bridge/state').publishers[0], latched=False)),
     Fault('a camera at 2 Hz', BOTH, ERROR, 'images rate', '2.0 Hz', 'raise the frame rate',
           thinned('image_raw', 15)),
@@ -155,13 +155,13 @@ FAULTS: list[Fault] = [
     Fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', '50 ms later',
           'middle of the exposure, by one clock; else set time_offset:=-0.050',
           change(shifts=shift_rows(offset=0.05))),
-    Fault('a marker printed larger than told', BOTH, ERROR, 'marker size',
+    Fault('a marker printed larger than configured', BOTH, ERROR, 'marker size',
           'moves 0.80 ± 0.01 times as far', '0.200 m would fit',
           change(sightings=sighting_rows(scale=0.8))),
-    Fault('a marker printed a little smaller than told', BOTH, WARNING, 'marker size',
+    Fault('a marker printed a little smaller than configured', BOTH, WARNING, 'marker size',
           'moves 1.07 ± 0.01 times as far', '0.150 m would fit',
           change(sightings=sighting_rows(scale=0.16 / 0.15))),
-    Fault('a camera that looks lower than told', BOTH, ERROR, 'camera mounting',
+    Fault('a camera that looks lower than configured', BOTH, ERROR, 'camera mounting',
           'looks lower by 15 deg', 'camera_rpy:=[0.0,0.262,0.0] would fit',
           change(sightings=sighting_rows(mounted=quaternion_to_matrix(
               quaternion_from_rpy(0.0, math.radians(15.0), 0.0))))),
@@ -239,7 +239,7 @@ FAULTS: list[Fault] = [
           '[-1.5708, 0.0, -1.5708] in planner', '/**',
           parameter('planner', 'odom_child_rpy', [-1.5708, 0.0, -1.5708])),
     Fault('a recording cut short', BAG, WARNING, 'bag', 'incomplete: the disk is full',
-          'record anew',
+          'record again',
           change(incomplete='the disk is full')),
 ]
 
@@ -295,7 +295,7 @@ def silent(seen: Observed) -> None:
 
 
 @fault('best effort where reliable is wanted', LIVE, ERROR, 'command/trajectory QoS',
-       '/mavlink_bridge hears nothing: /planner sends best effort', 'change the QoS')
+       '/mavlink_bridge receives nothing: /planner sends best effort', 'change the QoS')
 def unreliable(seen: Observed) -> None:
     seen.topic('command/trajectory').publishers[0].reliable = False
     seen.topic('command/trajectory').subscribers[0].reliable = True

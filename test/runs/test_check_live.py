@@ -214,7 +214,7 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
     assert_told(found, 'nodes', '/drone1/mavlink_bridge', 'check --namespace drone1')
     assert_told(found, 'clock', 'planner: use_sim_time is true, but nobody', 'without')
     assert_told(found, 'command/trajectory', '2 publishers', 'end all but one')
-    assert_told(found, 'mavlink_bridge/state QoS', '/planner hears nothing: /stand_in',
+    assert_told(found, 'mavlink_bridge/state QoS', '/planner receives nothing: /stand_in',
                 'QoS of /stand_in')
     assert_told(found, 'odom wiring', 'planner does not listen to /vio/odom',
                 '-r odom:=/vio/odom')
