@@ -45,7 +45,7 @@ from flock_follower.parameters.spec import filled
 #: rad: difference between the yaws of odometry and autopilot, from which on there is a warning;
 #: the bridge refuses above the second.
 YAWS: Final = (0.12, 0.35)
-#: Share of unusable messages above which nobody can fly by the rest.
+#: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02
 #: deg: mean lean of base_link from which on there is a warning, and an error.
 LEAN, LYING = 20.0, 40.0

@@ -292,7 +292,7 @@ class Requests:
         Return whether a take-off explains an offboard mode that misses no setpoint.
 
         ArduPilot takes off in GUIDED, and stays in it above. Before and while it climbs setpoints
-        would do nothing, or end it; after our own take-off nobody has requested offboard yet.
+        would do nothing, or end it; after our own take-off offboard has not been requested yet.
         """
         telemetry, newest = self._link.telemetry, self.newest
         if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:

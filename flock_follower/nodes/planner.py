@@ -22,7 +22,7 @@ steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``plann
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
+disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
 ``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """

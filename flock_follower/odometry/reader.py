@@ -19,8 +19,8 @@ Sources differ (see docs/sensors.md): their child frame is an IMU or a camera in
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
 their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 
-The attitudes show which axis of base_link points up: in flight it is z. If another axis points up, the
-pose of the child frame on base_link is set wrongly. The forward axis cannot be found in this
+The attitudes show which axis of base_link points up: in flight it is z. If another axis points up,
+the pose of the child frame on base_link is set wrongly. The forward axis cannot be found in this
 way, because a quadrotor flies in all directions.
 """
 
