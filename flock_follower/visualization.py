@@ -98,7 +98,7 @@ def circle(name: str, centre: Array, radius: float, color: Color, width: float) 
 
 def ellipsoid(name: str, centre: Array, covariance: Array, deviations: float,
               color: Color) -> Shape:
-    """Return the ellipsoid of so many standard deviations of a finite covariance (3, 3), m^2."""
+    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``deviations`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]

@@ -155,7 +155,7 @@ class FlightRecording:
         """
         Finish the recording under way.
 
-        :raises OSError: if that fails; it can be read all the same.
+        :raises OSError: if that fails; the recording stays readable.
         """
         try:
             self._end()

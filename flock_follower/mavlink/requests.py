@@ -67,7 +67,7 @@ class Requests:
     """
     Begins requests and steps the one whose outcome is open.
 
-    :param end: of the flight; a request by a person begins it anew.
+    :param end: end of the flight; reset by a request of an operator.
     :param require_failsafe: whether offboard needs the parameters of ``parameter_check.RULES``.
     """
 

@@ -192,8 +192,8 @@ class ClockWatch:
     """
     Finds steps of the system clock, and messages that were stamped before the last one.
 
-    ``shift`` is by how much the clock was set so far, ns: a stamp less the shift is a time of a
-    clock that goes on evenly.
+    ``shift`` is the sum of all steps of the clock, ns: a stamp minus the shift is the time of a
+    clock without steps.
     """
 
     def __init__(self) -> None:
