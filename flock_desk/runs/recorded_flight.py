@@ -48,6 +48,7 @@ from flock_follower.parameters import (
 )
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.planner.loop import PlannerLoop
 
@@ -115,17 +116,22 @@ class RecordedFlight:
         except ValueError as error:
             self._listener.rejected('invalid camera_info', str(error))
 
-    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '') -> None:
-        """Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name."""
+    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '',
+                   message: Any = None, pixels: GrayImage | None = None) -> None:
+        """
+        Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name.
+
+        :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
+        """
         self._begin(time)
         try:
-            image = deserialize(data, msgtype)
+            image = message or deserialize(data, msgtype)
             stamp = read_stamp(image.header.stamp)
         except ValueError as error:
             self._listener.rejected(INVALID_IMAGE, str(error))
             self._listener.image(ImageOutcome(time, camera=camera))
             return
-        self.follower.image(time, image, stamp, camera)
+        self.follower.image(time, image if pixels is None else pixels, stamp, camera)
 
     def take_range(self, time: int, data: bytes) -> None:
         """Take a sensor_msgs/Range of ``ranges``."""
