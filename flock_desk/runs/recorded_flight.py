@@ -96,7 +96,7 @@ class RecordedFlight:
         try:
             state = self.source.take(message or read_odometry(data), time)
         except ValueError as error:
-            self._listener.rejected(INVALID_ODOMETRY, str(error))
+            self._reject(time, INVALID_ODOMETRY, error)
             return
         for event in self.source.told():
             self._listener.rejected(*event)
@@ -114,7 +114,7 @@ class RecordedFlight:
             self.follower.camera_info(
                 time, deserialize(data, 'sensor_msgs/msg/CameraInfo'), camera)
         except ValueError as error:
-            self._listener.rejected('invalid camera_info', str(error))
+            self._reject(time, 'invalid camera_info', error)
 
     def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '',
                    message: Any = None, pixels: GrayImage | None = None) -> None:
@@ -128,7 +128,7 @@ class RecordedFlight:
             image = message or deserialize(data, msgtype)
             stamp = read_stamp(image.header.stamp)
         except ValueError as error:
-            self._listener.rejected(INVALID_IMAGE, str(error))
+            self._reject(time, INVALID_IMAGE, error)
             self._listener.image(ImageOutcome(time, camera=camera))
             return
         self.follower.image(time, image if pixels is None else pixels, stamp, camera)
@@ -139,7 +139,7 @@ class RecordedFlight:
         try:
             measured = from_range(deserialize(data, RANGE))
         except ValueError as error:
-            self._listener.rejected('invalid ranges', str(error))
+            self._reject(time, 'invalid ranges', error)
             return
         self.follower.range(time, measured)
 
@@ -147,9 +147,12 @@ class RecordedFlight:
         """Process the images that still wait: no more will come."""
         self.follower.finish()
 
-    def _begin(self, time: int) -> None:
-        """Let happen what is due before a message; with the first the flight begins."""
+    def _reject(self, time: int, reason: str, error: ValueError) -> None:
         self.follower.advance(time)
+        self._listener.rejected(reason, str(error))
+
+    def _begin(self, time: int) -> None:
+        """Begin the flight with the first message."""
         if not self._began:
             self._began = True
             self.follower.engage(time, True)
