@@ -16,7 +16,7 @@
 How fast large flocks are simulated: ``python benchmarks/simulation.py``, all in one run.
 
 All pairs two ways, neighbours by a k-d tree beside a plain numpy loop, and Vicsek's model beside
-SiSyPHE if that is installed (``pip install torch sisyphe``). Exit code 0 only if every bound holds.
+SiSyPHE if that is installed (``pip install torch sisyphe``). Exit code 0 only if all bounds hold.
 """
 
 from __future__ import annotations

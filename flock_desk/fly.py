@@ -58,7 +58,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
         prog='fly', description='Fly a scenario on the desk, through the real nodes.',
         epilog=f'scenarios: {", ".join(names())}')
     parser.add_argument('--scenario', default='indoor', metavar='NAME',
-                        help='of a file in config/scenarios, or the path of one (%(default)s)')
+                        help='a name in config/scenarios, or the path of a file (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
     parser.add_argument('--duration', type=float, default=0.0, metavar='S',
                         help='fly no longer than this, s; never longer than the scenario (as '
