@@ -31,13 +31,13 @@ import sys
 import time
 from typing import NamedTuple, TypeVar
 
+from flock_desk.runs.column import spacing
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     SchedulingDelay,
 )
-from flock_desk.runs.summary import spacing
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.mavlink.transport import open_transport
 

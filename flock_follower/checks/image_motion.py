@@ -116,15 +116,15 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float
     rows = np.array([row for row in shifts if row[4] >= RESPONSE]).reshape(-1, 5)
     if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST * focal:
         return None
-    turns = [turn for n, turn in enumerate(_QUARTER_TURNS)
-             if n == 0 or up is None or turn[2].dot(up) > 0.5]
+    turns = np.array([turn for n, turn in enumerate(_QUARTER_TURNS)
+                      if n == 0 or up is None or turn[2].dot(up) > 0.5])
+    to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
     shares = np.full((len(offsets), len(turns)), -1.0)
     for n, offset in enumerate(offsets.tolist()):
         turned, seen = _turned(rows, attitude, offset)
         if len(seen) >= FEW:
-            shares[n] = [_share(_expected(turned @ turn.T @ R_base_optical, focal), seen)
-                         for turn in turns]
+            shares[n] = _share(_expected(turned @ to_optical, focal), seen)
     if shares.max() < 0.0:
         return None
     # If several are equal, as when it only turned about one axis, the configured one wins.
@@ -133,10 +133,10 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float
     peak = int(curve.argmax())
     offset = _summit(offsets, curve, peak)
     turned, seen = _turned(rows, attitude, offset)
-    expected = _expected(turned @ turns[best].T @ R_base_optical, focal)
+    expected = _expected(turned @ to_optical[best], focal)
     zoom = float(np.sum(expected * seen) / np.sum(expected**2))
     return AxesFit(float(shares[:, 0].max()), float(curve[peak]), turns[best], offset,
-                   float(curve[len(offsets) // 2]), zoom, _share(zoom * expected, seen))
+                   float(curve[len(offsets) // 2]), zoom, float(_share(zoom * expected, seen)))
 
 
 def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:
@@ -151,13 +151,14 @@ def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Arra
 
 
 def _expected(turned: Array, focal: float) -> Array:
-    """Return the shifts (n, 2) by rotation vectors (n, 3) in optical axes."""
-    return focal * np.column_stack([-turned[:, 1], turned[:, 0]])
+    """Return the shifts (..., n, 2) by rotation vectors (..., n, 3) in optical axes."""
+    return focal * np.stack([-turned[..., 1], turned[..., 0]], axis=-1)
 
 
-def _share(expected: Array, seen: Array) -> float:
-    """Return the share of the squares of the shifts that the expected ones explain."""
-    return 1.0 - float(np.sum((seen - expected)**2) / np.sum(seen**2))
+def _share(expected: Array, seen: Array) -> Array:
+    """Return the shares (...) of the squares of shifts (n, 2) that (..., n, 2) explain."""
+    share: Array = 1.0 - np.sum((seen - expected)**2, axis=(-2, -1)) / np.sum(seen**2)
+    return share
 
 
 def _summit(offsets: Array, curve: Array, peak: int) -> float:

@@ -176,7 +176,7 @@ def acceleration(command: MultiDOFJointTrajectory) -> Any:
 
 def test_silence_of_neighbors_is_a_fault_only_if_no_image_is_processed(rig: Rig) -> None:
     rig.run(0.1)
-    time.sleep(2.1)
+    rig.wait(lambda: rig.reports('no /neighbors for '))
     rig.run(0.1, None)  # images without a leader in them
     assert not rig.reports('no /neighbors for ')
     assert rig.reports('no /neighbors for ', ahead=2.6)
