@@ -243,7 +243,8 @@ def test_the_table_is_narrow_and_ends_with_the_verdict(
     assert lines[-1].startswith('not usable as it is: 1 error, 1 warning, ')
     assert main([str(SAMPLE)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        'usable: 0 errors, 0 warnings, 19 ok, 2 not measured (marker size, camera mounting)')
+        'usable: 0 errors, 0 warnings, 20 ok, 3 not measured (odom positions, marker size, '
+        'camera mounting)')
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [
