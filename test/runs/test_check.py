@@ -29,14 +29,16 @@ import numpy as np
 import pytest
 from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
+from flock_follower import check
 from flock_follower.bags import mcap_file
-from flock_follower.bags.bag import open_bag, serialize
+from flock_follower.bags.bag import deserialize, open_bag, serialize, typestore
 from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
-from flock_follower.checks.observations import Observations
+from flock_follower.checks.observations import Observations, Told
 from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 
@@ -110,6 +112,41 @@ def test_an_unknown_message_type_leaves_the_rest_of_the_recording_in_the_report(
     with open_bag(tmp_path / 'recording' / 'last_minute') as part:
         assert (part.topics.keys(), part.duration_ns) == ({'/pose'}, 60_000_000_000)
         assert not part.incomplete
+
+
+def test_a_report_of_a_long_recording_holds_its_end(tmp_path: Path) -> None:
+    array, string, second = 'diagnostic_msgs/msg/DiagnosticArray', 'std_msgs/msg/String', 10**9
+    with BagWriter(tmp_path / 'bag', ['/planner/state']) as writer:
+        for time in range(0, 401, 10):
+            message = empty(array)
+            message.status = [typestore().types['diagnostic_msgs/msg/DiagnosticStatus'](
+                0, 'planner', f'at {time} s', '', [])]
+            writer.write('/diagnostics', array, time * second, serialize(message, array))
+        for time, state in ((1, 'IDLE'), (9, 'TRACK')):
+            message = empty(string)
+            message.data = state
+            writer.write('/planner/state', string, time * second, serialize(message, string))
+    main([str(tmp_path / 'bag'), '--report', str(tmp_path / 'report.zip')])
+    with zipfile.ZipFile(tmp_path / 'report.zip') as archive:
+        archive.extractall(tmp_path)
+        assert json.loads(archive.read('diagnostics.json'))['planner']['message'] == 'at 400 s'
+    with open_bag(tmp_path / 'recording' / 'last_minute') as part:
+        found = [(m.topic, m.stamp_ns // second) for m in part.messages()]
+        (state,) = part.messages(['/planner/state'])
+        assert deserialize(state.data, string).data == 'TRACK'
+    assert found[0] == ('/planner/state', 340)
+    assert found[1:] == [('/diagnostics', time) for time in range(340, 401, 10)]
+
+
+def test_a_report_of_a_running_system_holds_the_recording_of_its_black_box(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen = Observations(told={'a/black_box': Told(0, '', {'recording': str(SAMPLE)})})
+    monkeypatch.setattr(check, '_observe', lambda options: (seen, []))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))  # without a recording in the default folder
+    for namespace, there in (('a', True), ('b', False)):
+        main(['--report', str(tmp_path / namespace), '--namespace', namespace])
+        with zipfile.ZipFile(tmp_path / namespace) as archive:
+            assert any('last_minute' in name for name in archive.namelist()) is there
 
 
 def of(topic: str, edit: Callable[[Any], None]) -> Change:
