@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Image motion compared with the motion by odometry: it shows axes, time offset, mounting and focal.
+Comparison of image motion with odometry: finds wrong axes, clock, mounting, and focal length.
 
 A camera that turns by a small rotation vector r (its own axes: x right, y down, z ahead) sees the
-scene move by (-f r_y, f r_x) px, at any distance. A displacement d adds (-f d_x, -f d_y) / depth,
-whose mean is nearer to zero. So the shift of the image gives two of the three components of r
+scene move by (-f r_y, f r_x) px, at any distance. A translation d adds (-f d_x, -f d_y) / depth,
+with a smaller mean. So the shift of the image gives two of the three components of r
 for each pair of images. Many pairs give the rotation between body and camera: of the 24 rotations
 that lay three axes onto three others, the one that explains the shifts best. A least-squares fit
 then gives the small rotation that remains, and the ratio of the shifts to those expected from the
@@ -39,7 +39,7 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, skew
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 
-#: Width, px, at which images are compared, in so many parts.
+#: Width, px, to which images are scaled for the comparison; rows and columns of parts.
 WIDTH = 192
 ROWS, COLUMNS = 2, 3  # PARTS in all
 #: Least quality of a match, 0 to 1.
@@ -98,7 +98,7 @@ def shift(before: Array, after: Array, width: int) -> Array:
 
 class AxesFit(NamedTuple):
     """
-    How well rotation explains the shifts: shares of their squares, 1 is all of it.
+    Shares of the squared shifts that rotation explains, up to 1.
 
     ``configured`` is the share with the configured axes, ``best`` that with the best rotation
     ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset

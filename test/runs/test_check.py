@@ -38,7 +38,7 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
-from flock_follower.checks.observations import Observations, Told
+from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 
@@ -140,7 +140,8 @@ def test_a_report_of_a_long_recording_holds_its_end(tmp_path: Path) -> None:
 
 def test_a_report_of_a_running_system_holds_the_recording_of_its_black_box(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen = Observations(told={'a/black_box': Told(0, '', {'recording': str(SAMPLE)})})
+    seen = Observations(statuses={
+        'a/black_box': NodeStatus(0, '', {'recording': str(SAMPLE)})})
     monkeypatch.setattr(check, '_observe', lambda options: (seen, []))
     monkeypatch.setenv('ROS_HOME', str(tmp_path))  # without a recording in the default folder
     for namespace, there in (('a', True), ('b', False)):
