@@ -92,9 +92,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if jumps := motion.events['odom jumped']:
         yield warning('odom jumps', f'{jumps} in {len(motion.states)} messages', 'none',
                       'turn off loop closure and relocalisation, or take the frame without them')
-    positions = _positions(motion.source.twist)
-    if positions is not None:
-        yield positions
+    yield from _positions(motion.source.twist)
     yield _twist(motion)
     yield from _lacking(motion)
     up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
@@ -140,7 +138,7 @@ def _frames(seen: Observations) -> Finding:
                   'have its source fill header.frame_id')
 
 
-def _positions(twist: TwistFrame) -> Finding | None:
+def _positions(twist: TwistFrame) -> Iterator[Finding]:
     """
     Check that the positions have the axes of attitude and velocity.
 
@@ -150,7 +148,7 @@ def _positions(twist: TwistFrame) -> Finding | None:
     what, wanted = 'odom positions', 'along the axes of the velocity'
     if twist.wanted == NONE or len(twist.windows) < FEW or not np.any(
             np.array(twist.windows)[:, 1]):
-        return None  # without a velocity there is nothing to compare
+        return  # without a velocity there is nothing to compare
     moved, *readings = np.swapaxes(twist.windows, 0, 1)
     same = min(readings, key=lambda velocity: float(np.sum((moved - velocity)**2)))
     turned = []
@@ -162,20 +160,21 @@ def _positions(twist: TwistFrame) -> Finding | None:
     other = np.abs(A - np.eye(3)).max(axis=1) > SIN_TURNED
     before, after = (float(left[other].sum()) for left in (
         np.sum((moved - same)**2, axis=0), least))
+    # An axis whose reversal would show is known.
+    still = ', '.join(axis for axis, gain in zip('xyz', 4.0 * np.sum(moved * same, axis=0))
+                      if gain < EVIDENT * variance)
     if before - after > max(EVIDENT * variance, 3.0 * after):
         axes = ', '.join(f'{"-" if row[k] < 0.0 else ""}{"xyz"[k]}'
                          for row in A for k in [int(np.abs(row).argmax())])
         turn = math.degrees(math.acos(max(-1.0, 0.5 * (float(np.trace(A)) - 1.0))))
-        return error(
+        yield error(
             what, f'turned by {turn:.0f} deg against the velocity' if axes == 'x, y, z' else
-            f'x, y, z move as {axes} of the velocity', wanted, 'have its source send position, '
-            'attitude and velocity in the axes of REP-103 (ENU, FLU)')
-    # An axis whose reversal would show.
-    known = 4.0 * np.sum(moved * same, axis=0) > EVIDENT * variance
-    if not known.all():
-        still = ', '.join(axis for axis, there in zip('xyz', known) if not there)
-        return unmeasured(what, f'{still} moved too little: carry it, and lift it', wanted)
-    return ok(what, 'as the velocity says', wanted)
+            f'x, y, z move as {axes} of the velocity', wanted, 'set up its source to send '
+            'position, attitude and velocity in the axes of REP-103 (ENU, FLU)')
+    elif still:
+        yield unmeasured(what, f'{still} moved too little: carry it, and lift it', wanted)
+    else:
+        yield ok(what, 'as the velocity says', wanted)
 
 
 def _twist(motion: OwnMotion) -> Finding:

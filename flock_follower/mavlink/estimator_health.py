@@ -51,9 +51,7 @@ _NEEDED: Final[dict[int, str]] = {
 #: Part of the text of PX4's arming check for a global position, see ``status_texts``.
 NO_GLOBAL_POSITION: Final[str] = 'no global position'
 UNALIGNED: Final[str] = 'its estimator lacks no flag: its yaw is not aligned; restart it'
-#: PX4's parameter of the compass, its value for none, and the advice if it has another value.
-MAG_TYPE, NO_COMPASS = 'EKF2_MAG_TYPE', 5.0
-WITHOUT_COMPASS: Final[str] = f', and set {MAG_TYPE} to {NO_COMPASS:g} if it flies without GPS'
+WITHOUT_COMPASS: Final[str] = ', and set EKF2_MAG_TYPE to 5 if it flies without GPS'
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
 GPS_SILENCE: Final[float] = 10.0
@@ -110,7 +108,7 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float,
         return f'{refusal}; its estimator lacks {", ".join(status.missing)}'
     if NO_GLOBAL_POSITION not in refusal:
         return refusal
-    advice = '' if parameters.get(MAG_TYPE) == NO_COMPASS else WITHOUT_COMPASS
+    advice = '' if parameters.get('EKF2_MAG_TYPE') == 5.0 else WITHOUT_COMPASS
     return f'{refusal}; {UNALIGNED}{advice}'
 
 
