@@ -238,7 +238,19 @@ def test_the_axes_of_an_imu_are_named_unless_they_are_configured(
     config = configured(tmp_path, f'odom_child_rpy: {list(map(float, IMU_RPY))}')
     _, found = checked(capsys, bag, '--config', config)
     assert found['odom up']['level'] == found['odom ahead']['level'] == 'ok'
-    assert_told(found, ('error', 'camera time offset', '50 ms earlier', 'exposure'))
+    assert_told(found, ('error', 'camera time offset', 'ms earlier', 'exposure'))
+
+
+def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def longer(message: Any) -> None:
+        message.k = message.k * np.array([1.2, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0, 1.0, 1.0])
+    bag = excerpt(tmp_path / 'bag', 12.0, of('/camera_info', longer))
+    config = configured(tmp_path, 'camera_rpy: [0.0, 0.1745, 0.0]')
+    code, found = checked(capsys, bag, '--config', config)
+    assert code == 1
+    assert_told(found, ('error', 'focal length', '0.8', 'this lens'))
+    assert_told(found, ('error', 'camera mounting', 'looks higher', 'camera_rpy:=['))
 
 
 def test_topics_are_taken_by_the_names_they_have(
