@@ -97,9 +97,8 @@ def _add_recording(archive: zipfile.ZipFile, recording: Path) -> None:
                              for name in bag.topics.keys() - known]
                 latched, start = [name for name in known if known[name].latched], bag.end_ns - LAST
                 with BagWriter(excerpt, latched) as part:
-                    before = {message.topic: message for message in (
-                        bag.messages(latched, stop_ns=start) if latched else ())}
-                    for message in before.values():  # what a late subscriber would receive
+                    for message in {message.topic: message for message in (  # the newest of each
+                            bag.messages(latched, stop_ns=start) if latched else ())}.values():
                         part.write(*message._replace(stamp_ns=start))
                     for message in bag.messages(known, start, bag.end_ns + 1):
                         if message.topic in known:  # without any name the bag yields all

@@ -32,8 +32,7 @@ from flock_follower.geometry import (
 )
 
 #: Errors, rad, of a warning and of an error; an error must exceed so many deviations.
-LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(8.0)
-SURE: Final = 3.0
+LOOKS, BAD_LOOKS, SURE = math.radians(4.0), math.radians(8.0), 3.0
 WHAT: Final = 'camera mounting'
 MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
 _AXES: Final = ('roll', 'pitch', 'yaw')

@@ -63,8 +63,7 @@ SLOW: Final = 0.06
 ZOOM: Final = 0.1
 #: Axes of the positions: least number of windows; least error of the velocity, m/s; the squared
 #: errors must fall by so many variances; smaller turns are those of an estimator.
-FEW: Final = 6
-STILL, EVIDENT, SIN_TURNED = 0.02, 60.0, 0.4
+FEW, STILL, EVIDENT, SIN_TURNED = 6, 0.02, 60.0, 0.4
 TURN_MOVES: Final = 'images move as odometry turns'
 IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
@@ -265,10 +264,10 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     what, wanted = 'focal length', 'images move as far as it says'
     if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
         return unmeasured(what, 'a fisheye lens' if fisheye else 'turned too little', wanted)
-    off = abs(math.log(max(fit.zoom, 1e-3)))
-    return judged(off > max(ZOOM, SURE * fit.zoom_deviation), False, what,
-                  f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far', wanted,
-                  'is the calibration of this lens, and for this size of images?')
+    wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SURE * fit.zoom_deviation)
+    return judged(
+        wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
+        wanted, 'is the calibration of this lens, and for this size of images?')
 
 
 def _offset(fit: AxesFit, known: float) -> Finding:
