@@ -62,8 +62,9 @@ SLOW: Final = 0.06
 #: Relative error of a focal length that is an error: 0.965 was measured with the right one.
 ZOOM: Final = 0.1
 #: Axes of the positions: least number of windows; least error of the velocity, m/s; the squared
-#: errors must fall by so many variances; smaller turns are those of an estimator.
-FEW, STILL, EVIDENT, SIN_TURNED = 6, 0.02, 60.0, 0.4
+#: errors must fall by so many variances; smaller turns are those of an estimator. A vehicle that
+#: is lower than this, m, was started higher up, or z points down.
+FEW, STILL, EVIDENT, SIN_TURNED, BELOW = 6, 0.02, 60.0, 0.4, -0.5
 TURN_MOVES: Final = 'images move as odometry turns'
 IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
@@ -91,7 +92,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if jumps := motion.events['odom jumped']:
         yield warning('odom jumps', f'{jumps} in {len(motion.states)} messages', 'none',
                       'turn off loop closure and relocalisation, or take the frame without them')
-    yield from _positions(motion.source.twist)
+    yield from _positions(motion.source.twist, motion.states)
     yield _twist(motion)
     yield from _lacking(motion)
     up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
@@ -137,7 +138,7 @@ def _frames(seen: Observations) -> Finding:
                   'have its source fill header.frame_id')
 
 
-def _positions(twist: TwistFrame) -> Iterator[Finding]:
+def _positions(twist: TwistFrame, states: list[OdometryState]) -> Iterator[Finding]:
     """
     Check that the positions have the axes of attitude and velocity.
 
@@ -171,7 +172,11 @@ def _positions(twist: TwistFrame) -> Iterator[Finding]:
             f'x, y, z move as {axes} of the velocity', wanted, 'set up its source to send '
             'position, attitude and velocity in the axes of REP-103 (ENU, FLU)')
     elif still:
-        yield unmeasured(what, f'{still} moved too little: carry it, and lift it', wanted)
+        measured = f'{still} moved too little: carry it, and lift it'
+        low = float(np.median([state.position[2] for state in states]))
+        yield unmeasured(what, measured, wanted) if 'z' not in still or low > BELOW else warning(
+            what, f'{measured}; z is {low:.1f} m', wanted, 'if it was not started higher up, z '
+            'points down: set up its source to send ENU (REP-103)')
     else:
         yield ok(what, 'as the velocity says', wanted)
 

@@ -567,6 +567,9 @@ def test_an_axis_that_does_not_move_is_named() -> None:
         row[4], row[9:12] = 1.5, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
     found = next(finding for finding in seen.judged() if finding.what == 'odom positions')
     assert found.level == UNMEASURED and found.measured.startswith('z moved too little')
+    for row in seen.rows:
+        row[4] = -1.5
+    assert rows(seen)['odom positions'] == WARNING
 
 
 def test_at_rest_nothing_is_guessed() -> None:
