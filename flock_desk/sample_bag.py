@@ -63,7 +63,7 @@ _INFO, _ODOMETRY = 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry'
 
 @dataclass(frozen=True)
 class Variant:
-    """What distinguishes one bag from another."""
+    """The options of one bag."""
 
     summary: str
     duration: float = 12.0

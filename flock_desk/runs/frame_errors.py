@@ -146,7 +146,7 @@ class FrameErrors:
                              *estimate.covariance[:6, :6].ravel()))
 
     def _take(self, states: array[float], state: OdometryState) -> None:
-        """Keep states in the order of their stamps; if time jumps back, begin anew."""
+        """Keep states in the order of their stamps; restart if time jumps back."""
         time = state.stamp - self._start
         if states and time <= states[-_STATE]:
             if states[-_STATE] - time <= MAX_GAP:

@@ -107,7 +107,7 @@ class PlottedFlight:
 
 
 def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
-    """Return what the report of ``fly`` shows: plots, and images of the follower's camera."""
+    """Return the pictures of the report of ``fly``: plots, and images of the follower's camera."""
     log, times = flight.log, flight.table['time']
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     return [*chapters(

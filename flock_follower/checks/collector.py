@@ -127,7 +127,7 @@ class Collector:
             self._kept.append((picture, pixels))
 
     def _picture_period(self, size: int) -> float:
-        """Return the time between images of so many bytes that are searched, s."""
+        """Return the period of searched images, s, for images of a size, bytes."""
         count = min(max(int(MOST_BYTES / max(size, 1)), FEWEST_PICTURES), MOST_PICTURES)
         return max(PICTURE_PERIOD, self._duration / count)
 

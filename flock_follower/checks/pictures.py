@@ -133,10 +133,10 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
                      'come nearer, print it larger, or use a longer lens or a finer image')
     if side < SMALL:
         return warning(what, measured, wanted,
-                       'come nearer, or print it larger: a small one is lost easily')
+                       'come nearer, or print the marker larger: a small marker is lost easily')
     if share < SELDOM:
         return warning(what, measured, f'{wanted}, most of the time',
-                       'keep it in sight: light, blur, a cut-off margin')
+                       'keep the marker in sight; check light, blur and the white margin')
     return ok(what, measured, wanted)
 
 

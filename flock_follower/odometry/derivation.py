@@ -65,7 +65,7 @@ class _WhiteJerk:
 
     :param jerk: its spectral density, (unit/s^3)^2/Hz.
     :param noise: standard deviation of a measurement: initial, least, and largest.
-    :param rate: initial standard deviation of the rate; :param acceleration: likewise.
+    :param rate: initial standard deviation of the rate; :param acceleration: of the acceleration.
     """
 
     def __init__(self, jerk: float, noise: tuple[float, float, float], rate: float,

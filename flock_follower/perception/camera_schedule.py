@@ -135,7 +135,7 @@ def _faces(T_camera_marker: Transform) -> bool:
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
-#: This often they are searched although nobody is missing, s: for markers of an id in sight.
+#: Period of searches although no neighbour is missing, s: for further markers with a known id.
 SWEEP_PERIOD = 1.0
 #: Who was measured in an image not older than this, s, is well tracked by its camera.
 FRESH = 0.25
@@ -278,7 +278,7 @@ class CameraSchedule:
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """
-        Return whether to search the whole image of a stamp, s, though nobody is missing.
+        Return whether to search the whole image of a stamp, s, although none is missing.
 
         Several cameras take turns: more of them cost no more.
         """

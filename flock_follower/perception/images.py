@@ -68,7 +68,7 @@ def _png_size(data: bytes) -> tuple[int, int]:
     """
     Return the size in IHDR, of a file that goes on to IEND.
 
-    Every chunk is a length, a name, so many bytes and a checksum.
+    Every chunk is a length, a name, the data and a checksum.
     """
     size, start = (0, 0), len(_PNG)
     while start + 8 <= len(data):

@@ -76,11 +76,11 @@ _MODERN = hasattr(_cv_aruco, 'ArucoDetector')
 @dataclass(frozen=True)
 class DetectionParams:
     """
-    What the search for markers may cost and miss.
+    Parameters of the search for markers.
 
     ``windows`` are the sides, px, of the adaptive threshold: smallest, largest, step; the time
-    is proportional to how many there are. ``min_perimeter`` is the smallest marker outline
-    looked at, as a share of the longer image side. ``threshold``: by how many grey levels black
+    is proportional to their number. ``min_perimeter`` is the smallest marker outline
+    considered, as a share of the longer image side. ``threshold``: by how many grey levels black
     must be darker than the mean of the window.
     """
 
@@ -280,7 +280,7 @@ class NeighborConfig:
     neighbors: tuple[MarkedNeighbor, ...]
 
     def by_marker(self) -> dict[int, MarkerOf]:
-        """Return the markers, and who carries them, by marker id."""
+        """Return the markers with their neighbours, by marker id."""
         return {marker.marker_id: MarkerOf(neighbor, marker)
                 for neighbor in self.neighbors for marker in neighbor.markers}
 

@@ -81,7 +81,7 @@ class RangeGate:
     """
     The gate of n series of distances.
 
-    :param most: so many in a row are refused, less one.
+    :param most: at most one less than this number is refused in a row.
     """
 
     def __init__(self, count: int = 1, most: int = 6) -> None:
@@ -90,7 +90,7 @@ class RangeGate:
         self._before: Array = np.zeros(count)  # sign of the last one used, where it surprised
         self._judged: Any = np.zeros(count, dtype=int)
         self.outliers: Array = np.zeros(count)
-        """Which share of the distances was refused of late."""
+        """Share of recent distances that was refused."""
 
     def restart(self, which: Any) -> None:
         """Forget what surprised of some (n,) bool, but not how many are refused."""
@@ -228,7 +228,7 @@ class NeighborFilter:
         return now.moved(stamp, *self._transition(stamp - now.stamp))
 
     def continued(self, max_gap: float) -> NeighborFilter:
-        """Return another filter that goes on from where this one is, over gaps up to so many s."""
+        """Return a copy of this filter that bridges gaps of up to ``max_gap`` s."""
         other = NeighborFilter(replace(self.params, max_gap=max_gap))
         other.walk, other.newest = self.walk, self.newest
         return other

@@ -106,7 +106,7 @@ class Perceiver:
         self._max_wait = max_wait
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self._epoch: int | None = None
-        self._pending: list[PendingImage] = []  # by stamp: one from the future holds nobody up
+        self._pending: list[PendingImage] = []  # by stamp: one from the future blocks no other
 
     @property
     def overdue(self) -> float | None:

@@ -257,7 +257,7 @@ class Tracker:
         return (own.smooth_pose @ camera.T_body_camera).inverse() @ body
 
     def _view(self, look: Look, delay: float) -> View | Missing:
-        """Return the view of an image's camera so long, s, after the image's stamp."""
+        """Return the view of an image's camera at a delay, s, after the image's stamp."""
         if delay not in look.views:
             own = self._odometry.at(look.stamp + look.camera.time_offset.applied + delay)
             if isinstance(own, Missing):

@@ -62,7 +62,7 @@ def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | Non
     Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
 
     :param timeout: age at which odometry is not used at all, s.
-    :param before: whether it was too slow up to now.
+    :param before: whether the odometry was too slow before.
     """
     if not spans:
         return None

@@ -80,7 +80,7 @@ def observed(motions: Mapping[str, SmoothedMotion],
 
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
-NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
+NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
 
 
 class Loss(NamedTuple):
@@ -124,7 +124,7 @@ class Memory(NamedTuple):
     motions: Mapping[str, SmoothedMotion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
-    """See ``Neighborhood``, in the last step that followed somebody; likewise ``edges``."""
+    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
     """The neighbor that it faced then."""
@@ -139,7 +139,7 @@ class Memory(NamedTuple):
     lost: Loss | None = None
     """The loss of the neighbor that it followed, while it lasts."""
     given_up: bool = False
-    """Whether it followed nobody for too long to command anything until it is engaged anew."""
+    """Whether it had no neighbor for too long; then it sends no command until engaged again."""
     begun: float | None = None
     """Time at which it left IDLE, s."""
     home: Array | None = None

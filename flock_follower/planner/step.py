@@ -163,8 +163,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
         memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
-    # The thrust bias only corrects a wrong hover thrust: it does not move the vehicle.
-    bias = np.array([0.0, 0.0, altitude.thrust_bias])
+    bias = np.array([0.0, 0.0, altitude.thrust_bias])  # corrects hover thrust, moves nothing
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - bias * params.period, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
@@ -183,9 +182,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
-        command.reason, rejected,
-        _warnings(memory, mode, me, neighbors, leader, params), float(bias[2]),
-        tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+        command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params),
+        float(bias[2]), tuple(sorted(neighbors.edges)),
+        tuple(sorted(neighbors.flock, key=lambda n: n.name)))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,

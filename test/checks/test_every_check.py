@@ -186,7 +186,7 @@ FAULTS: list[Fault] = [
           pictures(fault="encoding = '16UC1': must be one of mono8, ...")),
     Fault('a cap before the lens', BOTH, ERROR, 'images', 'black', 'take off the cap',
           pictures(brightness=3.0, contrast=1.0, markers={})),
-    Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'however it is read',
+    Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
           rows(slice(9, 12), [1.5, 1.5, 0.0])),
     Fault('no angular rates', BOTH, WARNING, 'odom angular rate', 'always zero', 'derived from',
@@ -242,8 +242,8 @@ FAULTS: list[Fault] = [
           'processor time',
           delayed('odom', 0.3)),
     Fault('little processor time left', LIVE, WARNING, 'processor', '20% of 4 cores left',
-          'end what', machine(idle=0.2)),
-    Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end what',
+          'end programs', machine(idle=0.2)),
+    Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end programs',
           machine(idle=0.02)),
     Fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_',
           machine(shared_memory_free=2.0)),
@@ -330,7 +330,7 @@ def poses(seen: Observed) -> None:
 
 
 @fault('a source that sends nothing', LIVE, ERROR, 'odom', '/vio publishes /odom, and sends '
-       'nothing', 'is it initialised')
+       'nothing', 'initialised?')
 def silent(seen: Observed) -> None:
     seen.topic('odom').arrivals = seen.topic('odom').stamps = []
     seen.rows = []
@@ -343,8 +343,8 @@ def unreliable(seen: Observed) -> None:
     seen.topic('command/trajectory').subscribers[0].reliable = True
 
 
-@fault('use_sim_time forgotten', LIVE, ERROR, 'clock', '/clock is published, planner goes by the '
-       'time of day', 'use_sim_time:=true')
+@fault('use_sim_time forgotten', LIVE, ERROR, 'clock',
+       '/clock is published, but use_sim_time is false in planner', 'use_sim_time:=true')
 def time_of_day(seen: Observed) -> None:
     seen.clock = True
     for node, own in seen.parameters.items():
@@ -390,7 +390,8 @@ def turned(seen: Observed) -> None:
     seen.autopilot = []
 
 
-@fault('north, east, down', BOTH, ERROR, 'odom up', 'its z is down', 'instead of NED and FRD')
+@fault('north, east, down', BOTH, ERROR, 'odom up', 'z of base_link is down',
+       'instead of NED and FRD')
 def north_east_down(seen: Observed) -> None:
     for row in seen.rows:
         for y in (3, 6, 10, 13):  # position, attitude, velocity, rates: half a turn about x
@@ -399,7 +400,7 @@ def north_east_down(seen: Observed) -> None:
 
 
 @fault('compressed images, and raw ones wanted', LIVE, ERROR, 'images wiring',
-       'relative_pose does not listen', 'image_transport:=compressed')
+       'relative_pose does not subscribe', 'image_transport:=compressed')
 def other_transport(seen: Observed) -> None:
     topic = lose(seen, 'image_raw')
     topic.subscribers, topic.publishers[0].type = [], COMPRESSED
@@ -459,7 +460,7 @@ def elsewhere(seen: Observed) -> None:
 
 
 @fault('odom that a node does not listen to', LIVE, ERROR, 'odom wiring',
-       'planner does not listen to /odom', '-r odom:=/odom')
+       'planner does not subscribe to /odom', '-r odom:=/odom')
 def wiring(seen: Observed) -> None:
     topic = seen.topic('odom')
     topic.subscribers = [end for end in topic.subscribers if end.node != '/planner']

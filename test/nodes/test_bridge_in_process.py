@@ -373,7 +373,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     last = bench.node._report._last.setpoint
     bench.node._report.cycle(
         Cycle(last._replace(kind=COMMAND), False, None), time.monotonic())
-    assert 'no setpoint has left for 1.0 s' in bench.problems(ahead=1.0)
+    assert 'no setpoint was sent for 1.0 s' in bench.problems(ahead=1.0)
     assert 'autopilot lost on' in bench.problems(ahead=60.0)
 
 
