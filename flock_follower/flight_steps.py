@@ -73,7 +73,7 @@ class Reports:
     battery: str = ''
 
     def value(self, node: str, key: str) -> str:
-        """Return a value of a node's diagnostics, '' if there is none."""
+        """Return a value of a node's diagnostics, or ''."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
     def missing(self, now: float) -> list[str]:
@@ -151,10 +151,10 @@ class Flight:
         self._question = due
         if self._confirm or not due:
             self.lines.append(f'{reports.bridge}: press {due[0]} for {due}' if due else
-                              'it follows: press l to land; Ctrl-C brakes and hands over')
+                              'the follower flies: press l to land; Ctrl-C brakes and hands over')
             return []
         if due in self._requested:
-            self.lines.append(f'{due} is due again, and --yes requests it once')
+            self.lines.append(f'{due} is due again, but --yes requests each step only once')
             return self.end(1, reports)
         return self._request(due)
 

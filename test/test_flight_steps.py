@@ -97,7 +97,7 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
     desk.answer('engage')
     desk.engaged = 'True'
     desk.report()
-    assert desk.asked().startswith('it follows') and desk.flight.code is None
+    assert desk.asked().startswith('the follower flies') and desk.flight.code is None
 
 
 def test_only_the_key_of_the_step_that_is_due_does_anything() -> None:
@@ -235,7 +235,7 @@ def test_without_keys_each_step_is_requested_once() -> None:
     assert requested == ['check', 'arm', 'takeoff', 'offboard', 'engage']
     desk.answer('engage')
     desk.engaged = 'True'
-    assert desk.report() == [] and desk.asked().startswith('it follows')
+    assert desk.report() == [] and desk.asked().startswith('the follower flies')
     desk.engaged = 'False'
     assert desk.report(bridge='TAKEN_OVER: offboard was left') == []
     assert 'offboard is due again' in desk.asked() and desk.flight.code == 1

@@ -42,7 +42,7 @@ matplotlib.rcParams.update({
     'axes.grid': True, 'grid.alpha': 0.25, 'grid.linewidth': 0.6, 'axes.spines.top': False,
     'axes.spines.right': False, 'axes.titlelocation': 'left', 'axes.titlesize': 11})
 
-# Okabe and Ito's palette: told apart by the colour-blind, and by lightness in grey.
+# Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 COLOURS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
@@ -108,7 +108,7 @@ class PlottedFlight:
 
 
 def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
-    """Return what the report of ``fly`` shows: plots, and images of the follower's camera."""
+    """Return the pictures of the report of ``fly``: plots, and images of the follower's camera."""
     log, times = flight.log, flight.table['time']
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     return [*chapters(
@@ -262,7 +262,7 @@ def portrait(record: LiveRecord) -> bytes:
 
 
 def with_gaps(table: Table) -> Mapping[str, Array]:
-    """Return a table with a row of NaN where images are missing, and so no line."""
+    """Return a table with a row of NaN if images are missing, and so no line."""
     breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
     return {name: np.insert(column, breaks, np.nan) for name, column in table.items()}
 

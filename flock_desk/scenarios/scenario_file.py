@@ -75,7 +75,7 @@ def load(name: str) -> Scenario:
 
     A variant in such a file is FILE.yaml:NAME.
 
-    :raises ScenarioError: where there is none, or its file is wrong.
+    :raises ScenarioError: if it does not exist, or its file is wrong.
     """
     file, _, variant = name.partition(':')
     path = Path(file)
@@ -94,7 +94,7 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+    :raises ScenarioError: also if it has operations or a flock, which flights in lock step
         alone know.
     """
     scenario = load(name)
@@ -111,7 +111,7 @@ def parse(text: str, path: str, variant: str = '') -> Scenario:
     """
     Return the scenario in the text of a file, or a variant of it.
 
-    :raises ScenarioError: naming file, line, key, value and what is allowed.
+    :raises ScenarioError: naming file, line, key, value and the allowed values.
     """
     root, reader, stem = _composed(text, path), _ScenarioReader(path), Path(path).stem
     if root is None:
@@ -148,7 +148,7 @@ def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
     Return a scenario with some keys of its flock changed, to those of a YAML mapping.
 
     :param path: what to call it in an error.
-    :raises ScenarioError: also where the scenario has no flock.
+    :raises ScenarioError: also if the scenario has no flock.
     """
     if scenario.flock is None:
         raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')

@@ -45,7 +45,7 @@ from flock_follower.parameters.spec import filled
 #: rad: difference between the yaws of odometry and autopilot, from which on there is a warning;
 #: the bridge refuses above the second.
 YAWS: Final = (0.12, 0.35)
-#: Share of unusable messages above which nobody can fly by the rest.
+#: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02
 #: deg: mean lean of base_link from which on there is a warning, and an error.
 LEAN, LYING = 20.0, 40.0
@@ -77,7 +77,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} say nothing: {motion.why}',
+                     f'{motion.lost} of {count} say nothing: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialised; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
@@ -123,7 +123,7 @@ def _frames(seen: Observations) -> Finding:
         return error(what, f'changed {len(seen.frames) - 1} times, now {measured}', wanted,
                      'is it published by two sources? Every change starts perception anew')
     return judged(False, not header, what, measured, wanted,
-                  'have its source fill header.frame_id')
+                  'let the odometry source fill header.frame_id')
 
 
 def _twist(motion: OwnMotion) -> Finding:
@@ -135,8 +135,8 @@ def _twist(motion: OwnMotion) -> Finding:
         return error(what, f'read in {twist.wanted}, the positions say {twist.found}', wanted,
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
-        return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
-                       f'{DERIVED}; look at the source')
+        return warning(what, f'off by {twist.contradiction:.2f} m/s in either frame', wanted,
+                       f'{DERIVED}; check the velocity of the odometry source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
@@ -150,17 +150,17 @@ def _lacking(motion: OwnMotion) -> Iterator[Finding]:
     zero = 'angular velocity' in missing
     yield judged(False, zero, 'odom angular rate', 'always zero' if zero else
                  f'up to {math.degrees(fastest):.0f} deg/s', 'that of the gyroscope',
-                 'works: derived from the attitudes, which is noisier; have it sent if its source '
-                 'can')
+                 'works: derived from the attitudes, which is noisier; let the source send it if '
+                 'possible')
     parts = sorted({name.rsplit(' ', 1)[-1] for name in missing if 'covariance' in name})
     yield judged(False, bool(parts), 'odom covariances',
-                 f'none, or not all, of {" and ".join(parts)}' if parts else 'there',
+                 f'incomplete for {" and ".join(parts)}' if parts else 'there',
                  'those of its filter',
-                 'works: odom_std stands in; set that to what your odometry errs by')
+                 'works: odom_std is used instead; set it to the errors of your odometry')
 
 
 def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterator[Finding]:
-    """Check that up is up and ahead is ahead, the time offset and the focal length."""
+    """Check the vertical and forward axes, the time offset and the focal length."""
     x, y, z, w = np.array([state.quaternion for state in motion.states]).T
     up = np.mean([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], 1)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
@@ -179,18 +179,19 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
                     f'odom_child_rpy:={rpy} fits the images' if turned else
                     'its child frame is a camera or its IMU (x right, y down): '
                     'odom_child_rpy:=[-1.5708,0.0,-1.5708]' if axis == '-y' else
-                    'its child frame is not base_link: set odom_child_rpy to how it sits on the '
-                    'body (child_frame_id tells which it is), see docs/sensors.md')
+                    'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its '
+                    'attitude on the body, see docs/sensors.md')
     elif turned and fit is not None and fit.turn[2, 2] < -0.5:
-        yield error(what, 'images turn the other way round: its z is down', wanted,
-                    'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
-                    'the camera upside down (camera_rpy)?')
+        yield error(what, 'images turn the other way round: z of base_link is down', wanted,
+                    'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; '
+                    'or is the camera upside down (camera_rpy)?')
         return
     else:
         yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,
-                     'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
+                     'hold the vehicle level; else set the pose of the IMU on the body '
+                     '(odom_child_rpy)')
     if fit is None:
-        yield unmeasured('odom ahead', 'turned too little: turn it by hand, 30 deg', TURN_MOVES)
+        yield unmeasured('odom ahead', 'turned too little: turn the vehicle by 30 deg', TURN_MOVES)
         yield unmeasured('camera time offset', 'turned too little', IN_TIME)
         return
     what, share = 'odom ahead', f'turning explains {max(fit.configured, 0.0):.0%} of it'
@@ -200,7 +201,7 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
     elif fit.configured >= EXPLAINED:
         yield ok(what, share, TURN_MOVES)
     elif not turned:
-        yield unmeasured(what, f'{share}; turn it by hand', TURN_MOVES)
+        yield unmeasured(what, f'{share}; turn the vehicle by hand', TURN_MOVES)
     period = motion.source.period
     if fit.best >= EXPLAINED and period <= SLOW:
         yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))

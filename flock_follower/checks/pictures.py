@@ -79,10 +79,11 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     if straight and not rectified and np.any(camera.distortion):
-        return error(what, f'{measured}, distorted, but the topic says rectified', wanted,
-                     'start relative_pose with rectified:=true')
+        return error(what, f'{measured}, distorted, but the topic is marked as rectified',
+                     wanted, 'start relative_pose with rectified:=true')
     if rectified and not straight and any(seen.calibration.d):
-        return warning(what, f'{measured}; rectified is true, the topic does not say so', wanted,
+        return warning(what, f'{measured}; rectified is true, but the topic is not marked as '
+                       'rectified', wanted,
                        'rectified:=true only for images whose distortion was removed')
     return ok(what, measured, wanted)
 
@@ -125,10 +126,10 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
                      'come nearer, print it larger, or use a longer lens or a finer image')
     if side < SMALL:
         return warning(what, measured, wanted,
-                       'come nearer, or print it larger: a small one is lost easily')
+                       'come nearer, or print the marker larger: a small marker is lost easily')
     if share < SELDOM:
         return warning(what, measured, f'{wanted}, most of the time',
-                       'keep it in sight: light, blur, a cut-off margin')
+                       'keep the marker in sight; check light, blur and the white margin')
     return ok(what, measured, wanted)
 
 

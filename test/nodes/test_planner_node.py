@@ -250,7 +250,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     rig.send('camera_info', CameraInfo(width=640, height=480, k=np.zeros(9)))
     rig.fly()
     assert counters['invalid camera_info'] == 1
-    rig.wait(lambda: rig.reports('no /camera_info: flies without regard'))
+    rig.wait(lambda: rig.reports('no /camera_info: flies without bounds'))
     rig.send('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
     place = PointStamped()
     place.point.z = 0.4
