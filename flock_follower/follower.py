@@ -140,7 +140,7 @@ class Follower:
     Perception, planner and setpoint control on one clock; every time is in ns.
 
     :param planner: gathers inputs and takes one step per tick, with ``params``.
-    :param control: what may go out, and what it is; None while the bridge is dead.
+    :param control: the setpoint gate; None while the bridge is dead.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None if neighbors come from elsewhere.
@@ -293,7 +293,7 @@ class Follower:
             self.sharing.take_message(state, time)
 
     def advance(self, time: int) -> None:
-        """Let everything happen that is due up to a time."""
+        """Process all events that are due up to a time, ns."""
         if self._start is None:
             self._now = self._start = time
             self._next_tick = time + self._period
@@ -311,7 +311,7 @@ class Follower:
             self._now = max(self._now, waited)
             self._process_due()
 
-    # What is due.
+    # Due work.
 
     def _seconds(self, time: int | None = None) -> float:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""

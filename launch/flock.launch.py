@@ -43,7 +43,7 @@ ARGUMENTS = {
 
 
 def start(context: LaunchContext) -> list[Any]:
-    """Return what is started for each follower."""
+    """Return the launch actions of each follower."""
     values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     if not (values['followers'].isdigit() and 1 <= int(values['followers']) <= MOST):
         raise ValueError(f'followers = {values["followers"]!r}: must be an integer in [1, {MOST}]')

@@ -82,7 +82,7 @@ class OperatedVehicle:
         self.asked = False
         """Whether offboard was called, by the operations and HEARTBEATs so far."""
         self.unasked = 0
-        """How many setpoints left while it was not."""
+        """Number of setpoints sent while offboard was not requested."""
         self.obeying_since: float | None = None
         """Since when the vehicle flies setpoints, s; None while it does not."""
 

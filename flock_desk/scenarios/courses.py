@@ -80,7 +80,7 @@ def course(scenario: Scenario, run: int) -> Course:
     """
     Return the leader's course in one run; the follower starts at the origin, facing along x.
 
-    :raises ValueError: where the motion needs more than its acceleration.
+    :raises ValueError: if the motion needs more than its acceleration.
     """
     motion, rng = scenario.leader, scenario.random(run, 'leader')
     distance = rng.uniform(*scenario.start.distance)

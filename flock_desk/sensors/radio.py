@@ -30,12 +30,12 @@ Message = TypeVar('Message')
 
 class Radio(Generic[Message]):
     """
-    Messages within flocks of m; no flock receives those of another.
+    Messages within flocks of m vehicles; no flock receives messages of another.
 
-    :param company: m.
-    :param delay: from sending to arrival, s.
+    :param company: m, the number of vehicles in each flock.
+    :param delay: time from sending to arrival, s.
     :param loss: share of messages that do not arrive at one of the receivers.
-    :param generators: of chance, one for each follower, flock by flock.
+    :param generators: random generators, one for each follower, flock by flock.
     """
 
     def __init__(self, company: int, delay: float, loss: float,
@@ -75,7 +75,7 @@ class Radios:
         self._walk = errors.bias_walk * errors.rate ** -0.5
 
     def measure(self, distance: Array) -> Array:
-        """Return what is measured of true distances (n,), m, one period after the last."""
+        """Return measurements of true distances (n,), m, one period after the last."""
         errors = self._errors
         drawn = np.stack([g.standard_normal(2) for g in self._generators])
         chance = np.stack([g.random(2) for g in self._generators])

@@ -13,16 +13,16 @@
 # limitations under the License.
 
 """
-ArduCopter, as far as a companion computer meets it: GUIDED, take-off, landing, the EKF failsafe.
+ArduCopter as a companion computer uses it: GUIDED, take-off, landing, the EKF failsafe.
 
-Measured on ArduCopter 4.7, and as its source has it, see docs/autopilots.md. On the ground
-setpoints do nothing, MAV_CMD_NAV_TAKEOFF comes first. Each group of three ignore bits counts as
-set where any of them is, so that setpoints of mixed axes are none, and stop the vehicle without a
-word; so do those of positions and velocities here, which the bridge never sends it. Nothing checks
-for NaN; no speed limit applies to accelerations; without setpoints it goes on for GUID_TIMEOUT
-(3 s), then stops. Unlike PX4 it integrates an acceleration to a velocity and a position and holds
-on to those: vertical acceleration 0 keeps the height. A position that the EKF has lost ends in
-LAND without a position. After landing it stays in LAND, in which it does not arm.
+Measured on ArduCopter 4.7, and by its source code, see docs/autopilots.md. On the ground setpoints
+have no effect: MAV_CMD_NAV_TAKEOFF comes first. A group of three ignore bits counts as set if any
+of them is: setpoints of mixed axes stop the vehicle without a message. Here setpoints of position
+and velocity, which the bridge never sends, do so, too. NaN is not checked, and no speed limit
+applies to accelerations. Without setpoints the last one is flown for GUID_TIMEOUT (3 s); then the
+vehicle stops. Unlike PX4, ArduCopter integrates an acceleration to a velocity and a position, and
+holds those: vertical acceleration 0 keeps the height. If the EKF loses its position, the vehicle
+enters LAND without a position. After landing it stays in LAND, in which it cannot be armed.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class ArduCopter(FlightController):
         self._velocity = self._velocity + forward * dt
         self._position = self._position + self._velocity * dt
         if not np.all(np.isfinite([self._velocity, self._position])):
-            # A real one does not refuse NaN; what it then does is undefined. This one lets the
+            # A real one does not refuse NaN; its behaviour then is undefined. This one lets the
             # motors idle and falls, so that no test overlooks it.
             return IDLE
         self._follow_yaw(dt)

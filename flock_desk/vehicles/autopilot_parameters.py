@@ -68,7 +68,7 @@ class AutopilotParameters:
         if name not in self._values:
             return []
         if message.get_type() == 'PARAM_SET':
-            with contextlib.suppress(ValueError):  # the answer tells the old value then
+            with contextlib.suppress(ValueError):  # the answer then has the old value
                 self.set(name, self._recode(message.param_value, name, '<f', '<i'))
         # ArduPilot does not look up the index of a parameter asked for by its name.
         return [self._message(name)]

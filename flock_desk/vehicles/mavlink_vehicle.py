@@ -95,12 +95,12 @@ class MavlinkVehicle:
         return []
 
     def _answer_timesync(self, message: Any, now: float) -> list[Any]:
-        # Zero would make an answer a question, and two polite ends talk for ever.
+        # Zero would turn an answer into a request, and both ends would answer for ever.
         nanoseconds = max(1, round((now - self._start) * 1e9))
         if message.tc1 == 0:
             return [mavlink.MAVLink_timesync_message(nanoseconds, message.ts1)]
         if 0 <= nanoseconds - message.ts1 < _LONGEST_WAY:
-            # Whoever answered did so half way between question and answer.
+            # The other end answered half way between request and answer.
             self._clock_offset = (0.5 * (message.ts1 + nanoseconds) - message.tc1) * 1e-9
         return []
 
@@ -118,7 +118,7 @@ class MavlinkVehicle:
         return messages
 
     def _note_mode(self, now: float) -> None:
-        """Let what tells of the mode be due when it changes: as PX4 1.16 and ArduCopter 4.7 do."""
+        """Send the message with the mode at each change, as PX4 1.16 and ArduCopter 4.7 do."""
         mode, time = self._mode_sent
         news = mode != self.controller.custom_mode
         if not self._px4:
@@ -137,7 +137,7 @@ class MavlinkVehicle:
         return texts
 
     def _encoded(self, message_id: int, now: float) -> list[Any]:
-        """Return the message with an id; none where there is nothing to tell."""
+        """Return the message with an id; an empty list if it has no content."""
         message = self._encoders[message_id](now)
         return [] if message is None else [message]
 
@@ -258,7 +258,7 @@ class MavlinkVehicle:
             0, self.controller.custom_mode, self.controller.intended_mode)
 
     def _battery(self) -> tuple[int, int, int]:
-        """Return the voltage of a cell, mV, the current, cA, and what is left, per cent."""
+        """Return the voltage of a cell, mV, the current, cA, and the remaining charge, %."""
         charge = self.equipment.charge
         current = round(1e2 * (CURRENT if self.controller.armed else 0.5))
         if charge is None:

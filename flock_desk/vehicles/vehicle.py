@@ -15,8 +15,8 @@
 """
 A quadrotor that flies acceleration setpoints: thrust, tilt, gravity and the lags in between.
 
-Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It flies
-one vehicle, or as many as its arrays have rows, each for itself.
+Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It has
+one vehicle, or as many independent ones as its arrays have rows.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class VehicleParams:
-    """How the vehicle answers; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
+    """Dynamics of the vehicle; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
 
     attitude_time: float = 0.15
     """Time constant of tilting, s."""

@@ -90,7 +90,7 @@ class Bag:
 
     ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
     read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
-    ``incomplete`` says why the bag was never finished, '' where it was.
+    ``incomplete`` says why the bag was never finished, '' if it was.
     """
 
     def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader,

@@ -46,7 +46,7 @@ class TopicEnd:
 
 @dataclass
 class TopicSeen:
-    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is none."""
+    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is missing."""
 
     publishers: list[TopicEnd] = field(default_factory=list)
     subscribers: list[TopicEnd] = field(default_factory=list)
@@ -192,7 +192,7 @@ class Observations:
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
-    """By the full name of the node, without the slash before it."""
+    """Newest status by the full name of the node, without its first slash."""
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""

@@ -22,8 +22,8 @@ is aligned; until then they are kept, and not used.
 Two frames are related by a vehicle known in both at one time: the sender seen by this vehicle,
 this vehicle seen by the sender, or any vehicle that both see or that sends its own state. The
 relations of an unknown frame are collected until a first fit succeeds; later each updates the
-filter (``alignment``), and one that does not fit is refused. A sender whose relations go on not to
-fit has begun a new frame, which is aligned anew.
+filter (``alignment``), and one that does not fit is refused. If the relations of a
+sender repeatedly do not fit, its frame has changed and is aligned again.
 """
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ class Sharing:
         self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
 
     def _align_all_anew(self, forget_senders: bool) -> None:
-        """Begin anew, as the own frame is another; ``forget_senders``: time is another, too."""
+        """Reset after a change of the own frame; ``forget_senders``: after a jump of time, too."""
         self._seen.clear()
         self._forget_frame(self.name)
         self._pairs.clear()
@@ -331,8 +331,9 @@ class Sharing:
         """
         Return the received vehicles that are not seen, in the own frame, one state per vehicle.
 
-        Each has the stamp of its state; the covariances are those of its prediction to ``now``.
-        Of several states of one vehicle the most certain one is used: they may share errors.
+        Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
+        several states of one vehicle are known, the most certain one is used: their errors may be
+        correlated.
         """
         for sender in list(self.senders.values()):
             if now - sender.received > FORGOTTEN:
@@ -385,7 +386,7 @@ class Sharing:
             return OWN_FUTURE
         active = [s for s in self.status(now) if s.silent <= MESSAGE_AGE_MAX]
         if not active:
-            return 'nobody else talks'
+            return 'no other sender'
         return '' if any(not s.why for s in active) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in active)
 

@@ -60,7 +60,7 @@ class Vehicle(NamedTuple):
     altitude: float | None = None
     """m above the origin of its local frame."""
     shown_time: float = math.inf
-    """When it last showed what the request is about, by HEARTBEAT or CURRENT_MODE, s."""
+    """When HEARTBEAT or CURRENT_MODE last showed the requested state, s."""
     airborne: bool = True
     """Whether it flies, as far as it reports."""
 
@@ -74,24 +74,24 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What is requested, by which command, and how the vehicle shows that it is reached."""
+    """A request: its command, and how the vehicle shows that it is fulfilled."""
 
     name: str
     command: int
     params: Callable[[Dialect], tuple[float, ...]]
     reached: Callable[[Vehicle], bool]
     modes: Callable[[Dialect], tuple[str, ...]] | None = None
-    """The modes that it leads through; None: any. In another mode the pilot has taken over."""
+    """The modes that it leads through; None: any. In any other mode the pilot has taken over."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
     insists: bool = False
     """Whether it is requested even if the vehicle already shows it."""
     timeout: float = CONFIRM_TIMEOUT
-    """How long to wait for the vehicle to show it, s."""
+    """Time to wait for the requested state, s."""
     before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
     """What has to be reached first, by the state of the vehicle when the request begins."""
     instead: Callable[[Dialect], Goal | None] = lambda dialect: None
-    """What is requested if the autopilot refuses it."""
+    """The request that replaces it if the autopilot refuses it."""
 
 
 def _mode_goal(name: str, mode: Callable[[Dialect], str], **options: Any) -> Goal:
@@ -124,9 +124,9 @@ def arm(value: bool, streaming: bool = False) -> Goal:
     """
     Return the goal of arming or disarming; disarming in the air is refused by autopilots.
 
-    After a landing ArduPilot stays in LAND and PX4 returns to OFFBOARD, in which they do not arm
-    (PX4 does while ``streaming`` setpoints), or to AUTO.TAKEOFF, in which PX4 climbs as soon as it
-    is armed: another mode first.
+    After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
+    does not arm in LAND. PX4 arms in OFFBOARD only while ``streaming`` setpoints, and climbs at
+    once if armed in AUTO.TAKEOFF. So arming requests another mode first.
     """
     def armable(vehicle: Vehicle) -> Goal | None:
         mode, dialect = vehicle.status.mode, vehicle.dialect

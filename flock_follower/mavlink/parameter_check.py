@@ -40,7 +40,7 @@ RETRY_PERIOD: Final[float] = 1.0
 ATTEMPTS: Final[int] = 3
 #: Questions under way at a time: slow links have other things to carry.
 AT_ONCE: Final[int] = 2
-#: Entries after this comment matter only where odometry is forwarded.
+#: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: How the comment of an entry begins of which any other value but 0 will do.
 ANY_BUT_ZERO: Final[str] = 'Any but 0'
@@ -71,7 +71,7 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     Return the entries of a ``.params`` or ``.parm`` file.
 
     :param forwarding: whether those that matter only with forwarded odometry are wanted too.
-    :raises ValueError: naming the first line that is none of an entry, a comment, or empty.
+    :raises ValueError: naming the first line that is neither an entry, a comment, nor empty.
     """
     found: list[Recommendation] = []
     comments: list[str] = []
@@ -170,7 +170,7 @@ class ParameterCheck:
             self._unanswered = [other for other in self._unanswered if other != name]
 
     def result(self) -> CheckResult | None:
-        """Return what was found, None until every parameter was answered or given up."""
+        """Return the differences, None until every parameter was answered or given up."""
         values, unanswered = self.values.copy(), self._unanswered.copy()
         if self._waiting or self._asked or not self._names:
             return None
@@ -201,7 +201,7 @@ class Rule(NamedTuple):
     advice: str
     """What follows NAME = VALUE: why, and what to set."""
     forwarding: bool = False
-    """Whether it matters only where odometry is forwarded."""
+    """Whether it matters only if odometry is forwarded."""
 
 
 _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if the bridge died; '
@@ -252,5 +252,5 @@ def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> st
     for name in names:
         parameters.again(name)
     return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
-            f'bridge, or not fuse what is forwarded ({_ANYWAY} flies all the same)'
+            f'bridge, or not fuse forwarded odometry ({_ANYWAY} flies all the same)'
             if names else '')

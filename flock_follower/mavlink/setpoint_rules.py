@@ -139,7 +139,7 @@ class DisturbanceObserver:
         Take what has happened since the last step, until ``now``, s.
 
         :param sent: acceleration (3,), m/s^2, that was flown; None: none of ours, which forgets.
-        :param velocity: measured (3,), m/s; None where none is known, which waits.
+        :param velocity: measured (3,), m/s; None without one, which waits.
         """
         elapsed, self._time = now - self._time, now
         if sent is None:
@@ -186,13 +186,13 @@ class Setpoint(NamedTuple):
     acceleration: Array
     """(3,), m/s^2."""
     yaw: float | None
-    """rad; None where none is known."""
+    """rad; None without one."""
     limited: str
     """What limited it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
 
 
 class Held(NamedTuple):
-    """What is kept while there is no command; None where it is not known."""
+    """Yaw and height to keep without a command; None if unknown."""
 
     yaw: float | None = None
     """rad."""
@@ -209,14 +209,14 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
            held: Held = NOT_HELD,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
-    Return the setpoint that may be sent now, and the reason where it is not the command.
+    Return the setpoint that may be sent now, and the reason if it is not the command.
 
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
     acceleration is finite, at most ``a_max`` long, never leads to a speed above ``v_max``, and
     does not point upwards on the ground.
 
     :param full: the limits at start, for braking and separation; ``limits`` may be lower.
-    :param known: the vehicle's motion, as far as it is known, and what of it may be believed.
+    :param known: the vehicle's motion, as far as it is known and valid.
     :param command: the newest command; it should have applied ``command_age`` seconds ago.
     :param link_age: how long the autopilot has been missing, s.
     :param armed: whether it is armed; before, setpoints are level.
@@ -225,7 +225,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param place: where it is in its envelope.
     :param unplaced: why a height that was known is not any more, or ''.
-    :param held: what to keep where there is no command.
+    :param held: yaw and height to keep without a command.
     :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
     :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
     """

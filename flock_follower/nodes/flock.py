@@ -52,8 +52,8 @@ PERIOD = 0.1  # s
 
 SPECS = [
     Spec('vehicle_name', '',
-         'name of this vehicle, unique in the flock, as others know it in their neighbors_file; '
-         'empty: the namespace'),
+         'name of this vehicle, unique in the flock, as in the neighbors_file of others; empty: '
+         'the namespace'),
     *specs_of(SourceParams(), 'odom_'),
 ]
 

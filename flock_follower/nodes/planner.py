@@ -22,8 +22,8 @@ steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``plann
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
-``planner/engage`` is called again. What it decides, and why, is in
+disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
+``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """
 
@@ -84,7 +84,7 @@ FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DISTANCE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
+BRIDGE_QOS = STATE_QOS  # latched: received at once by a planner that starts later
 
 Dated = TypeVar('Dated', OdometryState, AccelerationState)
 #: ns between the stamps of a neighbour's state and of its acceleration, two messages.
@@ -270,7 +270,7 @@ class Planner(FlockNode):
         return response
 
     def _missing(self) -> list[str]:
-        """Return what is missing before it follows."""
+        """Return the missing condition before it follows."""
         fault = self._loop.odometry_fault(self._now(), self._settings.current)
         missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
         missing += filter(None, [self._loop.waiting(self._bridge_age())])
@@ -315,7 +315,7 @@ class Planner(FlockNode):
         for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
             del values[key]
         values.update({'state': decision.state.value, 'reason': decision.reason,
-                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
+                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
                        'guarded_commands': self._guarded, 'limits': decision.limits,
                        'warnings': '; '.join(decision.warnings),
@@ -357,8 +357,8 @@ class Planner(FlockNode):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
         if view or self._decision is None or self._decision.state is State.IDLE:
             return None
-        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
-                      'the camera sees')
+        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
+                      'that keep the leader in the image')
 
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:

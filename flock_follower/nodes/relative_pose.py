@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The perception node: images and one's own odometry in, the neighbours' states out.
+The perception node: images and own odometry in, the neighbours' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
@@ -67,7 +67,7 @@ UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, th
 
 
 class _Camera:
-    """One camera of the node: its topics, and what is amiss with its images."""
+    """One camera of the node: its topics, and the faults of its images."""
 
     def __init__(self, node: RelativePose, values: CameraValues, transport: str) -> None:
         self.name = values.name
@@ -109,7 +109,7 @@ class _Camera:
 
 
 class RelativePose(FlockNode):
-    """Feeds the perceiver from topics, publishes its estimates, and reports what is dropped."""
+    """Feeds the perceiver from topics, publishes its estimates, and reports dropped messages."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
@@ -242,7 +242,7 @@ class RelativePose(FlockNode):
         self._neighbors.publish(state)
 
     def _show_learnt(self, now: float) -> Problem | None:
-        """Show what was learnt of clocks, noise and ranges; it is no problem."""
+        """Show the estimates of clock offsets, noise and range errors."""
         values = self.diagnostics.values
         for name, camera in self._tracker.cameras.items():
             noise = camera.noise

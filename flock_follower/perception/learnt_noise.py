@@ -26,8 +26,8 @@ a neighbour sideways: errors of the odometry, of its interpolation and of the ca
 Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
 shutter, a bent print, motion blur.
 
-``LearntMotion``: how much more, or less, a neighbour and the own odometry's velocity change than
-``FilterParams`` has it, along each axis of odom.
+``LearntMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
+follow the motion of a neighbour and the errors of the own velocity.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ import numpy as np
 
 from flock_follower.geometry import Array, skew
 
-#: Innovations over which the noise is learnt; at first over as many as there were, and these.
+#: Number of innovations over which the noise is learnt; initial count of innovations.
 LEARNT = 120
 FIRST = 15
-#: An innovation counts at most with so many times its variance: one far out is a slip.
+#: The square of an innovation is limited to this many times its variance.
 LIMIT = 16.0
-#: The most that is believed, rad, and as share of the distance.
+#: Largest value that is used, rad, and as share of the distance.
 MOST = 0.05
-#: The least variance of the attitude, as share of the initial one.
+#: Lower limit of the variance of the attitude, as share of the initial one.
 LEAST = 0.04
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
 class LearntNoise:
     """
-    The noise of one's own attitude, rad, about each axis, and of the distance, a share of it.
+    The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
 
-    :param initial: that of the attitude before any was learnt; that of the distance is 0.
+    :param initial: initial value for the attitude, rad; the distance starts at 0.
     """
 
     def __init__(self, initial: float) -> None:
@@ -63,13 +63,13 @@ class LearntNoise:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was learnt."""
+        """Reset the estimates."""
         self._across, self._along = self._initial, 0.0
         self._count = FIRST
 
     @property
     def attitude(self) -> float:
-        """Return the noise of one's own attitude, one standard deviation, rad."""
+        """Return the noise of the own attitude, one standard deviation, rad."""
         return math.sqrt(self._across)
 
     @property
@@ -78,9 +78,9 @@ class LearntNoise:
         return math.sqrt(self._along)
 
     def covariance(self, sight: Array) -> Array:
-        """Return what it adds to a pose measured so far away (3,), m: (6, 6)."""
-        # An attitude error e turns what is seen about oneself: it moves a marker at r by e x r,
-        # and tilts it by e.
+        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
+        # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
+        # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()
         leverage[:3] = skew(-sight)
         covariance: Array = leverage.dot(self._across * leverage.T)
@@ -90,7 +90,7 @@ class LearntNoise:
 
     def take(self, change: Array, expected: Array, sight: Array) -> None:
         """
-        Take how a position's innovation changed: ``Step.change`` and ``Step.expected``.
+        Take the change of a position's innovation: ``Step.change`` and ``Step.expected``.
 
         :param sight: from the own vehicle to the neighbour (3,), m.
         """
@@ -119,14 +119,13 @@ def _excess(squared: float, expected: float) -> float:
 MEAN_TIME: Final = 0.25
 NOISE_TIME: Final = 2.0
 MOTION_TIME: Final = 1.0
-#: The mean innovation, squared, of a filter that follows well enough, as share of white noise: at
-#: 1 it would follow the fast errors of the own velocity too slowly for its covariance.
+#: Target of the squared mean innovation, as share of that of white noise. With 1 the filter would
+#: follow fast errors of the own velocity too slowly for its covariance.
 AIM: Final = 0.85
-#: The most that one image counts for; limits of the factor.
+#: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.05, 16.0)
-#: After a longer gap, s, the mean begins anew; a neighbour unseen for so long may do as
-#: ``FilterParams`` has it, at least.
+#: After a longer gap, s, the mean restarts, and the factor is at least 1: ``FilterParams`` holds.
 GAP: Final = 0.3
 
 
@@ -147,9 +146,9 @@ class LearntMotion:
 
     def take(self, dt: float, innovation: Array, expected: Array) -> None:
         """
-        Take an innovation of the position (3,), m, and the covariance expected of it (3, 3).
+        Take an innovation of the position (3,), m, and its expected covariance (3, 3).
 
-        :param dt: since the one before, s.
+        :param dt: time since the innovation before, s.
         """
         if dt > GAP:
             self._share, self._means = 0.0, [0.0] * 3

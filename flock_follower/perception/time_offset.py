@@ -45,37 +45,37 @@ from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_motion import FilterParams
 
-#: Standard deviation of an offset before anything is known, s; and the largest applied.
+#: Initial standard deviation of an offset, s; largest offset that is applied, s.
 PRIOR: Final[float] = 0.1
 MOST: Final[float] = 0.2
-#: Offsets of the grid, s, relative to the one that is known from the start.
+#: Step and half width of the grid of offsets about the initial one, s.
 STEP, FURTHEST = 0.01, 0.14
 GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)
-#: Least length of a batch, s, and number of its points; most points in this time.
+#: Least length of a batch, s; least number of its points, and the most in that time.
 BATCH: Final[float] = 0.6
 FEWEST, MOST_POINTS = 8, 40
 #: Noise of a point, m, and spectral density of the jerk, (m/s^3)^2/Hz: their ratio counts.
 NOISE, JERK = 0.0015, 0.5
 #: Deviations are widened: errors of successive images are alike.
 WIDENING: Final[float] = 2.0
-#: An estimate is applied once it differs from the applied offset by so many deviations, at first
-#: and later, and by so much, s.
+#: An estimate is applied once it differs from the applied offset by this many deviations, at first
+#: and later, and by this much, s.
 SIGNIFICANT: Final = (4.0, 1.5)
 LEAST: Final[float] = 0.001
-#: While the deviation is below LEAST, so long, s, are no points taken after a batch.
+#: Pause after a batch, s, while the deviation is below LEAST.
 REST: Final[float] = 3.0
-#: Batches that are remembered: clocks drift.
+#: Number of batches that are used: clocks drift.
 REMEMBERED: Final[float] = 60.0
 
 
 class TimeOffset:
     """
-    The offset of the camera's stamps, s: the one ``applied`` and the ``estimate``.
+    The offset of the camera's stamps, s: the ``applied`` one and the ``estimate``.
 
-    ``before`` was applied until the newest change.
+    ``before`` is the offset that was applied until the newest change.
 
-    :param offset: the one known from the start; it is applied at first.
-    :param fixed: whether it stays applied.
+    :param offset: initial value, applied from the start.
+    :param fixed: whether to keep the initial value.
     """
 
     def __init__(self, offset: float = 0.0, fixed: bool = False) -> None:
@@ -83,7 +83,7 @@ class TimeOffset:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was found out."""
+        """Reset the estimate."""
         self.applied = self.before = self.estimate = self._first
         self.deviation = PRIOR
         """Standard deviation of the estimate, s."""
@@ -95,9 +95,9 @@ class TimeOffset:
 
     @property
     def describe(self) -> str:
-        """Return what is known and what is done with it, in words."""
+        """Return the estimate and how it is used, as text."""
         if self.fixed:
-            return f'{1e3 * self.applied:.1f} ms, as told'
+            return f'{1e3 * self.applied:.1f} ms, as configured'
         known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
         if self._found:
             return f'{known}, applied'
@@ -190,9 +190,9 @@ def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
 
 class MountedCamera:
     """
-    A camera mounted at ``T_body_camera`` (optical), with what lasts from image to image.
+    A camera mounted at ``T_body_camera`` (optical), and its state from image to image.
 
-    :param time_offset: finds out by how much its images' stamps are off.
+    :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
     :param attitude_noise: of the own attitude as its images show it, before it is learnt, rad.
     :param rectified: whether its images are undistorted already.
@@ -210,26 +210,26 @@ class MountedCamera:
         self.restart(())
 
     def restart(self, names: Iterable[str]) -> None:
-        """Forget what was learnt and done, and begin anew with neighbours of these names."""
+        """Reset all estimates and searches, for neighbours of these names."""
         self.noise.restart()
         self.time_offset.restart()
         self.searched: float | None = None
-        """Stamp of the newest image that was searched as a whole, s."""
+        """Stamp of the newest whole image searched, s."""
         self.swept: float | None = None
-        """Stamp of the newest one, or the first, searched although nobody was missing, s."""
+        """Stamp of the newest whole image searched although no neighbour was missing, s."""
         self.wanting: float | None = None
-        """Stamp of the newest image that somebody was missing in, s."""
+        """Stamp of the newest image in which a neighbour was missing, s."""
         self.thorough = False
-        """How a whole image is searched the next time."""
+        """Whether the next search of a whole image is thorough."""
         self.unchecked = dict.fromkeys(names, 0)
-        """Images for which a neighbour's mirrored attitude need not be looked at."""
+        """Number of images for which a neighbour's mirrored attitude need not be checked."""
         self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
         self.delays = dict.fromkeys(names, 0.5 * self.readout_time)
         """How long after an image's stamp a neighbour is exposed, s."""
         self.measured: dict[str, float] = {}
-        """When it saw a neighbour last, by the clock of that one's filter, s."""
+        """When it last saw a neighbour, by the clock of that neighbour's filter, s."""
         self.vain: dict[str, float] = {}
-        """Stamp of the image in which one whom another camera sees was not found, s."""
+        """Stamp of the newest image without a neighbour that another camera sees, s."""
 
     def exposed(self, model: CameraModel, measurement: Measurement) -> float:
         """Return how long after the image's stamp a neighbour was exposed, s, and remember it."""

@@ -94,7 +94,7 @@ class Edges(NamedTuple):
     near: float
     far: float = math.inf
     margin: float = 0.0
-    """Of each edge, m."""
+    """Margin to each edge, m."""
     spread: float = 0.0
     """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
@@ -113,7 +113,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
-    Without a direction, or if something is not finite, there are none.
+    Without a direction, or with a value that is not finite, the list is empty.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
@@ -129,7 +129,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     unit = n.tolist()
     rate = scalar_product(unit, w)
     common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
-    # Whoever may be anywhere in a sphere that grows comes nearer by that.
+    # The growing sphere of possible places comes nearer at its growth rate.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)
@@ -166,7 +166,7 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
 
 
 def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
-    """Return the bound that stops it along a unit vector within so much, m."""
+    """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, float(along @ velocity)
     # Until the command acts it goes on as it does.
     speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,

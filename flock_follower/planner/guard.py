@@ -175,7 +175,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     """
     Return the least height, m, at which to let a closing neighbor pass that is out of sight.
 
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, there is none: -inf. The default
+    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
     of ``altitude_max`` is no ceiling.
 
     :param held: altitude to hold, m.
@@ -212,7 +212,7 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
     Without a camera a neighbor seen last may be anywhere: the follower does not back away.
 
     :param velocity: own velocity when the command acts (3,), m/s.
-    :param neighbors: the neighbors at hand in TRACK, else nobody.
+    :param neighbors: the neighbors at hand in TRACK, else none.
     :param blinded: whether no images are processed.
     """
     near = list[Bound]()

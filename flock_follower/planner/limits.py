@@ -34,11 +34,11 @@ from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
 
-# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
-# norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
+# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in
+# a caller's check, cannot exceed it; a limited vector thus passes a second time unchanged.
 INSIDE = 1.0 - 1e-12
-# Accelerations are limited to this share of a_max: what is sent has the 24 bits of a MAVLink
-# float, and rounding to those must not carry it over a_max.
+# Accelerations are limited to this share of a_max: rounding to the 24 bits of a MAVLink float must
+# not exceed a_max.
 SENT_INSIDE = 1.0 - 2e-7
 
 # Reasons of bounds.
@@ -47,7 +47,7 @@ STEEP = 0.1  # horizontal share of a direction below which no horizontal command
 
 
 class LimitedCommand(NamedTuple):
-    """An acceleration made safe, and what was done to it."""
+    """A limited acceleration, and the limits that changed it."""
 
     acceleration: Array
     """Acceleration (3,), m/s^2, in the frame of the inputs."""
@@ -66,7 +66,7 @@ class Bound(NamedTuple):
     least: float
     reason: str
     distance: float = 0.0
-    """From the neighbor that causes it, m."""
+    """Distance of the neighbor that causes the bound, m."""
     seen: bool = True
     """Whether that neighbor is in sight."""
 

@@ -50,8 +50,9 @@ class PlannerLoop:
     """
     Gathers inputs, and passes them to one step of the core per tick.
 
-    It is active while it is engaged and the bridge reports that it flies the commands. ``memory``
-    is the state that the last step left; ``missed`` counts the ticks that did not come in time.
+    The planner is active while it is engaged and the bridge reports that it flies the commands.
+    ``memory`` is the state that the last step left; ``missed`` counts the ticks that did not come
+    in time.
 
     :param require_bridge: whether the bridge has to report that; else engaging is enough.
     """
@@ -63,7 +64,7 @@ class PlannerLoop:
         """Fields of view of the cameras; () if unknown."""
         self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None
-        """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
+        """Height at which the vehicle was armed, in the frame of the odometry, m, if known."""
         self._require_bridge = require_bridge
         self.engaged = False
         """Whether commands are requested; set by :meth:`engage`."""
@@ -93,7 +94,7 @@ class PlannerLoop:
         """
         Take, and return, the state that the bridge reports; see ``modes``.
 
-        A pilot who takes over disengages it: it commands again only once it is engaged anew.
+        A pilot's takeover disengages the planner: it commands only after it is engaged again.
 
         :param silence: time since the message before, s.
         """

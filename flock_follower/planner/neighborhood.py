@@ -24,7 +24,7 @@ it last looks where it was, to both sides, then all round. Meanwhile it follows 
 their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
 vehicle would turn to another follower, and the whole flock would hover without its leader.
 
-Warnings name what is beyond the follower's means, and members of the flock whose position is
+Warnings name motions that the follower cannot follow, and members of the flock whose position is
 unknown.
 """
 
@@ -61,7 +61,7 @@ class Neighborhood(NamedTuple):
     level: Neighbor | None
     """The neighbor whose altitude it follows."""
     peers: Sequence[Neighbor] = ()
-    """Those at the ends of its edges, to meet at one altitude, if no leader is at hand."""
+    """The neighbors at its edges, to meet at one altitude, if no leader is at hand."""
 
 
 NOBODY = Neighborhood((), {}, frozenset(), None, None)
@@ -131,7 +131,7 @@ REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> list[str]:
-    """Return warnings of what is beyond the follower's means."""
+    """Return warnings of motions that the follower cannot follow."""
     v_max, most = params.v_max, params.climb_rate
     near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
@@ -161,7 +161,7 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 
     The search begins within ``coast_timeout``, if all other neighbors are only received: a vehicle
-    that has another one in view stays with that. It ends when a leader is at hand again.
+    that has another one in view stays with that. The search ends when a leader is at hand again.
     """
     last = memory.leader
     if last is None or any(n.member.role == LEADER for n in neighbors.flock):
@@ -192,9 +192,9 @@ def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
                    if me.stamp - n.stamp <= params.resume_timeout)
     missing -= memory.flock.keys()  # with those lost a moment ago
     advice = '' if any(n.received for n in neighbors.flock) else (
-        ': not a formation for what its cameras see; more of them, or words, would help')
-    return [f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
-            f'{advice}'] if missing else []
+        ': more cameras or flock messages are needed for this formation')
+    return [f'{", ".join(sorted(missing))} neither seen nor received, not kept clear of{advice}'
+            ] if missing else []
 
 
 def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,

@@ -31,7 +31,7 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
-TOLERANCE = 1e-9  # of lengths of the order of 1; what is left over is cut off by the caller
+TOLERANCE = 1e-9  # of lengths of the order of 1; the caller cuts off the rest
 ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below TOLERANCE
 PARALLEL = 1e-11  # slope along a line of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
@@ -102,7 +102,7 @@ class _Line(NamedTuple):
     high: float
     """At most ``low`` where the line misses what the discs share."""
     gap: float
-    """By how much it misses; at most 0 if it does not."""
+    """Distance by which the line misses the discs; at most 0 if it meets them."""
 
     @classmethod
     def of(cls, normal: complex, level: float, discs: Discs) -> _Line:

@@ -110,7 +110,7 @@ class Decision(NamedTuple):
 
 
 class _Mode(NamedTuple):
-    """The state of one step, and what it rests on."""
+    """The state of one step, and the inputs that it depends on."""
 
     state: State
     reason: str
@@ -163,8 +163,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
         memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
-    # The thrust bias only corrects a wrong hover thrust: it does not move the vehicle.
-    bias = np.array([0.0, 0.0, altitude.thrust_bias])
+    bias = np.array([0.0, 0.0, altitude.thrust_bias])  # corrects hover thrust, moves nothing
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - bias * params.period, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
@@ -183,9 +182,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
-        command.reason, rejected,
-        _warnings(memory, mode, me, neighbors, leader, params), float(bias[2]),
-        tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+        command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params),
+        float(bias[2]), tuple(sorted(neighbors.edges)),
+        tuple(sorted(neighbors.flock, key=lambda n: n.name)))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -332,7 +331,7 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
     command = limit_horizontal(unlimited, vertical, velocity, *limits, params.period, rising)
     if params.guard and (mode.state is not State.SEARCH or memory.flock):
         command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # What is still to be flown is a guess: the measured velocity is limited, too.
+    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = strongest
     final = limit_command(command.acceleration, me.velocity, *limits, params.period,
@@ -370,7 +369,7 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
               leader: Neighbor | None, params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means, and what it does about neighbors not seen."""
+    """Return warnings: neighbors that it cannot follow, and the reaction to lost ones."""
     if mode.state is State.TRACK:
         search = '' if leader is None else (
             f'looks for {leader.name}, not known of for {me.stamp - leader.stamp:.1f} s')

@@ -13,24 +13,23 @@
 # limitations under the License.
 
 """
-Which altitude to fly at, and the vertical acceleration that gets there.
+Altitude and yaw control: the altitude to hold, the vertical acceleration and the yaw.
 
 The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
-loses one that climbs or descends. It is controlled with the characteristic polynomial
-s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, and an integral that takes up what the
-autopilot's estimate of the hover thrust errs by.
+loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
+s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, with an integral that corrects errors of
+the autopilot's hover thrust.
 
-It stops in time before the lowest and the highest altitude: the nearer they are, the slower it may
-approach them, by where it is when a command acts. A target that ends there is no more than that:
-the vehicle passed it by 0.25 m, by the climb of the target, by what was still to be flown, and by
-an integral that had wound up.
+The vehicle stops in time before the lowest and the highest altitude: the nearer they are when a
+command acts, the slower it may approach them. A target that ends there is not enough: the vehicle
+overshot it by 0.25 m, because of the target's climb, of commands not yet flown, and of a wound-up
+integral.
 
-The noise of the neighbour's vertical velocity is kept out of the command, without lag for one that
-climbs: what is new in it counts little where its acceleration is known, and what is as small as
-the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
-is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
+The neighbour's vertical velocity is smoothed, without lag if its acceleration is known. A
+velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
+after a loss, is reduced slowly: with the delay of the vehicle, a fast climb overshoots ``v_max``.
 
-The yaw turns the camera to the neighbor, after it, or round in search of it.
+The yaw turns the camera to the neighbor, or turns round to search for it.
 """
 
 from __future__ import annotations
@@ -70,11 +69,11 @@ class Altitude(NamedTuple):
     highest: float
     """m."""
     climb: float = 0.0
-    """How fast ``held`` changes, m/s."""
+    """Rate of ``held``, m/s."""
     thrust_bias: float = 0.0
     """The integral, m/s^2."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
+    """Vertical velocity of the neighbour that is followed, m/s; None without one."""
 
     @classmethod
     def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
@@ -91,7 +90,7 @@ class Altitude(NamedTuple):
 
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return it after following a neighbour, at the own time, for some time, s."""
+        """Return the altitude after ``elapsed`` s of following a neighbour."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
         goal = float(leader.position[2]) + params.altitude_offset
@@ -106,7 +105,7 @@ class Altitude(NamedTuple):
             neighbor_climb = due + CLIMB_GAIN * (neighbor_climb - due)
         significant = 0.0
         if within == goal:
-            share = (neighbor_climb / CLIMB_NOISE) ** 4  # of it that is more than its noise
+            share = (neighbor_climb / CLIMB_NOISE) ** 4  # share that exceeds its noise
             significant = min(max(neighbor_climb * share / (1.0 + share), -most), most)
         ahead = self.held + significant * elapsed
         ahead = min(max(ahead + HEIGHT_GAIN * (within - ahead), self.lowest), self.highest)
@@ -119,11 +118,11 @@ class Altitude(NamedTuple):
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
-        Return it after meeting followers at one altitude, at the own time, for some time, s.
+        Return the altitude after ``elapsed`` s of meeting other followers at one altitude.
 
-        They follow this vehicle, too: a vehicle that took their mean at once would answer its own
-        motion, and all would leave together. So slowly, and with half of their climb, the way
-        round has a gain below 1 at every frequency, whoever is joined to whom.
+        The others follow this vehicle, too. If it took their mean at once, it would follow its own
+        motion, and all would drift together. With this slow rate and half of their climb, the
+        loop gain is below 1 at every frequency, for every neighbor graph.
         """
         height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
             [n.position for n in others], [n.velocity for n in others]))
@@ -138,9 +137,9 @@ class Altitude(NamedTuple):
                    least: float = -math.inf, most: float = math.inf,
                    coming: float = 0.0) -> tuple[Altitude, float]:
         """
-        Return it, and the vertical acceleration, m/s^2, for the next period.
+        Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
-        :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
+        :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
             lowest and the highest altitude go before.
         :param coming: vertical velocity, m/s, that is commanded and not yet flown.
         """
@@ -170,7 +169,7 @@ class Altitude(NamedTuple):
             BEYOND < above < FAR_BEYOND and rate > -RETURNING)
         share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
         bias = self.thrust_bias + share * w ** 3 * error * elapsed
-        # Anti-windup: what a limit takes away the integral does not ask for as well.
+        # Anti-windup: a limited acceleration does not increase the integral.
         if (vertical - nominal) * (bias - self.thrust_bias) < 0.0 and (
                 abs(bias) > abs(self.thrust_bias)):
             bias = self.thrust_bias

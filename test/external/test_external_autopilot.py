@@ -115,9 +115,9 @@ def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(personality, s
 @pytest.mark.parametrize(('received', 'forwarded', 'reported'), [
     (None, '', 'no pose of a vehicle within 0.4 s: nothing arrives$'),
     # An autopilot without a position is told from one that is not there.
-    (Report.say, '', 'PX4 is heard, but sends no LOCAL_POSITION_NED: it has no position'),
+    (Report.say, '', 'PX4 is connected, but sends no LOCAL_POSITION_NED: it has no position'),
     (Report.estimate, FORWARDED,
-     'PX4 is heard, but sends no HIL_STATE_QUATERNION.*it would feed itself$')])
+     'PX4 is connected, but sends no HIL_STATE_QUATERNION.*it would feed itself$')])
 def test_where_no_pose_comes_it_says_so_in_time(two, received, forwarded, reported):
     speak = partial(received, two[0]) if received else lambda: True
     with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:.*{reported}"):
@@ -153,7 +153,7 @@ def test_both_count_from_where_the_follower_was_first_heard_of(two):
 
 
 @pytest.mark.parametrize(('silent', 'received', 'reported'), [
-    (0, True, '^truth_connection = .*PX4 is heard, but sends no HIL_STATE_QUATERNION; its own '
+    (0, True, '^truth_connection = .*PX4 is connected, but sends no HIL_STATE_QUATERNION; its own '
               'estimate will not do where two vehicles are flown elsewhere'),
     (1, True, '^leader_truth_connection = .*its own estimate will not do'),
     (1, False, '^leader_truth_connection = .*no pose of a vehicle within 1 s: nothing arrives$')])
@@ -183,7 +183,7 @@ def test_whose_poses_stall_is_told_and_what_is_missing(two):
             assert stalled == ''  # the leader's may be late
         elif 0.17 + LONGEST_GAP * 1e-9 < missing < LATE - 0.03:
             assert stalled == 'poses of the leader come too far apart: no image between them'
-    assert stalled.startswith('no pose of the leader for 0.9 s: no image: PX4 is heard')
+    assert stalled.startswith('no pose of the leader for 0.9 s: no image: PX4 is connected')
     assert 'odometry' not in stalled and vehicles.gone(now) == ''
     stalled = vehicles.stalled(now + LATE + 0.1, flown)
     assert stalled.startswith('no pose of the vehicle for 0.6 s: no image, no odometry: ')

@@ -174,7 +174,7 @@ def test_why_nothing_is_heard_is_told() -> None:
     sharing = Sharing('f1')
     assert sharing.why_silent(EPOCH) == 'no own odometry'
     sharing.take_own(own())
-    assert sharing.why_silent(EPOCH) == 'nobody else talks'
+    assert sharing.why_silent(EPOCH) == 'no other sender'
     sharing.take_message(state(), EPOCH)
     assert sharing.why_silent(EPOCH) == (
         'not aligned with f2: neither sees the other, nor do both see one vehicle')

@@ -89,7 +89,7 @@ def test_what_is_no_danger_or_was_waived_is_not_refused(waits, options, odometry
     ({'start': 'landed'}, 0.0, 2.5, 'no HEARTBEAT from the autopilot'),
     ({'start': 'landed'}, 1.5, 2.5, 'disarmed: arm first'), ({}, 1.5, 2.5, 'already in the air'),
     ({'start': 'armed', **never('LOCAL_POSITION_NED')}, 1.5, 2.5,
-     'nothing would tell when the height is reached'),
+     'the height reached would be unknown'),
     ({'start': 'armed', 'parameters': {'MIS_TAKEOFF_ALT': 10.0}}, 7.0, 1.0,
      'PX4 would climb to MIS_TAKEOFF_ALT = 10 m'),
     ({'start': 'armed', **never('PARAM_VALUE')}, 7.0, 1.0, 'MIS_TAKEOFF_ALT is not known yet'),

@@ -121,7 +121,7 @@ def test_ardupilots_words_say_why():
                                     'no setpoint stream'),
     (HOLD, 'OFFBOARD', 58.0,
      'hold refused: temporarily rejected; POSCTL refused: temporarily rejected: no transmitter; '
-     'AUTO.LAND refused: temporarily rejected; PX4 tells the cause only to a ground station: look '
+     'AUTO.LAND refused: temporarily rejected; PX4 sends the cause only to a ground station: look '
      'there, or set announce_as_gcs')])
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
     status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')

@@ -80,10 +80,10 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
 
 
 @pytest.mark.parametrize(('who', 'autopilot', 'silence'), [
-    ({'system': 7}, PX4, 'heard system id 7, not target_system 1'),
+    ({'system': 7}, PX4, 'received system id 7, not target_system 1'),
     ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4, 'no autopilot with system id 1'),
     ({}, mavlink.MAV_AUTOPILOT_GENERIC,
-     "heard GENERIC QUADROTOR, which autopilot = 'auto' does not speak")])
+     "received GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
 def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_answered(
         who, autopilot, silence):
     bench = Bench()

@@ -137,7 +137,7 @@ def flock() -> Iterator[Flock]:
 
 def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     flock.run(0.3, seeing=False)
-    assert 'nobody else talks' in flock.status('front')['message'] or (
+    assert 'no other sender' in flock.status('front')['message'] or (
         'not aligned with rear' in flock.status('front')['message'])
     flock.run(2.5)
     flock.wait(lambda: flock.states['front'])

@@ -151,4 +151,4 @@ def test_the_offset_is_described_in_words() -> None:
     flown(0.02, 4.0, found)
     assert found.describe.startswith(('19.', '20.'))
     assert found.describe.endswith(' ms, applied')
-    assert TimeOffset(0.012, fixed=True).describe == '12.0 ms, as told'
+    assert TimeOffset(0.012, fixed=True).describe == '12.0 ms, as configured'

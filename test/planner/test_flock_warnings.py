@@ -26,8 +26,8 @@ from flock_follower.planner.step import step
 FOUR = {'leader': Member(), 'a': Member('follower'), 'b': Member('follower'),
         'tower': Member('avoid')}
 PARAMS = PlannerParams(vehicles=FOUR)
-NOT_KEPT_CLEAR = ' neither seen nor heard of, and not kept clear of'
-CAMERA = ': not a formation for what its cameras see; more of them, or words, would help'
+NOT_KEPT_CLEAR = ' neither seen nor received, not kept clear of'
+CAMERA = ': more cameras or flock messages are needed for this formation'
 PLACES = {'leader': (2.0, 0.0, 2.0), 'a': (1.0, 1.8, 2.0), 'b': (0.0, -2.1, 2.0)}
 
 

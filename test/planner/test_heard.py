@@ -71,8 +71,8 @@ def test_words_are_used_up_to_their_own_age() -> None:
 
 
 @pytest.mark.parametrize(('seen', 'received', 'state', 'reason'), [
-    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'nobody seen'),
-    (0.6, 0.9, State.TRACK, 'nobody seen'), (None, 1.1, State.COAST, 'no neighbor seen')])
+    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'no neighbor in sight'),
+    (0.6, 0.9, State.TRACK, 'no neighbor in sight'), (None, 1.1, State.COAST, 'no neighbor seen')])
 def test_the_state_says_whether_somebody_is_seen(seen: float | None, received: float | None,
                                                  state: State, reason: str) -> None:
     now, why = next_state(True, '', seen, 1.1, PARAMS, received=received)

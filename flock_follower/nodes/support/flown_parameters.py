@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters that other nodes fly with, as a file of parameters that ``evaluate`` takes."""
+"""Writes the parameters of the flying nodes to a parameter file for ``evaluate``."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _NEIGHBORS = 'neighbors_file'
 
 class FlownParameters:
     """
-    Asks nodes for their parameters, again whenever it is told that they have changed.
+    Requests the parameters of nodes, again after each change that they report.
 
     :param nodes: their names, in the namespace of ``node``.
-    :param note: is given the name and the text of a file to keep, whenever there is a new one.
+    :param note: called with the name and the text of each new file.
     """
 
     def __init__(self, node: Node, nodes: Collection[str],
