@@ -118,10 +118,7 @@ def _excess(squared: float, expected: float) -> float:
 #: learnt motion.
 MEAN_TIME: Final = 0.25
 NOISE_TIME: Final = 2.0
-MOTION_TIME: Final = 1.0
-#: Target of the squared mean innovation, as share of that of white noise. With 1 the filter would
-#: follow fast errors of the own velocity too slowly for its covariance.
-AIM: Final = 0.85
+MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.05, 16.0)
@@ -162,7 +159,7 @@ class LearntMotion:
                     0.5 * (off - self._before[k])**2 - self._noises[k])
             self._before[k] = off
             self._means[k] += weight * (off - self._means[k])
-            surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - AIM
+            surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - 1.0
             factor = self.factors[k] * math.exp(
                 min(dt, GAP) / MOTION_TIME * min(surplus, STRONGEST))
             self.factors[k] = min(max(factor, FACTORS[0]), FACTORS[1])

@@ -453,8 +453,8 @@ class Tracker:
         change, estimate = self._filters[name].change, self._filters[name].newest
         if change is not None and estimate is not None:
             camera.noise.take(*change, estimate.position - view.own.travel)
-        point = camera.T_body_camera.apply(measurement.T_camera_body.apply(measurement.reference))
-        shift = camera.time_offset.take(name, time, point, self._odometry)
+        point = measurement.T_camera_body.apply(measurement.reference)
+        shift = camera.time_offset.take(name, time, point, camera.T_body_camera, self._odometry)
         if not shift:
             return
         camera.noise.restart()
