@@ -52,6 +52,7 @@ _MIN_APART = 4.0  # grey levels between black and white, both in the shade
 #: Where black or white spread more than this, as a variance against half of what they are apart,
 #: squared, they are not what they should be, and tell nothing.
 _MAX_SPREAD = 0.35
+_SATURATED = 250.0  # grey levels
 
 
 class Windows(NamedTuple):
@@ -68,9 +69,11 @@ class Windows(NamedTuple):
     white: Array
     black: Array
     places: NDArray[np.intp]
+    shown: NDArray[np.bool_]
+    around: Any
 
 
-def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
+def windows(grid: Array, white: NDArray[np.bool_], around: int = 0) -> Windows:
     """Return the windows on cells at columns and rows (c, 2), white or black as (c,)."""
     column, row = (grid - grid.min(axis=0)).T
     size = max(w * h for w, h in SHAPES)
@@ -89,35 +92,39 @@ def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
     most = max(len(some) for some in places)
     return Windows(cells, (white[cells] & counted).astype(float),
                    (~white[cells] & counted).astype(float),
-                   np.array([np.resize(some, most) for some in places]))
+                   np.array([np.resize(some, most) for some in places]), white, slice(around, None))
 
 
 def read(brightness: Array, seen: Windows) -> Array:
     """
     Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
 
-    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells.
+    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells, NaN
+    where a reflex dazzles the camera: a saturated cell that should be black.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
-    for colour in (seen.white, seen.black):  # of the others: a cell does not judge itself
+    for colour in (seen.white, seen.black * (values < _SATURATED)):  # a cell does not judge itself
         some = values * colour
         sums.append([total.sum(axis=-1, keepdims=True) - total
                      for total in (colour, some, some * values)])
     (whites, white, white2), (blacks, black, black2) = sums
-    light, dark = white / whites, black / blacks
+    light, dark = white / whites, black / np.maximum(blacks, 1.0)
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
     shown = (values - 0.5 * (light + dark)) / half
-    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
+    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD) & (blacks > 0.0)
     # Best is a window that is even, and in which the cell is as any black or white one.
     odd = spread + (np.abs(shown) - 1.0)**2
     odd, shown = (part.reshape(len(values), -1) for part in (
         np.where(told, odd, np.inf), np.where(told, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
-    colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
-    return colours
+    colours = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
+    saturated = brightness >= _SATURATED
+    # Where paper is as bright as a reflex, it is not a reflex that makes a cell white.
+    lit = saturated[:, seen.around].mean(axis=1, keepdims=True) <= _MOST_DAZZLED
+    return np.where(saturated & ~seen.shown & lit, np.nan, colours)
 
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
@@ -129,6 +136,7 @@ _LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Where else a cell is looked at, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+_MOST_DAZZLED = 0.25  # share of the inner cells that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
@@ -176,7 +184,7 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
     return CellCode(
         marker.T_body_marker.apply(centers), grid, bits, border,
         max(correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
-        windows(grid, white),
+        windows(grid, white, order.size - int((from_edge < 0).sum())),
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
         np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
 
@@ -213,9 +221,11 @@ def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
     """Return whether all cells (c,), black -1 to white 1, are those of a marker."""
     inner, around = read[:code.bits.size], read[code.bits.size + code.border:]
     border = read[code.bits.size:code.bits.size + code.border]
+    dazzled = np.isnan(inner)
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
-    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0).sum())
-    return (wrong < max(0.5 * code.errors, 1.0) and _is_word(inner, code)
+    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0)[~dazzled].sum())
+    return (wrong < max(0.5 * code.errors, 1.0) and dazzled.mean() <= _MOST_DAZZLED
+            and _is_word(np.where(dazzled, 0.0, inner), code)
             and np.count_nonzero(border < 0.0) >= _MIN_BORDER * code.border
             and np.count_nonzero(around > 0.0) >= _MIN_AROUND * len(around))
 

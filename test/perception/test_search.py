@@ -64,10 +64,11 @@ def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,
 def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) -> None:
     camera = make_camera(width=width, height=480)
     pose = facing((0.14 * width / 640 * 1.6, -0.1, 1.2), (0.1, 0.3, 0.2))
-    found = search.everywhere(render(camera, {3: pose}, rays=3), DICTIONARY, thorough)
+    found = search.everywhere(render(camera, {3: pose}, rays=3), DICTIONARY,
+                              LEADER.markers if thorough else None)
     assert found.ids.tolist() == [3]
     errors = found.corners[0] - corners_of(camera, pose)
-    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.0)
+    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.5)
     assert np.abs(errors.mean(axis=0)).max() < 0.35
 
 
@@ -119,7 +120,7 @@ def test_a_thorough_search_reads_a_marker_in_uneven_light(kind: str, least: int)
     for seed in range(10):
         pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * seed))
         image = in_uneven_light(render(CAMERA, {3: pose}), pose, seed, kind)
-        detections = search.everywhere(image, DICTIONARY, True, LEADER.markers)
+        detections = search.everywhere(image, DICTIONARY, LEADER.markers)
         found.append(detections.ids.tolist() == [3] and np.abs(
             detections.corners[0] - corners_of(CAMERA, pose)).max() < 3.0)
     assert sum(found) >= least
@@ -130,4 +131,4 @@ def test_no_other_marker_in_uneven_light_is_taken_for_the_one_sought(kind: str) 
     for other in range(4, 14):
         pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * other))
         image = in_uneven_light(render(CAMERA, {other: pose}), pose, other, kind)
-        assert 3 not in search.everywhere(image, DICTIONARY, True, LEADER.markers).ids
+        assert 3 not in search.everywhere(image, DICTIONARY, LEADER.markers).ids
