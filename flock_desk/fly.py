@@ -16,13 +16,13 @@
 A closed-loop flight on the desk: the simulator in place of camera, odometry and both vehicles.
 
 ``python -m flock_desk.fly --scenario indoor`` starts simulator, relative_pose, planner
-and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that nobody
-outside this machine can hear; arms, changes to offboard mode, engages, and flies the scenario.
+and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that
+other machines cannot receive; arms, changes to offboard mode, engages, and flies the scenario.
 Exit code 0 only if every bound holds; 3 if the machine was too busy: then nothing is judged.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
 flown by an autopilot that runs already, see docs/desk.md: from the ground, and back to it. With
-``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
+``--leader-truth`` its leader is the vehicle of a second autopilot, which another program flies.
 
 ``--followers 2`` flies a column: each follower with nodes, namespace, vehicle and simulator of its
 own, its camera on the vehicle of the one before it.
@@ -37,12 +37,13 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from flock_desk.runs.column import column_chapters, column_figures
 from flock_desk.runs.console import guarded
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH
 from flock_desk.runs.judge import FigureBound, Judgement, nearest, scenario_bounds
 from flock_desk.runs.record import clear, LiveRecord, locked, PICTURE, read_flown, set_aside
 from flock_desk.runs.report import announce, Chapter, report
-from flock_desk.runs.summary import column_figures, scenario_figures
+from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
 from flock_follower.ranges import Range
@@ -58,7 +59,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
         prog='fly', description='Fly a scenario on the desk, through the real nodes.',
         epilog=f'scenarios: {", ".join(names())}')
     parser.add_argument('--scenario', default='indoor', metavar='NAME',
-                        help='of a file in config/scenarios, or the path of one (%(default)s)')
+                        help='a name in config/scenarios, or the path of a file (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
     parser.add_argument('--duration', type=float, default=0.0, metavar='S',
                         help='fly no longer than this, s; never longer than the scenario (as '
@@ -71,7 +72,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
                        help='where the bridge finds it: udp:HOST:PORT where it sends to, '
                        'tcp:HOST:PORT where it listens')
     group.add_argument('--truth', default='', metavar='URL',
-                       help='another link, on which it tells where the vehicle is '
+                       help='another link, on which it sends the true place '
                        f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
     group.add_argument('--leader-truth', default='', metavar='URL',
                        help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
@@ -154,7 +155,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
         judgements = report(
             out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
             scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
-            partial(_column_pictures, scenario, flights), parts=summaries)
+            partial(column_chapters, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
     return announce(summary, judgements, pages, out)
 
@@ -166,22 +167,17 @@ def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
     return scenario_chapters(flight)
 
 
-def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import column_chapters
-    return column_chapters(scenario, flights)
-
-
 def cautions(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings: a busy machine, a flight cut short."""
-    told = []
+    warnings = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
     if skipped > BUSY:
-        told.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
+        warnings.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
                     'rendered in time, which the follower feels as a camera that stops; fly again '
                     'when it is idle')
     if early := (summary['external'] or {}).get('ended_early'):
-        told.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
-    return told
+        warnings.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
+    return warnings
 
 
 if __name__ == '__main__':

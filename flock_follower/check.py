@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Report what is wrong with a running system, or with a recording, before anything flies.
+Report the faults of a running system, or of a recording, before a flight.
 
 ``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes and the
 autopilot's messages through the bridge. ``check BAG`` reads a recording, without ROS, and reports
@@ -52,7 +52,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.checks.topic_names import full_name, parse_remaps
 from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
 from flock_follower.resources import resource
@@ -69,7 +69,7 @@ _COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m',
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(
-        prog='check', description='Say in plain words what is wrong with a system (without BAG), '
+        prog='check', description='Report the faults of a running system (without BAG), '
         'or a recording, before anything flies. It changes nothing.')
     parser.add_argument('bag', type=Path, nargs='?', metavar='BAG',
                         help='.mcap, .db3, .bag or ROS 2 bag folder; none: the running system')
@@ -88,7 +88,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
     parser.add_argument('--report', type=Path, metavar='FILE', help='also write a zip file for a '
                         'bug report: versions, findings, parameters, diagnostics, the last minute '
-                        'of BAG or of the newest recording in the default folder')
+                        'of BAG, of the black box that runs, or of the newest recording in the '
+                        'default folder')
     options = parser.parse_args(args)
     if not 1.0 <= options.seconds <= MOST_SECONDS:
         parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
@@ -105,8 +106,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _refuse(error)
     except ModuleNotFoundError as error:
-        return _refuse(f'{error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-                       'package that package.xml names?')
+        return _refuse(f'{error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+                       'package in package.xml')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
@@ -144,8 +145,10 @@ def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
 
 def _report(options: argparse.Namespace, seen: Observations,
             findings: Sequence[Finding]) -> None:
-    recording = options.bag or newest_recording(folder(
-        {'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace))
+    recorder = seen.statuses.get(full_name('black_box', options.namespace).lstrip('/'))
+    running = Path(recorder.values.get('recording', '')) if recorder else Path()
+    recording = options.bag or (running if running.name and running.exists() else newest_recording(
+        folder({'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace)))
     try:
         write_report(options.report, seen, table(seen, findings), as_json(seen, findings),
                      recording)
@@ -195,7 +198,7 @@ def _rows(finding: Finding, colours: bool) -> list[str]:
         rows[0] = rows[0].replace(level, f'{_COLOURS[finding.level]}{level}\x1b[0m', 1)
     if finding.advice:
         indent = ' ' * _WIDTHS[0]
-        # What is to be copied stays in one piece.
+        # Text to copy is not wrapped.
         whole = finding.advice.replace('--remap ', '--remap\0').replace('-r ', '-r\0')
         rows += [row.replace('\0', ' ') for row in textwrap.wrap(
             f'-> {whole}', COLUMNS, initial_indent=indent, subsequent_indent=f'{indent}   ',

@@ -62,18 +62,18 @@ STATES: Mapping[str, Color] = {
 
 
 class Shape(NamedTuple):
-    """One shape; ``name`` tells it from others, and replaces the one drawn before."""
+    """One shape; it replaces the shape of the same ``name`` that was drawn before."""
 
     name: str
     kind: str
     """The name of a constant of ``visualization_msgs/Marker``."""
     color: Color
     size: tuple[float, float, float]
-    """Lengths along the axes; of lines the width first, of text the height last."""
+    """Lengths along the axes; the first is the width of lines, the last the height of text."""
     position: Array = np.zeros(3)
     quaternion: Array = IDENTITY_QUATERNION
     points: Array = np.zeros((0, 3))
-    """Of lines and arrows (n, 3); then position and quaternion are left alone."""
+    """Points of lines and arrows (n, 3); then position and quaternion are not used."""
     text: str = ''
 
 
@@ -98,7 +98,7 @@ def circle(name: str, centre: Array, radius: float, color: Color, width: float) 
 
 def ellipsoid(name: str, centre: Array, covariance: Array, deviations: float,
               color: Color) -> Shape:
-    """Return the ellipsoid of so many standard deviations of a finite covariance (3, 3), m^2."""
+    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``deviations`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]
@@ -178,13 +178,13 @@ def image_corners(width: int, height: int, k: ArrayLike, fisheye: bool = False) 
         raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
                          'must all be above 0')
     pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
-    away = (pixels - (cx, cy)) / (fx, fy)
+    rays = (pixels - (cx, cy)) / (fx, fy)
     if not fisheye:
-        return SIGHT_DEPTH * np.column_stack([away, np.ones(4)])
-    angle = np.hypot(*away.T)
+        return SIGHT_DEPTH * np.column_stack([rays, np.ones(4)])
+    angle = np.hypot(*rays.T)
     seen = np.minimum(angle, WIDEST)[:, None]
     return SIGHT_DEPTH * np.column_stack([
-        np.sin(seen) * away / np.maximum(angle, 1e-9)[:, None], np.cos(seen)])
+        np.sin(seen) * rays / np.maximum(angle, 1e-9)[:, None], np.cos(seen)])
 
 
 def shapes(known: Snapshot) -> list[Shape]:

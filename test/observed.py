@@ -25,12 +25,13 @@ import numpy as np
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import Finding
+from flock_follower.checks.image_motion import COLUMNS, ROWS
 from flock_follower.checks.observations import (
     Machine,
+    NodeStatus,
     Observations,
     OURS,
     Picture,
-    Told,
     TopicEnd,
     TopicSeen,
 )
@@ -44,9 +45,11 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
+    rotation_vector_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.perception.camera import CameraModel
 from flock_follower.resources import resource
 
 START = 1_700_000_000.0  # s
@@ -101,13 +104,15 @@ def attitude(time: float) -> Array:
 
 
 def position(time: float) -> Array:
-    """Return where it is, m: it moves ahead and back."""
-    return np.array([0.5 * math.sin(1.5 * time), 0.4 * math.sin(1.1 * time), 1.5])
+    """Return where it is, m: it moves ahead and back, and up and down."""
+    return np.array([0.5 * math.sin(1.5 * time), 0.4 * math.sin(1.1 * time),
+                     1.5 + 0.2 * math.sin(0.9 * time)])
 
 
 def velocity(time: float) -> Array:
     """Return its velocity, m/s, in odom."""
-    return np.array([0.75 * math.cos(1.5 * time), 0.44 * math.cos(1.1 * time), 0.0])
+    return np.array([0.75 * math.cos(1.5 * time), 0.44 * math.cos(1.1 * time),
+                     0.18 * math.cos(0.9 * time)])
 
 
 def between(before: float, after: float) -> Array:
@@ -134,14 +139,28 @@ def odometry_rows(rate: float = 50.0, late: float = 0.01) -> list[list[float]]:
     return rows
 
 
-def shift_rows(rate: float = 30.0, offset: float = 0.0) -> list[list[float]]:
-    """Return how its images moved; their stamps are ``offset`` s too late."""
+def shift_rows(rate: float = 30.0, offset: float = 0.0, mounted: Array | None = None
+               ) -> list[list[float]]:
+    """
+    Return how the parts of its images moved, with a far scene; stamps ``offset`` s too late.
+
+    ``mounted`` as that of :func:`sighting_rows`.
+    """
+    camera = CameraModel.from_calibration(
+        (known := calibration()).k, known.d, known.distortion_model, known.width, known.height)
+    pixels = np.array([[(x + 0.5) * known.width / COLUMNS, (y + 0.5) * known.height / ROWS]
+                       for y in range(ROWS) for x in range(COLUMNS)])
+    rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
+    R_base_optical = (np.eye(3) if mounted is None else mounted) @ R_FLU_OPTICAL
     rows = []
     for n in range(round(SECONDS * rate) - 1):
         before, after = n / rate, (n + 1) / rate
-        turn = R_FLU_OPTICAL.T @ between(before, after)
+        turn = rotation_vector_to_matrix(R_base_optical.T @ between(before, after))
+        # The part that is halfway between both images at its middle moves as that does.
+        half = rotation_vector_to_matrix(0.5 * R_base_optical.T @ between(before, after))
+        moved = camera.project(rays @ turn @ half.T) - camera.project(rays @ half.T)
         rows.append([START + before + offset, START + after + offset,
-                     -FOCAL * float(turn[1]), FOCAL * float(turn[0]), 0.9])
+                     *np.column_stack([moved, np.full(len(moved), 0.9)]).ravel()])
     return rows
 
 
@@ -163,7 +182,7 @@ def sighting_rows(scale: float = 1.0, mounted: Array | None = None) -> list[list
     return rows
 
 
-def heard(rate: float, late: float) -> dict[str, Any]:
+def at_rate(rate: float, late: float) -> dict[str, Any]:
     """Return when messages of a topic came, and their stamps."""
     stamps = [START + n / rate for n in range(round(SECONDS * rate))]
     return {'stamps': stamps, 'arrivals': [stamp + late for stamp in stamps]}
@@ -174,7 +193,7 @@ def healthy(live: bool = True) -> Observed:
     names = names_there('', {})
     topics = {names[name]: TopicSeen([TopicEnd(sender if live else '', TYPES[name], *qos)],
                                      [TopicEnd(f'/{node}', TYPES[name], False, qos[1:] == (True,))
-                                      for node in takers if live], **heard(rate, late))
+                                      for node in takers if live], **at_rate(rate, late))
               for name, sender, qos, takers, rate, late in (
         ('image_raw', '/camera', (False,), ('relative_pose',), 30.0, 0.02),
         ('camera_info', '/camera', (False,), ('relative_pose', 'planner'), 30.0, 0.02),
@@ -186,7 +205,7 @@ def healthy(live: bool = True) -> Observed:
         ('mavlink_bridge/state', '/mavlink_bridge', (True, True), ('planner',), 2.0, 0.0),
         ('planner/state', '/planner', (True, True), (), 2.0, 0.0))}
     if not live:
-        topics |= {f'/truth/{name}': TopicSeen([TopicEnd('', TYPES['odom'])], **heard(30.0, 0.0))
+        topics |= {f'/truth/{name}': TopicSeen([TopicEnd('', TYPES['odom'])], **at_rate(30.0, 0.0))
                    for name in ('odom', 'neighbors')}
     rows = odometry_rows()
     parameters = read_parameters(resource('config/follower.yaml'), TABLE)
@@ -201,7 +220,7 @@ def healthy(live: bool = True) -> Observed:
         pictures=[Picture(START + 0.4 * n, 640, 480, 'mono8', 307200, 120.0, 40.0, {0: 60.0})
                   for n in range(12)],
         shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
-        told={node: Told(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
+        statuses={node: NodeStatus(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
               for node in OURS} if live else {},
         machine=Machine(4, 0.6, 8000.0, True, domain='0'))
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How well flights went: the figures of each run from engaging on, and of all runs of a scenario.
+Figures of flights: of each run from the engagement on, and of all runs of a scenario.
 
 All is true, not estimated. A row of ``measure`` is a follower. Of a flock, ``of_runs`` puts the
 rows of its followers together run by run: the worst of them if safety or a share of runs asks for
@@ -36,7 +36,7 @@ FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
 LOST_AFTER = 5.0  # s without following at the end of a flight, and it counts as lost
-STRAYED = 1.25  # times the far edge of the band: with nobody that near it is lost, too
+STRAYED = 1.25  # times the far edge of the band: a follower without a vehicle in it is lost
 
 Measures = dict[str, Array]
 """Figures by name, (n,) each."""
@@ -195,10 +195,10 @@ def band_exits(flights: Flights) -> list[BandExit]:
 
 def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float, float]:
     """
-    Return the greatest of all handovers of a run, (k,) each.
+    Return the greatest values over all handovers of a run; the inputs are (k,) each.
 
-    They are the change of height in the first second, the vertical speed after it, and the change
-    of height until the vehicle flies setpoints no longer.
+    The values are the change of height in the first second, the vertical speed after it, and the
+    change of height until the vehicle no longer flies setpoints.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
     early = late = change = 0.0
@@ -224,7 +224,7 @@ def _kept(flights: Flights) -> Any:
 
 
 def _strayed(positions: Array, flights: Flights) -> Any:
-    """Return which followers (m,) nobody leads to from the leader; positions (m + 1, 3), m."""
+    """Return which followers (m,) are not connected to the leader; positions (m + 1, 3), m."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
     near &= np.append(True, _kept(flights))  # a failed follower leads no other

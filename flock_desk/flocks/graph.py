@@ -64,7 +64,7 @@ class Graph:
     edges: Pairs
 
     def with_edges(self, pairs: Pairs) -> Graph:
-        """Return the graph with these pairs as edges too; itself where it has them already."""
+        """Return the graph with these pairs as edges too; itself if it has them already."""
         new = pairs[~self.joins(pairs)]
         return Graph(self.count, np.concatenate([self.edges, new])) if len(new) else self
 
@@ -99,7 +99,7 @@ def grown(graph: Graph, positions: Array, params: FlockingParams,
     """
     Return the graph with an edge more for every two agents that have come near enough.
 
-    :param near: all pairs with r^2 < d1 at least, where known; found here otherwise.
+    :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
     """
     near = pairs_within(positions, np.sqrt(params.d1)) if near is None else near
     return graph.with_edges(near[squared_distances(positions, near) < _joining(params)])
@@ -114,30 +114,30 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     :param velocities: (k, n), m/s, in the same frame.
     :param coupling: 'flock' scales separation and cohesion with the L of the whole flock, as the
         paper does; 'pair' with each pair's own |v_i - v_j| / sqrt(2), which two agents can know
-        by themselves. The same for two agents; nothing is proven of it for more.
-    :param near: all pairs with r^2 < d1 at least, where known; found here otherwise.
+        by themselves. Both are equal for two agents; for more, nothing is proven of 'pair'.
+    :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
     :raises ValueError: for another coupling, another number of agents than the graph's, other
         shapes, or values not finite or beyond 1e100.
     """
     x, v = _checked(positions, velocities, graph.count, coupling)
     near = pairs_within(x, np.sqrt(params.d1)) if near is None else near
-    strangers = near[~graph.joins(near)]
     whole = disagreement(v)
+    x, v = np.ascontiguousarray(x.T), np.ascontiguousarray(v.T)  # columns: faster for many pairs
     u = np.zeros_like(x)
-    for pairs, joined in ((graph.edges, True), (strangers, False)):
-        i, j = pairs.T
-        offset, difference = x[j] - x[i], v[j] - v[i]
-        r2 = np.sum(offset ** 2, axis=1, keepdims=True)
-        scale = whole if coupling == 'flock' else pair_disagreement(difference)
+    # Any pair separates with f0 psi, and an edge with f0 (1 - psi) more: no search for edges.
+    for pairs, joined in ((graph.edges, True), (near, False)):
+        i, j = np.ascontiguousarray(pairs.T)
+        offset, difference = x.take(j, 1) - x.take(i, 1), v.take(j, 1) - v.take(i, 1)
+        r2 = np.einsum('ij,ij->j', offset, offset)
+        scale = whole if coupling == 'flock' else pair_disagreement(difference.T)[:, 0]
         if joined:
-            pull = cohesion(r2, params) - separation(r2, params)
+            pull = cohesion(r2, params) - separation(r2, params) * (1.0 - fade(r2, params))
             action = alignment(r2, params) * difference + scale * pull * offset
         else:
             action = -scale * separation(r2, params) * fade(r2, params) * offset
-        for axis in range(x.shape[1]):  # equal and opposite on i and j
-            u[:, axis] += np.bincount(i, action[:, axis], len(x))
-            u[:, axis] -= np.bincount(j, action[:, axis], len(x))
-    return u
+        for each, component in zip(u, action):  # equal and opposite on i and j
+            each += np.bincount(i, component, len(each)) - np.bincount(j, component, len(each))
+    return u.T
 
 
 def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Graph,
@@ -160,7 +160,7 @@ def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Gr
 def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
                           neighbors: NDArray[np.int64], coupling: Coupling = 'flock') -> Array:
     """
-    Return the acceleration (k, n), m/s^2, of agents that attend to some others, as birds do.
+    Return the acceleration (k, n), m/s^2, of agents that each follow some others, as birds do.
 
     The law over those only, its cohesion f1 psi: bounded, because neighbours come and go. This
     loses what the law is for: attending is not mutual, so the mean velocity drifts; nothing

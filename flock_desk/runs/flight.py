@@ -31,14 +31,15 @@ import sys
 import time
 from typing import NamedTuple, TypeVar
 
+from flock_desk.runs.column import spacing
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     SchedulingDelay,
 )
-from flock_desk.runs.summary import spacing
 from flock_desk.scenarios.scenario import Scenario
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.transport import open_transport
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
@@ -52,7 +53,7 @@ READY_TIMEOUT = 90.0  # s for an external estimator, without which the autopilot
 TAKEOFF_TIMEOUT = 20.0
 LAND_TIMEOUT = 5.0  # s of requests for a landing after something failed
 LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
-MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
+MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a little later
 #: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
@@ -220,7 +221,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     return {
         'relative_pose': [],
         'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
-                    f'altitude_min:={flight.altitude_min}'],
+                    # No wider than the gate's, which would be a warning.
+                    f'altitude_min:={max(flight.altitude_min, GateLimits.height_min)}'],
         'mavlink_bridge': [*limits, *envelope, *bridge],
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],

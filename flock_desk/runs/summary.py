@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 import json
 import math
 from pathlib import Path
@@ -34,7 +33,7 @@ import numpy as np
 from flock_desk.runs.evaluation import Evaluation, STATES
 from flock_desk.runs.frame_errors import STAGES, Table
 from flock_desk.runs.record import FlightRecord, LiveRecord
-from flock_desk.scenarios.scenario import Outage, Scenario
+from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.geometry import Array
 from flock_follower.whole_file import whole_file
@@ -50,7 +49,6 @@ HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and on
 LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
 OUTRUN = 1.0  # s for which a leader is faster than v_max that outruns; a gust is shorter
 OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
-STEP = 0.02  # s between the times at which the vehicles of a column are compared
 
 
 def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str, Any]:
@@ -58,7 +56,7 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     Return how often and how well neighbours were measured, from the tables of ``frame_errors``.
 
     Images count once for each neighbour. ``recall`` is the share with an estimate, of those in
-    which the truth has a marker in view, or of all where there is no truth. Errors are over all
+    which the truth has a marker in view, or of all without a truth. Errors are over all
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
     a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
@@ -270,11 +268,11 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
 
 def _altitude_off(flight: LiveRecord) -> Array:
     """
-    Return the distance of the follower's height from the leader's, m, at the images that count.
+    Return the height difference between follower and leader, m, at the images that count.
 
-    Those count whose leader has been in view for ``LEVEL_WITHIN``: the follower cannot know the
-    height of a leader that it does not see. One of the scenario begins at the follower's height,
-    so all images from the beginning count; one flown by an autopilot begins at any height.
+    An image counts if the leader has been in view for ``LEVEL_WITHIN``: the follower does not know
+    the height of a leader out of view. A scenario's leader begins at the follower's height, so all
+    images from the beginning count. A leader flown by an autopilot begins at any height.
     """
     times, hidden = flight.table['time'], flight.table['visible'] == 0.0
     begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf
@@ -310,7 +308,7 @@ def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
 
 
 def _problems(flight: LiveRecord) -> dict[str, int]:
-    """Return how often each node reported which problem in the scenario, without its numbers."""
+    """Return the count of each problem reported by each node; numbers in its text are masked."""
     reported = Counter(
         f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
         for t, array in flight.diagnostics if 0.0 < t <= flight.duration
@@ -327,65 +325,18 @@ def _longest(times: Array, holds: Any) -> float:
     return longest
 
 
-def spacing(scenario: Scenario) -> float:
-    """Return the distance between two vehicles of a column at its start, m: the mean one."""
-    return float(np.mean(scenario.start.distance))
-
-
-def column_tracks(scenario: Scenario, flights: Mapping[str, LiveRecord]
-                  ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """
-    Return the motion of a column while all of it flew the scenario, in the first one's frame.
-
-    :returns: times (n,), s; positions (n, 3), m, by vehicle; distances (n,), m, by pair.
-    """
-    logs = {name: flight.log for name, flight in flights.items()}
-    began = max(float(log['began']) for log in logs.values())
-    times = np.arange(began, min(float(log['ended']) for log in logs.values()), STEP)
-    first = next(iter(logs.values()))
-    tracks = {'leader': _at(times, float(first['start']) + (
-        first['image_stamp'] - int(first['epoch_ns'])) * 1e-9, first['leader_position'])}
-    for i, (name, log) in enumerate(logs.items()):
-        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + _at(
-            times, flights[name].velocity_times + float(log['began']), log['position'])
-    return times - began, tracks, {
-        f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
-        for a, b in combinations(tracks, 2)}
-
-
-def _at(times: Array, known: Array, positions: Array) -> Array:
-    """Return positions (n, 3) at times (n,); NaN if they are unknown."""
-    return np.stack([np.interp(times, known, column, np.nan, np.nan)
-                     for column in positions.T], axis=1)
-
-
-def column_figures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> dict[str, Any]:
-    """
-    Return the figures of a column as a whole.
-
-    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
-    """
-    _, _, distances = column_tracks(scenario, flights)
-    pairs = {pair: float(np.nanmin(distance)) for pair, distance in distances.items()}
-    return jsonable({
-        'column_of': scenario.name, 'followers': len(flights),
-        'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
-        'speed_max_m_s': most(np.concatenate(
-            [np.linalg.norm(flight.velocities, axis=1) for flight in flights.values()]))})
-
-
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """
     Write a summary as JSON.
 
-    :raises OSError: where it cannot be written.
+    :raises OSError: if it cannot be written.
     """
     with whole_file(path) as file:
         file.write((json.dumps(summary, indent=2, ensure_ascii=False) + '\n').encode())
 
 
 def jsonable(value: Any) -> Any:
-    """Return a summary with None for what is NaN or infinite, which JSON does not know."""
+    """Return a summary with None for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: jsonable(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

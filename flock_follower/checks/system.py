@@ -58,7 +58,7 @@ FEW = 10
 PARAMETER: Final = 'parameter '
 NOT_READY: Final = 'not ready to arm'
 REFUSED: Final = 'offboard would be refused'
-#: The action to take for a status of a node, by words of it.
+#: The action for a status of a node, by a part of its text.
 ADVICE: Final[Mapping[str, str]] = {
     'cannot keep up': 'fly behind a slower leader, or raise v_max',
     'not aligned': 'let the autopilot fuse this odometry (forward_odometry:=true)',
@@ -85,7 +85,8 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
         yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
                      f'{machine.idle:.0%} of {machine.processors} cores left',
                      f'{IDLE:.0%} or more left',
-                     'end what need not run (rviz, recordings), or ask less of the odometry')
+                     'end programs that are not needed (rviz, recordings), or reduce the load of '
+                     'the odometry')
     if machine.shares_memory:
         yield from _shared_memory(seen)
     images, frames = seen.topic(seen.image_name), seen.topic('neighbors/frames')
@@ -95,8 +96,8 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
             not frames.arrivals, share < PROCESSED, 'images processed',
             f'{min(share, 1.0):.0%} of the images' if frames.arrivals else 'none',
             f'{PROCESSED:.0%} or more',
-            'less to do for the processor, or a lower frame rate' if frames.arrivals else
-            'see images, calibration and odometry; its log says what it drops')
+            'reduce the load of the processor, or the frame rate' if frames.arrivals else
+            'see images, calibration and odometry; its log names the dropped messages')
 
 
 def _shared_memory(seen: Observations) -> Iterator[Finding]:
@@ -149,17 +150,17 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
     """Report the status of our nodes and of the autopilot."""
     for node in OURS:
         full = full_name(node, seen.namespace)
-        told = seen.told.get(full.lstrip('/'))
-        if told is None:
+        status = seen.statuses.get(full.lstrip('/'))
+        if status is None:
             if full in seen.nodes:
                 yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
             continue
-        advice = next((advice for words, advice in ADVICE.items() if words in told.message),
+        advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
-        found = [judged(told.level > 1, told.level == 1, f'{node} says', told.message, 'running',
-                        advice)]
+        found = [judged(status.level > 1, status.level == 1, f'{node} says', status.message,
+                        'running', advice)]
         if node == 'mavlink_bridge':
-            found += _autopilot(told.values)
+            found += _autopilot(status.values)
         # Faults at the time of a recording do not prevent its use.
         yield from (finding if seen.live or finding.level != ERROR else
                     finding._replace(level=WARNING) for finding in found)
@@ -170,9 +171,10 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     what = 'autopilot'
     if values.get('link') != 'alive':
         yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
-                    'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
+                    'check cable, connection and baud rate; is the autopilot on, is its MAVLink '
+                    'port set up?')
         return
-    yield ok(what, f'{values.get("autopilot") or "heard"}, {values.get("mode") or "no mode"}, '
+    yield ok(what, f'{values.get("autopilot") or "received"}, {values.get("mode") or "no mode"}, '
              f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
     differing = [key for key in values if key.startswith(PARAMETER)]
     wanted = 'as config/ recommends'

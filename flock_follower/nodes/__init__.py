@@ -59,7 +59,7 @@ def unhurried() -> Iterator[None]:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals: one that comes while the interpreter ends is no failure."""
+    """Ignore further signals: one during the interpreter's exit must not change the exit code."""
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -89,8 +89,8 @@ def _runs_as_a_program() -> bool:
 def _report_missing_package(kind: type[BaseException], error: BaseException,
                             trace: TracebackType | None) -> None:
     if isinstance(error, ModuleNotFoundError):
-        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-              'package that package.xml names?', file=sys.stderr)
+        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+              'package in package.xml', file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)
 

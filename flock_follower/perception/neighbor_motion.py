@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The state of a neighbour, its motion model, and the measurement noise learnt in flight.
+The state of a neighbour and its motion model.
 
 ``Estimate``: position p, velocity v and acceleration a of the neighbour's body, its attitude R
 (body to odom) and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,),
@@ -23,12 +23,6 @@ with R_true = exp(dr) R, a rotation vector along odom's axes.
 performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s,
 forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T. White angular
 acceleration drives the angular velocity.
-
-``LearntNoise`` learns from innovations how much measurements err beyond the fit's covariance.
-Across the line of sight, the noise is the error of the own attitude, which moves a neighbour
-sideways: errors of the odometry, of its interpolation and of the camera's stamps. Along the line
-of sight, the noise is anything that changes the marker's apparent size: a rolling shutter, a bent
-print, motion blur.
 """
 
 from __future__ import annotations
@@ -49,10 +43,10 @@ from flock_follower.geometry import (
 )
 from flock_follower.ranges import Checked, parameter, Range
 
-#: Where in the error state what is.
+#: Slices of the error state.
 POSITION, VELOCITY, ATTITUDE, RATE, ACCELERATION = (slice(k, k + 3) for k in range(0, 15, 3))
 SIZE = 15
-#: What of the error state a pose is, (6, 15).
+#: Rows of the error state that form a pose, (6, 15).
 POSE = np.concatenate([np.eye(SIZE)[POSITION], np.eye(SIZE)[ATTITUDE]])
 
 
@@ -141,7 +135,7 @@ class Estimate(NamedTuple):
 
 
 _EYE = np.eye(3)
-#: How the own position wanders, m/sqrt(s), where no velocity is measured.
+#: Random walk of the own position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbour's angular velocity before any motion was seen, rad/s.
 INITIAL_RATE = 0.5
@@ -150,16 +144,15 @@ INITIAL_RATE = 0.5
 @dataclass(frozen=True)
 class FilterParams(Checked):
     """
-    How neighbours move, and when to doubt a measurement.
+    Motion model of neighbours, and limits for measurements.
 
     ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
-    ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
-    m/s^2/sqrt(Hz).
+    ``odometry_noise`` is the random walk of the error of the own velocity, m/s^2/sqrt(Hz).
     ``initial_speed``, m/s, is the deviation before any motion has been seen.
-    ``attitude_noise``, rad, is how much one's own attitude errs differently from one image to the
-    next; at a distance it moves a neighbour sideways.
+    ``attitude_noise``, rad, is the noise of the own attitude from one image to the next; it moves
+    a distant neighbour sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
     above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
     ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
@@ -167,9 +160,9 @@ class FilterParams(Checked):
 
     acceleration: float = parameter(
         0.5, Range(0.01, 100.0, 'm/s^2'),
-        'how much a neighbour accelerates, standard deviation per axis', live=False)
+        "standard deviation of a neighbour's acceleration per axis", live=False)
     acceleration_time: float = parameter(
-        1.0, Range(0.01, 100.0, 's'), 'in which time its acceleration changes', live=False)
+        1.0, Range(0.01, 100.0, 's'), "correlation time of a neighbour's acceleration", live=False)
     angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
     odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
     initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
@@ -178,7 +171,8 @@ class FilterParams(Checked):
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
-        'a track begins anew only where a neighbour at this speed can be, as the planner has it',
+        "a track restarts only at a place that a neighbour at this speed can reach; the planner's "
+        'leader_speed_max must be the same',
         live=False)
 
 
@@ -230,9 +224,9 @@ def turned_along(covariances: Array, before: Array, now: Array) -> Array:
     """
     Return covariances (n, k, k), of position, velocity and more, turned from one line to another.
 
-    Of whom no more than the distance is known may be anywhere on a sphere: where the line to the
-    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), what is known along it
-    turns along. ``before`` of zeros turns nothing.
+    A neighbour of which only the distance is known may be anywhere on a sphere. If the line to its
+    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), the covariance turns
+    with it. ``before`` of zeros turns nothing.
     """
     w = np.cross(before, now)
     cross = np.zeros((len(w), 3, 3))
@@ -249,11 +243,11 @@ def turned_along(covariances: Array, before: Array, now: Array) -> Array:
 
 def bounded_across(covariances: Array, along: Array, distance: Array, speed: float) -> Array:
     """
-    Return covariances (n, k, k), of position, velocity and more, with what is absurd taken off.
+    Return covariances (n, k, k), of position, velocity and more, with bounded deviations.
 
-    Seen from where the distances (n,), m, were measured, along (n, 3), a neighbour is no farther
-    to the side than it is away, and no faster there than ``speed``, m/s. Were it more, turning
-    the line a little would make the distance uncertain, too.
+    Across the line (n, 3) along which the distances (n,), m, were measured, the deviation of the
+    position is at most the distance, and that of the velocity at most ``speed``, m/s. Larger ones
+    would make the distance uncertain after a small turn of the line.
     """
     scale = np.tile(np.eye(covariances.shape[-1]), (len(covariances), 1, 1))
     line = along[:, :, None] * along[:, None, :]
@@ -263,76 +257,3 @@ def bounded_across(covariances: Array, along: Array, distance: Array, speed: flo
         share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
         scale[:, part, part] = line + share * (_EYE - line)
     return scale @ covariances @ scale.transpose(0, 2, 1)
-
-
-#: Innovations over which the noise is learnt; at first over as many as there were, and these.
-LEARNT = 120
-FIRST = 15
-#: An innovation counts at most with so many times its variance: one far out is a slip.
-LIMIT = 16.0
-#: The most that is believed, rad, and as share of the distance.
-MOST = 0.05
-_LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
-
-
-class LearntNoise:
-    """
-    The noise of one's own attitude, rad, about each axis, and of the distance, a share of it.
-
-    :param least: what that of the attitude is at least, and at first; that of the distance is 0.
-    """
-
-    def __init__(self, least: float) -> None:
-        self._least = least**2
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget what was learnt."""
-        self._across, self._along = self._least, 0.0
-        self._count = FIRST
-
-    @property
-    def attitude(self) -> float:
-        """Return the noise of one's own attitude, one standard deviation, rad."""
-        return math.sqrt(self._across)
-
-    @property
-    def distance(self) -> float:
-        """Return the noise of the distance, one standard deviation, a share of it."""
-        return math.sqrt(self._along)
-
-    def covariance(self, sight: Array) -> Array:
-        """Return what it adds to a pose measured so far away (3,), m: (6, 6)."""
-        # An attitude error e turns what is seen about oneself: it moves a marker at r by e x r,
-        # and tilts it by e.
-        leverage = _LEVERAGE.copy()
-        leverage[:3] = skew(-sight)
-        covariance: Array = leverage.dot(self._across * leverage.T)
-        if self._along:
-            covariance[:3, :3] += self._along * sight[:, None] * sight
-        return covariance
-
-    def take(self, innovation: Array, spread: Array, sight: Array) -> None:
-        """
-        Take an innovation of a position (3,), m, of covariance (3, 3), and the way there (3,), m.
-
-        The covariance holds the noise as it is now.
-        """
-        # In plain numbers: for every image, and so small.
-        (x, y, z), (u, v, w) = sight.tolist(), innovation.tolist()
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = spread.tolist()
-        squared = x * x + y * y + z * z
-        along = (x * u + y * v + z * w)**2 / squared
-        expected = (x * x * xx + y * y * yy + z * z * zz
-                    + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
-        across, across_expected = u * u + v * v + w * w - along, xx + yy + zz - expected
-        self._count = min(self._count + 1, LEARNT)
-        # Two axes across, each off by the noise times the distance.
-        for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)
-        for_distance = _excess(along, expected) / (squared * self._count)
-        self._across = min(max(self._across + for_attitude, self._least), MOST**2)
-        self._along = min(max(self._along + for_distance, 0.0), MOST**2)
-
-
-def _excess(squared: float, expected: float) -> float:
-    return min(squared, LIMIT * expected) - expected

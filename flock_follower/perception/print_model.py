@@ -49,8 +49,8 @@ from flock_follower.perception.markers import (
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
 _MIN_APART = 4.0  # grey levels between black and white, both in the shade
-#: Where black or white spread more than this, as a variance against half of what they are apart,
-#: squared, they are not what they should be, and tell nothing.
+#: Black or white cells are not used if their variance exceeds this share of the squared half of
+#: their contrast.
 _MAX_SPREAD = 0.35
 _SATURATED = 250.0  # grey levels
 
@@ -60,7 +60,7 @@ class Windows(NamedTuple):
     Windows on the c cells of a marker.
 
     ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
-    than k; ``white`` and ``black`` (w, k) are 1 where a cell should have that colour, else 0, and
+    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that colour, else 0, and
     0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
     where it is in fewer than p.
     """
@@ -69,11 +69,9 @@ class Windows(NamedTuple):
     white: Array
     black: Array
     places: NDArray[np.intp]
-    shown: NDArray[np.bool_]
-    around: Any
 
 
-def windows(grid: Array, white: NDArray[np.bool_], around: int = 0) -> Windows:
+def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
     """Return the windows on cells at columns and rows (c, 2), white or black as (c,)."""
     column, row = (grid - grid.min(axis=0)).T
     size = max(w * h for w, h in SHAPES)
@@ -92,19 +90,19 @@ def windows(grid: Array, white: NDArray[np.bool_], around: int = 0) -> Windows:
     most = max(len(some) for some in places)
     return Windows(cells, (white[cells] & counted).astype(float),
                    (~white[cells] & counted).astype(float),
-                   np.array([np.resize(some, most) for some in places]), white, slice(around, None))
+                   np.array([np.resize(some, most) for some in places]))
 
 
 def read(brightness: Array, seen: Windows) -> Array:
     """
     Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
 
-    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells, NaN
-    where a reflex dazzles the camera: a saturated cell that should be black.
+    -1: like the black cells around it, 1: like the white ones, 0: no cells to compare with.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
-    for colour in (seen.white, seen.black * (values < _SATURATED)):  # a cell does not judge itself
+    # A cell is not compared with itself, and with no saturated cell that should be black.
+    for colour in (seen.white, seen.black * (values < _SATURATED)):
         some = values * colour
         sums.append([total.sum(axis=-1, keepdims=True) - total
                      for total in (colour, some, some * values)])
@@ -113,18 +111,15 @@ def read(brightness: Array, seen: Windows) -> Array:
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
     shown = (values - 0.5 * (light + dark)) / half
-    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD) & (blacks > 0.0)
+    readable = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD) & (blacks > 0.0)
     # Best is a window that is even, and in which the cell is as any black or white one.
     odd = spread + (np.abs(shown) - 1.0)**2
     odd, shown = (part.reshape(len(values), -1) for part in (
-        np.where(told, odd, np.inf), np.where(told, shown, 0.0)))
+        np.where(readable, odd, np.inf), np.where(readable, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
-    colours = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
-    saturated = brightness >= _SATURATED
-    # Where paper is as bright as a reflex, it is not a reflex that makes a cell white.
-    lit = saturated[:, seen.around].mean(axis=1, keepdims=True) <= _MOST_DAZZLED
-    return np.where(saturated & ~seen.shown & lit, np.nan, colours)
+    colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
+    return colours
 
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
@@ -136,21 +131,20 @@ _LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Where else a cell is looked at, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
-_MOST_DAZZLED = 0.25  # share of the inner cells that a reflex may hide
+_MOST_HIDDEN = 0.25  # share of the inner cells that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
 @dataclass(frozen=True, eq=False)
 class CellCode:
     """
-    What a marker's cells should show.
+    The code of a marker: the colours of its cells.
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
-    rows. ``bits`` (b,): +1 white, -1 black;
-    ``errors`` of them may be misread.
-    ``others`` (w, b): every other word of the dictionary, and each in its turns. ``windows``:
-    which cells are compared where light is uneven.
+    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors``
+    of them may be misread. ``others`` (w, b): all other codewords of the dictionary, in all
+    rotations. ``windows``: cells that are compared with one another under uneven light.
     """
 
     centers: Array
@@ -184,7 +178,7 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
     return CellCode(
         marker.T_body_marker.apply(centers), grid, bits, border,
         max(correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
-        windows(grid, white, order.size - int((from_edge < 0).sum())),
+        windows(grid, white),
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
         np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
 
@@ -209,25 +203,29 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
             and np.count_nonzero(cells * code.bits <= 0.0) <= code.errors
             and _is_word(cells, code)):
         return True
-    if _shows_in_uneven_light(read(brightness[None], code.windows)[0], code):
+    if _shows_in_uneven_light(brightness[None], code):
         return True
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
-    return _shows_in_uneven_light(read(
-        grey_levels(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
+    return _shows_in_uneven_light(grey_levels(image, beside).reshape(len(_BESIDE), -1), code)
 
 
-def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
-    """Return whether all cells (c,), black -1 to white 1, are those of a marker."""
-    inner, around = read[:code.bits.size], read[code.bits.size + code.border:]
-    border = read[code.bits.size:code.bits.size + code.border]
-    dazzled = np.isnan(inner)
+def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
+    """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
+    colours = read(brightness, code.windows).mean(axis=0)
+    saturated: Any = (brightness >= _SATURATED).any(axis=0)
+    end = code.bits.size + code.border
+    inner, border, around = slice(code.bits.size), slice(code.bits.size, end), slice(end, None)
+    # A reflex hides black cells. It cannot be told from paper that is saturated as well.
+    hidden = saturated[inner] & (code.bits < 0.0)
+    hidden &= saturated[around].mean() <= _MOST_HIDDEN
+    bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
-    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0)[~dazzled].sum())
-    return (wrong < max(0.5 * code.errors, 1.0) and dazzled.mean() <= _MOST_DAZZLED
-            and _is_word(np.where(dazzled, 0.0, inner), code)
-            and np.count_nonzero(border < 0.0) >= _MIN_BORDER * code.border
-            and np.count_nonzero(around > 0.0) >= _MIN_AROUND * len(around))
+    wrong = float(np.clip(0.5 - bits * code.bits, 0.0, 1.0)[~hidden].sum())
+    return (wrong < max(0.5 * code.errors, 1.0) and hidden.mean() <= _MOST_HIDDEN
+            and _is_word(bits, code)
+            and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
+            and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))
 
 
 def _is_word(read: Array, code: CellCode) -> bool:
@@ -240,7 +238,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     Return by how many cells, to the right and down, a marker is off where it is expected.
 
     Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
-    None where nothing resembles it.
+    None if nothing resembles it.
     """
     pattern = np.concatenate([code.bits, -np.ones(code.border),
                               np.ones(len(pixels) - code.bits.size - code.border)])
@@ -377,7 +375,7 @@ def _edges(code: Any) -> list[_Edge]:
     """
     Return places and tangents in the marker's frame, room, and axis; lengths in cells.
 
-    ``code`` (c, c) is True where white, its first row on top.
+    ``code`` (c, c) is True for white cells, its first row on top.
     """
     cells = len(code)
     edges: list[_Edge] = []

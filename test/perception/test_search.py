@@ -69,7 +69,7 @@ def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) 
     assert found.ids.tolist() == [3]
     errors = found.corners[0] - corners_of(camera, pose)
     assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.5)
-    assert np.abs(errors.mean(axis=0)).max() < 0.35
+    assert np.abs(errors.mean(axis=0)).max() < (0.35 if width < search.LARGE else 0.7)
 
 
 @pytest.mark.parametrize('place', [

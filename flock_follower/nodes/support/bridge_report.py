@@ -217,7 +217,7 @@ class BridgeReport:
         return values
 
     def _log_link(self, now: float) -> None:
-        """Log what was lost and came back."""
+        """Log losses and recoveries."""
         transport, log = self._bridge.link.transport, self._node.get_logger()
         alive, fault, reboots = self._bridge.alive(now), transport.fault, self._reboots
         if fault and not self._fault:
@@ -253,9 +253,9 @@ class BridgeReport:
                 f'{result.answered} parameters of the autopilot are as recommended')
 
     def _log_own_requests(self) -> None:
-        """Log what the bridge itself has requested, and the result."""
+        """Log the bridge's own requests and their results."""
         log = self._node.get_logger()
-        own = ((self._bridge.blind_landing, 'no velocity can be believed'),
+        own = ((self._bridge.blind_landing, 'no valid velocity'),
                (self._bridge.handover, self._bridge.end.why))
         before, self._logged = self._logged, {
             request: request.outcome is not None for request, _ in own if request is not None}
@@ -263,8 +263,8 @@ class BridgeReport:
             if request is not None and request not in before:
                 log.error(f'the bridge requests {request.goal.name}: {why}')
             if request is not None and request.outcome is not None and not before.get(request):
-                tell = log.warning if request.outcome.success else log.error
-                tell(request.outcome.message)
+                write = log.warning if request.outcome.success else log.error
+                write(request.outcome.message)
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
@@ -274,7 +274,7 @@ class BridgeReport:
         if (against := self._bridge.unready(now)) is not None:
             values[NOT_READY] = against
 
-    # Problems; '' or None if there is none.
+    # Problems; '' or None without one.
 
     def _while_alive(self, reason: Callable[[float], str]) -> Callable[[float], str]:
         return lambda now: reason(now) if self._bridge.alive(now) else ''
@@ -282,11 +282,11 @@ class BridgeReport:
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
             return ''
-        transport, heard = self._bridge.link.transport, self._bridge.telemetry.message_time
+        transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
-        if math.isfinite(heard):
-            return f'autopilot lost on {transport.url}, silent for {now - heard:.1f} s'
+        if math.isfinite(received):
+            return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
         if now - self._start < SILENCE:
             return ''
         return f'no autopilot on {transport.url}: {self._bridge.link.silence()}'
@@ -299,7 +299,7 @@ class BridgeReport:
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
                    if newest is None or now - newest.time > SILENCE]
         if missing:
-            return f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+            return f'the autopilot sends no {" and no ".join(missing)}: is its estimator ready?'
         distrusted = self._bridge.distrusted(now)
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
@@ -340,8 +340,8 @@ class BridgeReport:
             return None
         bridge, setpoint = self._bridge, self._last.setpoint
         if now - self._stuck_since > STUCK:
-            return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
-                           f'{bridge.link.transport.url} takes none')
+            return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
+                           f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not (
             bridge.requests.takeoff_explains_mode(now))
@@ -349,20 +349,20 @@ class BridgeReport:
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if silent else WARN
-            return level, (f'no setpoints are sent: {permission.reason}; the service '
-                           'mavlink_bridge/offboard asks for offboard')
+            return level, (f'no setpoints are sent: {permission.reason}; call '
+                           'mavlink_bridge/offboard to request offboard')
         if setpoint.kind == NONE and not bridge.withheld():
             return ERROR, f'no setpoints are sent: {setpoint.reason}'
         if setpoint.kind in (COMMAND, NONE) or not bridge.gate.flies:
             return None
         if setpoint.kind == LEVEL:
-            return ERROR, f'flying blind and level: {setpoint.reason}, and no other velocity'
+            return ERROR, f'only level setpoints: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
         reason = self._bridge.gate.permission.reason
         if reason.startswith(TWO_COMMAND):
-            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
+            return ERROR, f'{reason}; the bridge brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 

@@ -107,8 +107,8 @@ class FlockNode(ValidatedNode):
         """
         Add an entity that the executor waits for, as rclpy does; QoS events once a second.
 
-        Each topic, in or out, has two such events, of incompatible nodes, which are rare. To wait
-        for all of them took a third of the time of every wait.
+        Each publisher and subscription has two QoS events, which report incompatible nodes and
+        are rare. Waiting for all these events took a third of the time of every wait.
         """
         if isinstance(waitable, EventHandler):
             waitable.callback_group = self._events
@@ -325,9 +325,9 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     """
     Run one node until Ctrl-C, SIGTERM or its own end, and return the process's exit code.
 
-    ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
+    ``factory`` creates the node; a ValueError or OSError it raises (a bad parameter, a missing
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
-    With ``--help`` among ``args``, None being those of the process, it prints that and ends.
+    ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
     """
     arguments = sys.argv if args is None else args
     own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
