@@ -29,7 +29,6 @@ import numpy as np
 import pytest
 
 from flock_desk.evaluate import main
-from flock_desk.runs.summary import TIMINGS, without_timings
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
@@ -51,6 +50,8 @@ from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')
+#: Figures that differ from run to run.
+TIMINGS = ('cpu_ms_per_frame', 'realtime_factor', 'timings')
 
 
 @pytest.fixture(scope='module')
@@ -68,6 +69,10 @@ def result(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def summary(out: Path) -> dict[str, Any]:
     loaded: dict[str, Any] = json.loads((out / 'summary.json').read_text())
     return loaded
+
+
+def without_timings(figures: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in figures.items() if key not in TIMINGS}
 
 
 def with_ranges(path: Path, seen: float, seconds: float) -> Path:
