@@ -43,7 +43,7 @@ FEWEST_PICTURES: Final = 20
 MOST_BYTES: Final = 60e6
 #: Time between two images whose shift is measured, s, and the number of pairs.
 PAIR: Final = (0.03, 0.16)
-PAIRS: Final = 60
+PAIRS: Final = 90
 #: Dictionaries to search if no marker of ours is found: the largest of each family.
 OTHERS: Final = ('DICT_4X4_1000', 'DICT_5X5_1000', 'DICT_6X6_1000', 'DICT_7X7_1000',
                  'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_25h9', 'DICT_APRILTAG_36h11')
@@ -142,7 +142,7 @@ class Collector:
             self._small = stamp, reduced
             return
         self.observations.shifts.append(
-            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1])])
+            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1]).ravel()])
         self._small, self._next_pair = None, arrival + self._duration / PAIRS
 
     def finish(self, config: NeighborConfig) -> None:

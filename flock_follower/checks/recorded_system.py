@@ -42,8 +42,9 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
-#: s: of a longer bag only the beginning is checked.
+#: s: of a longer bag only the beginning is checked, and the diagnostics of the last LAST ns.
 LONGEST: Final = 300.0
+LAST: Final = 60_000_000_000
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: Of the other topics only the messages are counted.
@@ -141,6 +142,10 @@ def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = ''
             if system.topics:
                 for message in bag.messages(
                         list(system.topics), stop_ns=None if whole else system.stop_ns):
+                    system.take(*message)
+            if not whole and DIAGNOSTICS in system.topics:  # those of the end count
+                system.stop_ns = bag.end_ns + 1
+                for message in bag.messages([DIAGNOSTICS], bag.end_ns - LAST, system.stop_ns):
                     system.take(*message)
         except BagError as problem:
             system.seen.incomplete = system.seen.incomplete or str(problem)

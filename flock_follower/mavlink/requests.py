@@ -147,7 +147,8 @@ class Requests:
             self._ask(request, streaming_for, now)
             if request.outcome is not None and not request.outcome.success:
                 request.outcome = request.outcome._replace(message=explained(
-                    request.outcome.message, self._link.telemetry.estimator, now))
+                    request.outcome.message, self._link.telemetry.estimator, now,
+                    self._housekeeping.parameters.values))
         if request.goal is OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
             self._gate.permit(OffboardFailed(request.outcome.message))

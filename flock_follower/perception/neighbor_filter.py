@@ -42,6 +42,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
 from flock_follower.messages import MAX_JUMP
+from flock_follower.perception.learnt_noise import GAP, LearntMotion
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
     ATTITUDE,
@@ -158,7 +159,9 @@ class Step(NamedTuple):
     The state went through ``transition`` (15, 15) to its stamp; there ``gain`` (15, n) times
     ``innovation`` (n,), of covariance ``spread`` (n, n), was added. ``jacobian`` (n, 15) is that
     of the measurement to the error state; n is 6, or 3 if only the position was used.
-    ``expected`` (3, 3) is the expected covariance of the position's innovation.
+    ``change`` (3,) is the difference between this innovation of the position and the one before,
+    divided by the root of 2, and ``expected`` (3, 3) its covariance if innovations are white;
+    ``change`` is None if there was none shortly before.
     """
 
     transition: Array
@@ -166,6 +169,7 @@ class Step(NamedTuple):
     gain: Array
     innovation: Array
     spread: Array
+    change: Array | None
     expected: Array
 
 
@@ -197,6 +201,8 @@ class NeighborFilter:
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
         self._line = _CENTRE  # on which the last distance was measured
+        self._motion = LearntMotion()
+        self._before: tuple[Array, Array] | None = None  # the last innovation, its covariance
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -231,6 +237,7 @@ class NeighborFilter:
         """Return a copy of this filter that bridges gaps of up to ``max_gap`` s."""
         other = NeighborFilter(replace(self.params, max_gap=max_gap))
         other.walk, other.newest = self.walk, self.newest
+        other._motion.factors = [max(factor, 1.0) for factor in self._motion.factors]
         return other
 
     def shift(self, error: Array) -> None:
@@ -246,6 +253,9 @@ class NeighborFilter:
                 self._steps.clear()
             self._steps[dt] = transition(dt, self.params)
         linear, whole, noise = self._steps[dt]
+        x, y, z = self._motion.scale(dt)
+        scale = np.array([x, y, z, x, y, z, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, x, y, z])
+        noise = scale[:, None] * noise * scale
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
@@ -291,8 +301,7 @@ class NeighborFilter:
         self._turned = 0 if plausible else self._turned + 1
         if self._turned >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
-        self.step = Step(self._transition(stamp - now.stamp)[1], jacobian, gain.T, innovation,
-                         spread, nominal)
+        self.step = self._learn(stamp - now.stamp, jacobian, gain.T, innovation, spread, nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
@@ -301,6 +310,18 @@ class NeighborFilter:
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
+
+    def _learn(self, dt: float, jacobian: Array, gain: Array, innovation: Array, spread: Array,
+               nominal: Array) -> Step:
+        """Return how a measurement dt, s, after the last one was used; learn from it."""
+        step = Step(self._transition(dt)[1], jacobian, gain, innovation, spread, None, nominal)
+        off, before = innovation[:3], self._before
+        self._before = off, nominal
+        self._motion.take(dt, off, nominal)
+        if before is None or dt > GAP:
+            return step
+        return step._replace(change=math.sqrt(0.5) * (off - before[0]),
+                             expected=0.5 * (nominal + before[1]))
 
     def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
                   covariance: Array) -> tuple[Array, bool, Array, Array, Array]:

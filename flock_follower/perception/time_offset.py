@@ -37,9 +37,10 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Step
-from flock_follower.perception.neighbor_motion import FilterParams, LearntNoise, SIZE
+from flock_follower.perception.neighbor_motion import FilterParams, SIZE
 
 #: Initial standard deviation of an offset, s; largest offset that is applied, s.
 PRIOR: Final[float] = 0.03
@@ -243,7 +244,7 @@ class MountedCamera:
 
     :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
-    :param attitude_noise: of the own attitude as its images show it, at least, rad.
+    :param attitude_noise: of the own attitude as its images show it, before it is learnt, rad.
     :param rectified: whether its images are undistorted already.
     """
 

@@ -61,7 +61,7 @@ from flock_follower.perception.neighbor_filter import (
     NeighborFilter,
     UpdateOutcome,
 )
-from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
+from flock_follower.perception.neighbor_motion import ODOMETRY_WALK, POSITION, VELOCITY
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import JointOffsets, MountedCamera, TimeOffset
@@ -70,6 +70,7 @@ from flock_follower.perception.time_offset import JointOffsets, MountedCamera, T
 MARGIN = 100.0
 #: and otherwise in one of so many.
 MIRRORED_EVERY = 30
+_EYE = np.eye(3)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -276,8 +277,14 @@ class Tracker:
         own = self._odometry.at(stamp) if exposed else view.own
         if isinstance(own, Missing):
             own = view.own
-        _, position, *others = estimate
-        return Estimate(stamp, position + own.correction, *others)
+        # White noise of the own attitude and velocity at the stamp: the filter averages over it.
+        attitude, velocity = self._odometry.white_noise
+        sight, covariance = estimate.position - own.travel, estimate.covariance.copy()
+        covariance[POSITION, POSITION] += attitude * (
+            sight.dot(sight) * _EYE - sight[:, None] * sight)
+        covariance[VELOCITY, VELOCITY] += velocity * _EYE
+        return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
+                                 covariance=covariance)
 
     def _track(self, image: GrayImage,
                look: Look) -> tuple[dict[str, Measurement], list[Measurement]]:
@@ -448,7 +455,8 @@ class Tracker:
         if step is None:
             self._offsets.begin(camera.time_offset, name, view.moving(sight))
             return
-        camera.noise.take(step.innovation[:3], step.expected, sight)
+        if step.change is not None:
+            camera.noise.take(step.change, step.expected, sight)
         changes = self._offsets.take(camera.time_offset, name, step, view.moving(sight))
         if not any(changes):
             return
