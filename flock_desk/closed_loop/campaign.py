@@ -54,14 +54,12 @@ PLANNER_STEPS = 12
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         noise: PerceptionNoise | None = None,
-        progress: Callable[[float], None] | None = None,
         cpu_time: Callable[[], float] = lambda: 0.0) -> Flights:
     """
     Fly some runs of a scenario and return their results.
 
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.
-    :param progress: called with the share that is done, now and then.
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     """
     world = World(scenario, runs, noise or _noise(scenario))
@@ -88,8 +86,6 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.outbox = []
             if now >= ENGAGED - 1e-9:
                 log.tick(now, followers)
-            if progress is not None and k % (20 * PLANNER_STEPS) == 0:
-                progress(k / count)
         if failing and flock.fails is not None and now >= flock.fails.at:
             for follower in failing:
                 follower.fail(now)
