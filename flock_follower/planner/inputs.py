@@ -184,7 +184,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
 
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
-ACCELERATION_NOISE = 0.35  # m/s^2: an acceleration of a neighbor below this is mostly noise
+ACCELERATION_NOISE = 0.2  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
 FRESH = 0.12  # s up to which the guard's margin covers what else a neighbor may do

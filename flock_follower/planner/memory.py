@@ -44,6 +44,7 @@ from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
+SETTLING = 0.2  # s in which an estimated acceleration is followed: two thirds of its noise go
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
@@ -69,13 +70,16 @@ def observed(motions: Mapping[str, SmoothedMotion],
     for n in neighbors:
         last = motions.get(n.name)
         if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
+            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3)
+                                  if n.acceleration is None else n.acceleration)
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
             change = -math.expm1(-elapsed / SMOOTHING) * (n.velocity - last.velocity)
-            last = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
-        updated[n.name] = last if n.acceleration is None else last._replace(
-            acceleration=n.acceleration)
+            acceleration = change / elapsed if n.acceleration is None else (
+                last.acceleration - math.expm1(-elapsed / SETTLING) * (
+                    n.acceleration - last.acceleration))
+            last = SmoothedMotion(n.stamp, last.velocity + change, acceleration)
+        updated[n.name] = last
     return updated
 
 
