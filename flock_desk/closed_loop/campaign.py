@@ -45,7 +45,7 @@ from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
-from flock_follower.geometry import quaternion_from_yaw, Transform
+from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.planner.sight import FieldOfView
 
@@ -78,6 +78,10 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
+            if scenario.flight.relative_flight:
+                attitudes = world.attitudes()
+                world.look_alone([follower.lean(now, matrix_to_quaternion(rotation))
+                                  for follower, rotation in zip(followers, attitudes)], attitudes)
             for row, message in radio.arrived(now):
                 followers[row].receive(now, message)
         if k % PLANNER_STEPS == 0:

@@ -41,6 +41,7 @@ from flock_follower.mavlink.permission import (
     Phase,
     Seen,
 )
+from flock_follower.mavlink.relative_flight import RelativeFlight
 from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
@@ -55,7 +56,7 @@ from flock_follower.mavlink.velocity_check import (
     VELOCITIES_DISAGREE,
     VelocityComparison,
 )
-from flock_follower.messages import Command, SANE
+from flock_follower.messages import Command, OdometryState, SANE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -101,6 +102,8 @@ class Gate:
         self.fused = False
         """Whether the autopilot's estimate rests on our odometry, so that it proves nothing."""
         self.heights = HeightEstimator()
+        self.relative = RelativeFlight(
+            self.limits.relative_timeout if self.limits.relative_flight else 0.0)
         self.new_command = False
         """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
@@ -124,6 +127,7 @@ class Gate:
         self._disturbance = DisturbanceObserver()
         self._flown: Array | None = None
         self._held: Held | None = None
+        self._commanded = False  # whether the last setpoint was a command
         self._last_yaw: float | None = None
 
     def permit(self, event: Event) -> None:
@@ -170,8 +174,10 @@ class Gate:
         if refused := refusal(age, self.limits.planner_timeout):
             return refused
         source = age if source_age is None else source_age
-        if not source <= OLDEST_SOURCE:
+        if not source <= (setpoint_rules.OLDEST_MARKER if command.relative else OLDEST_SOURCE):
             return 'resting on an old image'
+        if command.relative and math.isnan(self.relative.lasts(now)):
+            return 'relative: not permitted'
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
@@ -202,7 +208,7 @@ class Gate:
         """Take an altitude, m, of the barometer; return '' or why it is refused."""
         known = self._known(now)
         # Also of a source that is not believed: a constant error is found and taken out.
-        velocity = known.source_first[0].fresh_velocity(
+        velocity = None if self.relative.reckoning else known.source_first[0].fresh_velocity(
             self.limits) or known.braking_velocity(self.limits)
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now)
@@ -222,6 +228,14 @@ class Gate:
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
         self._sources[source].take_yaw(yaw, time)
+
+    def update_attitude(self, quaternion: Array, rates: Array, time: float,
+                        now: float) -> OdometryState | None:
+        """Take the autopilot's attitude at a time, s; return the motion without odometry."""
+        flown = np.zeros(3) if self._flown is None else self._flown * [0.0, 0.0, 1.0]
+        return self.relative.motion(
+            quaternion, rates, flown + self._disturbance.acceleration, self.heights.height(now),
+            time, now)
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
@@ -276,13 +290,16 @@ class Gate:
         """Return where the vehicle is in its envelope."""
         position = self._sources[self._source()].path.position
         height = self.heights.height(now)
+        if (motion := self.relative.reckoning) is not None:
+            return Location(height, float(motion.velocity[2]))
         return Location(height, self.heights.climb_rate if height is not None else 0.0,
                      None if position is None or self._start is None else (
                          position - self._start)[:2])
 
     def handover(self, now: float) -> str:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        if now - self._displaced_since > velocity_check.HANDOVER_TIME:
+        if now - self._displaced_since > velocity_check.HANDOVER_TIME and math.isnan(
+                self.relative.lasts(now)):
             return self._displaced
         if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
             return 'no height from the autopilot'
@@ -318,16 +335,22 @@ class Gate:
         velocity = None if known.contradiction(self.limits) else (
             known.source_first[0].fresh_velocity(self.limits))
         self._disturbance.step(self._flown, None if velocity is None else velocity.vector, now)
+        usable = velocity is not None and not self._displaced and self._source() == ODOM
+        self.relative.update(active and engaged, self._commanded, usable, place.height, now)
         command = self._command
         setpoint = setpoint_rules.decide(
             self.limits, full=self.full_limits, known=known,
             command=None if command is None else command.command,
             command_age=math.inf if command is None else now - command.time,
             link_age=link_age, armed=armed, airborne=airborne, withheld=withheld, place=place,
-            unplaced=self.heights.lost(now) or self._displaced, held=self._held or Held(),
+            unplaced=self.heights.lost(now) or (
+                '' if command is not None and command.command.relative else self._displaced),
+            held=self._held or Held(), relative=self.relative.permission(
+                -math.inf if command is None else command.source_time, now),
             wind=self._wind, offset=self._disturbance.offset)
         sends = setpoint.kind != setpoint_rules.NONE
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
+        self._commanded = setpoint.kind == setpoint_rules.COMMAND
         if not sends and not withheld and known.blind(self.limits):
             self.permit(Blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:

@@ -16,7 +16,9 @@
 The setpoint rules: one pure function decides which setpoint may be sent now, if any.
 
 A command passes only if it is fresh and finite, the velocity that it is judged with is fresh, and
-the autopilot is received. Otherwise the setpoint brakes. A stale command is never repeated: an
+the autopilot is received. A command that rests on the marker alone passes only while flight
+without odometry is permitted (``relative_flight``), and with bounds of its own, because its speed
+is not known. Otherwise the setpoint brakes. A stale command is never repeated: an
 autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
 acceleration setpoints lead to, and ArduCopter obeys NaN. Each setpoint keeps these bounds, the
 most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
@@ -46,6 +48,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
+from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command, FASTEST_OWN, SANE
 from flock_follower.planner.limits import (
@@ -54,6 +57,7 @@ from flock_follower.planner.limits import (
     limit_level,
     limit_norm,
     LimitedCommand,
+    SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
 
@@ -167,6 +171,10 @@ class DisturbanceObserver:
         self.excess_since = min(self.excess_since, now) if abs(up) > OFFSET_MAX else math.inf
 
 
+#: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
+RELATIVE_MAX: Final[float] = 1.0
+#: Oldest image that such a command may rest on, s.
+OLDEST_MARKER: Final[float] = 0.5
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'
@@ -206,7 +214,7 @@ NOT_HELD: Final[Held] = Held()
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, armed: bool, airborne: bool = True,
            withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
-           held: Held = NOT_HELD,
+           held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -226,6 +234,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param place: where it is in its envelope.
     :param unplaced: why a height that was known is not any more, or ''.
     :param held: what to keep where there is no command.
+    :param relative: whether a command may rest on the marker alone.
     :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
     :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
     """
@@ -236,7 +245,13 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
+    if command is not None and command.relative:
+        reason = _relative_refusal(limits, command, command_age, relative, link_age, place)
+        if not reason and not unplaced and airborne:
+            return _relative(full, command, against, place, offset)
+        command, admitted, reason = None, None, reason or unplaced or 'on the ground'
+    else:
+        admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
     if admitted is not None:
         command, velocity = admitted
         lift = np.array([0.0, 0.0, _bounded(command.lift)])
@@ -248,7 +263,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                         safe.reason)
     believed = known.braking_velocity(limits)
     if believed is None:
-        kind = NONE if known.blind(limits) else LEVEL
+        kind = NONE if known.blind(limits) and not relative.begins else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin)
     if place.height is not None and held.height is not None and airborne:
@@ -283,6 +298,44 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     if not fresh(command_age, limits.planner_timeout):
         return None, 'command stale'
     return (command, velocity), ''
+
+
+def _relative_refusal(limits: GateLimits, command: Command, command_age: float,
+                      relative: Relative, link_age: float, place: Location) -> str:
+    """Return why a command that rests on the marker alone may not pass, or ''."""
+    if not link_age <= limits.link_timeout:  # written so that NaN fails
+        return 'link lost'
+    if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
+        return 'relative command not permitted'
+    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
+        return 'command not finite'
+    if not fresh(command_age, limits.planner_timeout):
+        return 'command stale'
+    if not fresh(relative.marker_age, OLDEST_MARKER):
+        return 'marker lost'
+    known = place.height is not None and math.isfinite(place.height + place.climb_rate)
+    return '' if known else 'no height'
+
+
+def _relative(full: GateLimits, command: Command, against: Array, place: Location,
+              offset: float) -> Setpoint:
+    """
+    Return the setpoint of a command that rests on the marker alone.
+
+    Heights go first, then the limit of the whole acceleration; the speed is not known.
+    """
+    wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
+    least, most = envelope.vertical_range(
+        full, place, place.climb_rate, _bounded(offset), full.speed_horizon)
+    strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
+    within = min(max(float(wanted[2]), least), most)
+    up = min(max(within, -strongest), strongest)
+    level = limit_norm(wanted[:2], math.sqrt(strongest ** 2 - up ** 2))
+    limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
+    if within != wanted[2]:
+        limits.append(ENVELOPE)
+    return Setpoint(COMMAND, '', np.array([*level, up]), wrap_angle(command.yaw),
+                    ', '.join(limits))
 
 
 def _bounded(offset: float) -> float:

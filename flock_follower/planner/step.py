@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner import relative
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
@@ -142,6 +143,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     last = memory.now
     memory, rejected = ingest(memory, now, own, estimates, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
+    if memory.own is not None and memory.own.relative and engaged and not (
+            waiting or memory.given_up):
+        return _relative(memory, memory.own, now, params, elapsed, rejected)
     memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
     if mode.state is State.IDLE:
         return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
@@ -167,6 +171,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lift = np.array([0.0, 0.0, altitude.lift])
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - lift * params.period, params)
+    if now - memory.switched < relative.SETTLING:
+        command = command._replace(
+            acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -185,6 +192,19 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         turning(last_yaw, yaw, me, params, elapsed), command.away, stamp, command.reason, rejected,
         _warnings(memory, mode, me, neighbors, leader, params), float(lift[2]),
         tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+
+
+def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, elapsed: float,
+              rejected: tuple[Rejection, ...]) -> tuple[Memory, Decision]:
+    """Return the memory and the decision while there is no odometry: see ``relative``."""
+    flown = relative.step(memory, own, now, params, elapsed)
+    if isinstance(flown, str):
+        memory = memory._replace(command=None, pending=np.zeros(3))
+        return memory, Decision(State.HOLD, flown, rejected=rejected)
+    memory, leader, yaw, yaw_rate = flown
+    return memory, Decision(
+        State.RELATIVE, 'no odometry: flies by the marker alone', memory.command, yaw, yaw_rate,
+        stamp=leader.stamp, rejected=rejected, known=(leader,))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
