@@ -21,7 +21,6 @@ Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import Final
 
@@ -42,7 +41,12 @@ from flock_follower.mavlink.permission import (
     Seen,
 )
 from flock_follower.mavlink.relative_flight import RelativeFlight
-from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
+from flock_follower.mavlink.setpoint_rules import (
+    AcceptedCommand,
+    DisturbanceObserver,
+    Held,
+    Setpoint,
+)
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     displaced,
@@ -69,17 +73,6 @@ HEIGHT_HANDOVER_TIME: Final[float] = 2.0
 #: false one must not remove thrust.
 LANDED_HEIGHT: Final[float] = 0.3
 LANDED_TIME: Final[float] = 1.0
-
-
-@dataclass(frozen=True)
-class AcceptedCommand:
-    """A command that was accepted; times are on the monotonic clock."""
-
-    command: Command
-    time: float
-    """When it applies, s."""
-    source_time: float
-    """When the image it rests on was taken, s."""
 
 
 class Gate:

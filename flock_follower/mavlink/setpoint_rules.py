@@ -184,6 +184,16 @@ LEVEL: Final[str] = 'level'
 NONE: Final[str] = 'none'
 
 
+class AcceptedCommand(NamedTuple):
+    """A command that was accepted; times are on the monotonic clock."""
+
+    command: Command
+    time: float
+    """When it applies, s."""
+    source_time: float
+    """When the image it rests on was taken, s."""
+
+
 class Setpoint(NamedTuple):
     """What to send, and why."""
 
@@ -245,15 +255,14 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    if command is not None and command.relative:
-        reason = _relative_refusal(limits, command, command_age, relative, link_age, place)
-        if not reason and not unplaced and airborne:
-            return _relative(full, command, against, place, offset)
-        command, admitted, reason = None, None, reason or unplaced or 'on the ground'
-    else:
-        admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
+    without_odometry = _refusal(limits, relative, place, airborne) if (
+        command is not None and command.relative) else None
+    admitted, reason = _admit(
+        limits, known, command, command_age, link_age, unplaced, without_odometry)
     if admitted is not None:
         command, velocity = admitted
+        if velocity is None:
+            return _relative(full, command, against, place, offset)
         lift = np.array([0.0, 0.0, _bounded(command.lift)])
         away = _direction(command.away)
         safe = _limited(limits if away is None else full,
@@ -277,18 +286,28 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
 
 
 def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-           link_age: float, unplaced: str) -> tuple[tuple[Command, Velocity] | None, str]:
-    """Return the command and the velocity to judge it with, or None and why it may not pass."""
+           link_age: float, unplaced: str, without_odometry: str | None,
+           ) -> tuple[tuple[Command, Velocity | None] | None, str]:
+    """
+    Return the command and the velocity to judge it with, or None and why it may not pass.
+
+    :param without_odometry: of a command that rests on the marker alone, which has no velocity,
+        why it may not pass, or ''; of others None.
+    """
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
-    judge, _ = known.source_first
-    velocity = judge.fresh_velocity(limits)
-    if velocity is None:
-        never = math.isinf(judge.velocity_age)
-        told = f'velocity from {known.source}'
-        return None, f'no {told}' if never else f'{told} stale'
-    if disagreement := known.contradiction(limits):
-        return None, disagreement
+    velocity = None
+    if without_odometry is None:
+        judge, _ = known.source_first
+        velocity = judge.fresh_velocity(limits)
+        if velocity is None:
+            never = math.isinf(judge.velocity_age)
+            told = f'velocity from {known.source}'
+            return None, f'no {told}' if never else f'{told} stale'
+        if disagreement := known.contradiction(limits):
+            return None, disagreement
+    elif without_odometry:
+        return None, without_odometry
     if unplaced:
         return None, unplaced
     if command is None:
@@ -300,21 +319,15 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     return (command, velocity), ''
 
 
-def _relative_refusal(limits: GateLimits, command: Command, command_age: float,
-                      relative: Relative, link_age: float, place: Location) -> str:
-    """Return why a command that rests on the marker alone may not pass, or ''."""
-    if not link_age <= limits.link_timeout:  # written so that NaN fails
-        return 'link lost'
+def _refusal(limits: GateLimits, relative: Relative, place: Location, airborne: bool) -> str:
+    """Return why no command may pass that rests on the marker alone, or ''."""
     if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
         return 'relative command not permitted'
-    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
-        return 'command not finite'
-    if not fresh(command_age, limits.planner_timeout):
-        return 'command stale'
     if not fresh(relative.marker_age, OLDEST_MARKER):
         return 'marker lost'
-    known = place.height is not None and math.isfinite(place.height + place.climb_rate)
-    return '' if known else 'no height'
+    if place.height is None or not math.isfinite(place.height + place.climb_rate):
+        return 'no height'
+    return '' if airborne else 'on the ground'
 
 
 def _relative(full: GateLimits, command: Command, against: Array, place: Location,
