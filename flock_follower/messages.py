@@ -53,6 +53,8 @@ LIFT = 'lift'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
 RELATIVE = 'flock_relative'
+#: On this topic the bridge publishes it while that is flown on.
+MOTION_TOPIC = 'mavlink/relative'
 #: s without a message in that frame after which odometry counts again.
 RELATIVE_SILENCE = 0.15
 #: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
