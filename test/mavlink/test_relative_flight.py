@@ -209,6 +209,18 @@ def test_never_longer_than_the_timeout_and_never_after_a_takeover(events):
         assert len(span) == 0 or span[-1] - span[0] <= 8.0 + 1.1
 
 
+def test_time_without_odometry_is_made_up_for_by_as_much_time_with_it():
+    vehicle = Flown(GateLimits(relative_flight=True, relative_timeout=8.0, blind_timeout=10.0))
+    vehicle.permit()
+    vehicle.for_seconds(1.0, False)
+    for with_odometry, kind in ((2.0, COMMAND), (2.0, LEVEL), (9.0, COMMAND)):
+        vehicle.for_seconds(with_odometry, False)
+        vehicle.odometry = False
+        assert vehicle.for_seconds(6.0, True).kind == kind
+        vehicle.odometry = True
+        vehicle.cycle(False)
+
+
 def test_displacements_that_differ_are_flown_without_odometry_and_then_handed_over():
     vehicle = Flown()
     vehicle.permit()

@@ -98,6 +98,13 @@ def test_without_the_marker_or_the_attitude_nothing_is_commanded(seen, own_age, 
     assert reason in decision.reason
 
 
+def test_the_relative_speed_is_bounded():
+    far = leader(5.0, (30.0, 0.0, 0.0))
+    for speed, acceleration in ((0.3, 0.1 / 0.6), (0.4, 0.0), (0.5, -0.1 / 0.6)):
+        decision = tick(Memory(), 5.0, [far], (speed, 0.0, 0.0))[1]
+        assert decision.acceleration[0] == pytest.approx(acceleration)
+
+
 def test_another_neighbor_in_the_way_is_not_approached():
     far, near = leader(5.0, (2.8, 0.0, 0.0)), leader(5.0, (1.25, 0.0, 0.0), name='other')
     assert tick(Memory(), 5.0, [far])[1].acceleration[0] > 0.2
