@@ -327,9 +327,10 @@ class Gate:
         self._hold(known, place, engaged, now)
         velocity = None if known.contradiction(self.limits) else (
             known.source_first[0].fresh_velocity(self.limits))
-        self._disturbance.step(self._flown, None if velocity is None else velocity.vector, now)
         usable = velocity is not None and not self._displaced and self._source() == ODOM
         self.relative.update(active and engaged, self._commanded, usable, place.height, now)
+        self._disturbance.step(self._flown, None if velocity is None or (
+            self.relative.reckoning is not None) else velocity.vector, now)
         command = self._command
         setpoint = setpoint_rules.decide(
             self.limits, full=self.full_limits, known=known,
