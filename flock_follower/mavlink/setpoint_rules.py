@@ -255,10 +255,8 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    without_odometry = _refusal(limits, relative, place, airborne) if (
-        command is not None and command.relative) else None
-    admitted, reason = _admit(
-        limits, known, command, command_age, link_age, unplaced, without_odometry)
+    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced,
+                              _refusal(limits, command, relative, place, airborne))
     if admitted is not None:
         command, velocity = admitted
         if velocity is None:
@@ -319,8 +317,11 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     return (command, velocity), ''
 
 
-def _refusal(limits: GateLimits, relative: Relative, place: Location, airborne: bool) -> str:
-    """Return why no command may pass that rests on the marker alone, or ''."""
+def _refusal(limits: GateLimits, command: Command | None, relative: Relative, place: Location,
+             airborne: bool) -> str | None:
+    """Return why a command that rests on the marker alone may not pass, or ''; of others None."""
+    if command is None or not command.relative:
+        return None
     if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
         return 'relative command not permitted'
     if not fresh(relative.marker_age, OLDEST_MARKER):

@@ -171,9 +171,6 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lift = np.array([0.0, 0.0, altitude.lift])
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - lift * params.period, params)
-    if now - memory.switched < relative.SETTLING:
-        command = command._replace(
-            acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -357,7 +354,10 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
     final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
-    return command._replace(acceleration=final.acceleration, reason=reason), fading
+    a = final.acceleration
+    if me.stamp - memory.switched < relative.SETTLING:
+        a = relative.without_step(a, memory.command)
+    return command._replace(acceleration=a, reason=reason), fading
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
