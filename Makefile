@@ -38,9 +38,9 @@
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   RUNS=20             how often `make flights` flies each scenario
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
-#                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
+#                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
-#                       LEADER=udpin:127.0.0.1:19411 where a second one tells the truth, which flies the leader
+#                       LEADER=udpin:127.0.0.1:19411 where a second autopilot, that of the leader, sends the truth
 
 VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
@@ -60,7 +60,7 @@ KILLS ?= 100
 SEED ?= 1
 ONLY ?=
 export PYTHON
-# Nothing started from here is ever heard outside this machine.
+# Other machines receive nothing from the programs started here.
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 

@@ -15,12 +15,12 @@
 """
 Three rclpy nodes that only pass messages, for ``stack.py``, and odometry twice as often.
 
-Each takes what the node of its name takes, every message by an ordinary callback, and publishes
-under ``bare/`` what that publishes, as often and as long. They compute nothing, check nothing, and
-speak no MAVLink. The three are a chain of their own beside the real ones.
+Each subscribes to the topics of the node of its name, with ordinary callbacks, and publishes the
+same messages under ``bare/``, at the same rate and size. They compute nothing, check nothing, and
+send no MAVLink. The three are a separate chain beside the real nodes.
 
-A fourth is no part of what is measured. The simulator tells odometry at 100 Hz, ``OftenOdometry``
-at 200 Hz: each as it comes, and where its velocities lead 5 ms later.
+A fourth node is not measured. The simulator publishes odometry at 100 Hz, ``OftenOdometry`` at
+200 Hz: each message as it comes, and its prediction 5 ms later.
 """
 
 from __future__ import annotations
@@ -117,14 +117,14 @@ class BareBridge(Node):
             MultiDOFJointTrajectory, 'bare/command/trajectory', nothing, NEWEST)
         self._odometry = self.create_publisher(Odometry, 'bare/mavlink/odom', 10)
         self._states = self.create_publisher(String, 'bare/mavlink_bridge/state', 1)
-        self.create_timer(STATE, self._tell)
+        self.create_timer(STATE, self._publish_state)
 
     def _take_odom(self, message: Odometry) -> None:
         self._count += 1
         if self._count % EVERY == 0:
             self._odometry.publish(message)
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         self._states.publish(String(data='ACTIVE'))
 
 

@@ -43,7 +43,7 @@ from flock_follower.resources import resource
 
 #: The aim is 3: perception, planner, gate and images alone take 2.4 of it.
 MOST = 4.5
-#: The parts that ``Evaluation.cpu`` knows, by what is shown.
+#: The parts of ``Evaluation.cpu``, by their titles.
 PARTS = {'perception': ('track', 'roi', 'full'), 'planner': ('planner',), 'gate': ('gate',),
          'images': ('decode',)}
 

@@ -162,7 +162,7 @@ def rms(values: list[float]) -> float:
 
 
 def main() -> None:
-    """Print what is seen."""
+    """Print the detections."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
     render_in_one_thread()
     carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),

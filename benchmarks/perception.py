@@ -24,7 +24,7 @@ is a bag of images, odometry and truth. Every image goes, in one process on one 
 - ours: ``Tracker.process_image`` as the node calls it, fed with the odometry.
 
 They take turns every thirty images, so that a slow moment of the machine is nobody's alone, and
-yet each finds its own code and data in the caches. What is timed is this process's CPU time;
+yet each finds its own code and data in the caches. The measure is this process's CPU time;
 decoding is outside. Exit code 0 only if every bound holds.
 
 ``--flights cameras`` compares two cameras with one in the same way, on the sample: a second one
@@ -73,14 +73,14 @@ TURN = 30  # images in a row that a method gets
 SHORT_TURN = 10  # the same where cameras are compared, by the median over the turns
 MAX_WAIT = 0.05  # s that an image waits for odometry, as in the node
 WRONG = np.deg2rad(20.0)
-#: A velocity less certain than this, m/s, is none: the planner does not use it either.
+#: A velocity less certain than this, m/s, does not count: the planner does not use it either.
 VELOCITY_STD = PlannerParams().max_velocity_std
 
 Look = Callable[[GrayImage], Transform | None]  # returns T_camera_marker
 
 
 class Bounds(NamedTuple):
-    """What a flight must reach; infinite where it need not."""
+    """What a flight must reach; infinite if it need not."""
 
     ratio: float
     """CPU time of default over ours, at least."""
@@ -110,7 +110,7 @@ BACK = camera_mounting([-0.10, 0.0, 0.0], [0.0, 0.0, np.pi])
 
 
 class Figures(NamedTuple):
-    """What one method reached on one flight; NaN where it has no such thing."""
+    """What one method reached on one flight; NaN if it has no such thing."""
 
     cpu_ms_mean: float
     cpu_ms_p50: float
@@ -259,7 +259,7 @@ class Flight:
 
     def timed(self, method: str, stamp: int, seconds: float, image: GrayImage,
               model: CameraModel) -> float:
-        """Give an image to a method, remember what it tells, and return the CPU time, ms."""
+        """Give an image to a method, store its result, and return the CPU time, ms."""
         look = self.looks.get(method)
         start = time.process_time_ns()
         if look is None:
@@ -287,7 +287,7 @@ class Flight:
         gc.freeze()  # as the node does before it spins
 
     def state(self, method: str, stamp: int, T_camera_marker: Transform) -> State:
-        """Return what a detector tells of the leader, its velocity from two positions."""
+        """Return a detector's state of the leader, its velocity from two positions."""
         before, after = next((a, b) for a, b in zip(self.own[-2::-1], self.own[:0:-1])
                              if a.stamp <= stamp)
         f = (stamp - before.stamp) / (after.stamp - before.stamp)

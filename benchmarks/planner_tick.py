@@ -27,7 +27,7 @@ else "in order" adds a bisection for the first bound that cannot be, and one pro
 as nearly as possible. They stop there, where ours goes on to the bounds after it: it is the least
 that they could cost. Their error is the distance from our answer with the same polygons.
 
-What is timed is this thread's CPU time, for each input the least of several rounds over all of
+The measure is this thread's CPU time, for each input the least of several rounds over all of
 them, so that what varies is the input, not what else the machine does. Exit code 0 only if the
 ticks keep MOST.
 """
@@ -297,7 +297,7 @@ def osqp() -> Solve:
             ready[A.shape].setup(
                 sparse.eye(len(w), format='csc'), -w, sparse.csc_matrix(np.ones(A.shape)), b,
                 np.full(len(b), np.inf), verbose=False, eps_abs=1e-6, eps_rel=1e-6)
-        # What was found before is no start for another problem.
+        # An earlier solution is no start for another problem.
         ready[A.shape].update(q=-w, l=b, Ax=A.T.ravel())
         ready[A.shape].warm_start(x=np.zeros(len(w)), y=np.zeros(len(b)))
         result = ready[A.shape].solve()

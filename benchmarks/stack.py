@@ -23,8 +23,8 @@ ordinary callbacks, and pass on as many of their own. The ratio is the CPU time 
 that of the bare three, in the same seconds, so that a busy machine slows both. It is CPU time of
 whole processes, by /proc; what makes the messages, the autopilot and this program do not count.
 
-Lateness, of the planner's ticks by the time that each command tells, of the setpoints by when the
-kernel got them: how much later one came, in a grid of 0.1 s and 0.05 s, than the earliest of the
+Lateness, of the planner's ticks by the time in each command, of the setpoints by the kernel's time
+of reception: how much later one came, in a grid of 0.1 s and 0.05 s, than the earliest of the
 same 10 s do. A missed one left its place in the grid empty.
 
 Exit code 0 only if the ratio keeps MOST.
@@ -59,11 +59,11 @@ from flock_follower.messages import from_trajectory
 
 NODES = ('relative_pose', 'planner', 'mavlink_bridge')
 MOST = 0.8  # times the CPU time of the bare nodes
-WINDOW = 10.0  # s over which a share of a core is told
+WINDOW = 10.0  # s over which the share of a core is reported
 SETTLING = 5.0  # s of flight that are not counted
 PERIODS = {'planner': 0.1, 'mavlink_bridge': 0.05}  # s
-EARLY = 5  # percentile of those of 10 s that is taken for in time
-EARLIEST = 0.1  # of a period: what is earlier than that is late by most of one
+EARLY = 5  # percentile of those of 10 s that counts as in time
+EARLIEST = 0.1  # of a period: a message earlier than that is late by most of a period
 SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it
 SETPOINT = 84  # id of SET_POSITION_TARGET_LOCAL_NED
 SCENARIO = """summary: "indoor, for long"
@@ -105,7 +105,7 @@ class Relay:
 
 
 class Ticks:
-    """Notes the time that each command of the planner tells."""
+    """Notes the time in each command of the planner."""
 
     def __init__(self) -> None:
         self.times: list[float] = []

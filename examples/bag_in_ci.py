@@ -16,7 +16,7 @@
 Judge a bag in your own CI by what ``evaluate`` wrote of it; bag_in_ci.yaml is the workflow.
 
     python -m flock_desk.evaluate BAG --output OUT
-    python examples/bag_in_ci.py OUT/summary.json      # exit code 1 where a bound is broken
+    python examples/bag_in_ci.py OUT/summary.json      # exit code 1 if a bound is broken
 
 Bounds on single figures need no Python: ``evaluate --expect bounds.yaml``. Here are also figures
 made of several, and this needs nothing but Python.
@@ -31,8 +31,8 @@ if len(sys.argv) != 2:
 summary = json.loads(Path(sys.argv[1]).read_text(encoding='utf-8'))
 planner, setpoints = summary['planner'], summary['setpoints']
 
-# What it is, the figure, the least, the greatest. A figure is None where the bag cannot tell it:
-# errors need truth/odom and truth/neighbors.
+# Name, figure, least, greatest. A figure is None if the bag lacks its data: errors need truth/odom
+# and truth/neighbors.
 BOUNDS = [
     ('share of images in which the leader was found', summary['recall'], 0.95, None),
     ('share of ticks that followed', planner['states']['TRACK'] / planner['ticks'], 0.9, None),

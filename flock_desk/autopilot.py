@@ -15,8 +15,8 @@
 """
 An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
 
-``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and talks to a bridge listening
-there. It is for tests and demonstrations, and refuses any address but loopback.
+``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and connects to a bridge that
+listens there. The program is for tests and demonstrations; it refuses any address but loopback.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def loopback_address(text: str) -> tuple[str, int]:
     """
     Return the address of 'HOST:PORT'.
 
-    :raises ValueError: where it is malformed, or not loopback.
+    :raises ValueError: if it is malformed, or not loopback.
     """
     host, _, port = text.rpartition(':')
     if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
@@ -113,7 +113,7 @@ class Endpoint:
 
     :param address: where the bridge listens.
     :param autopilot: the autopilot, or another link of it.
-    :raises OSError: where the socket cannot be made.
+    :raises OSError: if the socket cannot be made.
     """
 
     def __init__(self, address: tuple[str, int], autopilot: Stepped) -> None:
@@ -138,7 +138,7 @@ class Endpoint:
         return due
 
     def step(self, now: float) -> None:
-        """Fly on to ``now``, s on the monotonic clock, and send what is due."""
+        """Fly on to ``now``, s on the monotonic clock, and send the messages that are due."""
         self._send(self.autopilot.step(now))
 
     def close(self) -> None:

@@ -16,8 +16,8 @@
 The demonstration: a recorded bag becomes MAVLink setpoints, judged against bounds.
 
 ``python -m flock_desk.demo`` starts replay, relative_pose, planner, mavlink_bridge and
-the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that nobody
-outside this machine can hear. Exit code 0 only if every bound holds; 3 if the machine was too
+the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that
+other machines cannot receive. Exit code 0 only if every bound holds; 3 if the machine was too
 busy: then nothing is judged.
 """
 
@@ -60,7 +60,7 @@ PLAYED = ['/image_raw/compressed', '/camera_info', '/odom']
 STATE = 'planner/state:std_msgs/msg/String'
 TITLE = 'flock_follower: a recorded bag, flown by an embedded autopilot'
 INTRODUCTION = (
-    'The bag is replayed through the nodes, and an embedded autopilot flies what they command. '
+    'The bag is replayed through the nodes, and an embedded autopilot flies their commands. '
     'The camera in the bag does not move with that vehicle: its speed is shown, its path would '
     'mean nothing. Distance, path and errors are those of the recorded flight.')
 BOUNDS = (

@@ -13,17 +13,17 @@
 # limitations under the License.
 
 """
-Run perception, planner and setpoint gate over a bag, and say how well they did.
+Run perception, planner and setpoint gate over a bag, and report their errors.
 
 ``python -m flock_desk.evaluate BAG --config config/follower.yaml --output OUT`` needs no
-ROS and runs in the bag's own time, as fast as the machine allows; what happens when is told in
-``flock_desk.runs.recorded_flight``. It writes
+ROS and runs in the bag's own time, as fast as the machine allows; the order of events is that
+of ``flock_desk.runs.recorded_flight``. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
   them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
-  (acceleration, yaw and yaw rate in the axes of odom; NaN where it gives none);
-- ``summary.json``: the figures; null where the bag does not tell, as errors without truth. Two
-  runs differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
+  (acceleration, yaw and yaw rate in the axes of odom; NaN if it gives none);
+- ``summary.json``: the figures; null if the bag lacks the data, as errors without truth. Two runs
+  differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
 - ``report.html``: the figures and pictures of the flight in one file.
 
 The rules of ``check`` judge the bag at the same time: their errors and warnings stand before the
@@ -117,7 +117,7 @@ def _evaluate_all(each: Sequence[argparse.Namespace], scheduler: str) -> int:
 
 
 class BagOutcome(NamedTuple):
-    """The outcome of one bag; ``refused`` is the reason why there is none, or ''."""
+    """The outcome of one bag; ``refused`` is the reason if it failed, or ''."""
 
     refused: str = ''
     findings: Sequence[Finding] = ()
@@ -183,7 +183,7 @@ def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
         return []
     return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
             f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
-            'brake; set v_max (--config) to what was flown']
+            'brake; set v_max (--config) to the recorded speed']
 
 
 if __name__ == '__main__':

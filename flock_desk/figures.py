@@ -153,7 +153,7 @@ def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list
 
 
 def one_flock(options: argparse.Namespace) -> list[str]:
-    """Simulate one flock from a random start, draw it, and return the names of what it wrote."""
+    """Simulate one flock from a random start, draw it, and return the names of its files."""
     from flock_desk.runs import paper_plots as plots
     params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
     usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
@@ -210,7 +210,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
 
 
 def _text(value: float, digits: int) -> str:
-    """Return a number as text; empty where there is none, and never a negative zero."""
+    """Return a number as text; empty for NaN, and never a negative zero."""
     zero = '0.' + '0' * digits
     return '' if np.isnan(value) else f'{value:.{digits}f}'.replace(f'-{zero}', zero)
 

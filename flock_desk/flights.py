@@ -61,7 +61,7 @@ from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 from flock_follower.whole_file import whole_file
 
-CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
+CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
 MOST_EXITS = 5  # of a scenario that are named
 MODES = ('law', 'guard')
@@ -160,7 +160,7 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
     """
     Return the scenarios of given names and files, in their order; 'all' is all of the package.
 
-    :raises ScenarioError: where one is unknown, wrong, or of the same name as another.
+    :raises ScenarioError: if one is unknown, wrong, or of the same name as another.
     """
     scenarios: dict[str, Scenario] = {}
     for name in dict.fromkeys(names() if 'all' in wanted else wanted):
@@ -234,7 +234,7 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
     try:
         yield from flown
     except BaseException:
-        # A task runs for up to a minute: what it would return, nobody wants any more.
+        # A task runs for up to a minute: its result is no longer needed.
         for worker in multiprocessing.active_children():
             worker.terminate()
         raise

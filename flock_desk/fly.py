@@ -16,13 +16,13 @@
 A closed-loop flight on the desk: the simulator in place of camera, odometry and both vehicles.
 
 ``python -m flock_desk.fly --scenario indoor`` starts simulator, relative_pose, planner
-and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that nobody
-outside this machine can hear; arms, changes to offboard mode, engages, and flies the scenario.
+and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that
+other machines cannot receive; arms, changes to offboard mode, engages, and flies the scenario.
 Exit code 0 only if every bound holds; 3 if the machine was too busy: then nothing is judged.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
 flown by an autopilot that runs already, see docs/desk.md: from the ground, and back to it. With
-``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
+``--leader-truth`` its leader is the vehicle of a second autopilot, which another program flies.
 
 ``--followers 2`` flies a column: each follower with nodes, namespace, vehicle and simulator of its
 own, its camera on the vehicle of the one before it.
@@ -71,7 +71,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
                        help='where the bridge finds it: udp:HOST:PORT where it sends to, '
                        'tcp:HOST:PORT where it listens')
     group.add_argument('--truth', default='', metavar='URL',
-                       help='another link, on which it tells where the vehicle is '
+                       help='another link, on which it sends the true place '
                        f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
     group.add_argument('--leader-truth', default='', metavar='URL',
                        help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
@@ -173,15 +173,15 @@ def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> S
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings: a busy machine, a flight cut short."""
-    told = []
+    warnings = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
     if skipped > BUSY:
-        told.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
+        warnings.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
                     'rendered in time, which the follower feels as a camera that stops; fly again '
                     'when it is idle')
     if early := (summary['external'] or {}).get('ended_early'):
-        told.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
-    return told
+        warnings.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
+    return warnings
 
 
 if __name__ == '__main__':

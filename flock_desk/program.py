@@ -15,7 +15,7 @@
 """
 The command ``flock_follower``: starts a node or a command by its name, where pip installed it.
 
-``ros2 run flock_follower NAME`` does the same where there is ROS.
+``ros2 run flock_follower NAME`` does the same with ROS.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def main() -> int:
         if (error.name or 'flock_desk').startswith(('flock_follower', 'flock_desk')):
             raise
         print(f'error: {name} needs {error.name}, which is not installed: in the folder of the '
-              "package run pip install '.[runtime]'; where there is ROS, source its setup.bash",
+              "package run pip install '.[runtime]'; with ROS, source its setup.bash",
               file=sys.stderr)
         return 1
     code: int = program.main()

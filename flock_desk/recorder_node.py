@@ -39,7 +39,7 @@ from flock_follower.nodes.support.runtime import run, spin
 
 class Recorder(Node):
     """
-    Writes what it receives; QoS reliable and volatile, so nothing published so is lost.
+    Writes every message received; its QoS is reliable and volatile, so no message is lost.
 
     :raises ValueError: for a message type that is not there, or a bag that cannot be made.
     """
@@ -61,7 +61,7 @@ class Recorder(Node):
                 spin(self)
                 print(f'closing {self._bag.path}', flush=True)
         except BagError as error:
-            kept = ('; what was recorded before is kept, marked incomplete'
+            kept = ('; the recording so far is kept, marked incomplete'
                     if incomplete(self._bag.path) else '')
             print(f'error: {error}{kept}', file=sys.stderr)
             return 1

@@ -209,7 +209,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     Write a bag, in place of an older one there, rendering in processes of its own.
 
     :param jobs: number of processes; they change nothing but the time it takes.
-    :raises BagError: where something other than a bag is in the way, or cannot be written.
+    :raises BagError: if something other than a bag is in the way, or cannot be written.
     """
     if out.exists() and not (out / 'metadata.yaml').is_file():
         raise BagError(f'{out}: exists and is not a bag: not replaced')

@@ -17,9 +17,9 @@ The simulator node: the camera, the odometry and both vehicles of a flight on th
 
 Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, and
 ``ranges`` where the scenario has them, in real time. The follower is flown by an embedded
-autopilot, which a ``mavlink_bridge`` on this machine talks to. It hovers, as the leader does,
-until ``planner/state`` says that it is engaged and it is in offboard mode; then the scenario
-begins, and the node ends with it.
+autopilot, connected to a ``mavlink_bridge`` on this machine. Follower and leader hover until
+``planner/state`` reports that it is engaged and the autopilot is in offboard mode. Then the
+scenario begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an external autopilot, usually a simulator, and
 ``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
@@ -77,35 +77,35 @@ MESSAGES = 3
 SPECS = [
     Spec('scenario', 'indoor',
          'name of a file in config/scenarios, or the path of a .yaml file'),
-    Spec('seed', 0, 'of everything that chance decides', SEEDS),
-    Spec('duration', 0.0, 'flight time; 0: that of the scenario', DURATIONS),
+    Spec('seed', 0, 'seed of all random numbers', SEEDS),
+    Spec('duration', 0.0, 'flight time; 0: the duration of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
     Spec('vehicle', 'embedded',
          'autopilot of the follower: the embedded one, or an external one',
          ('embedded', 'external')),
     Spec('truth_connection', 'udpin:127.0.0.1:19410',
-         "link on which an external autopilot reports its vehicle's place, not the bridge's: "
-         "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the "
-         "default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
+         "link on which an external autopilot reports the true place of its vehicle; not the "
+         "bridge's link: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; "
+         "PX4's SIH: the default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
     Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
     Spec('require_truth', False,
          'refuse the estimate of an external autopilot that sends no ground truth: set it if odom '
          'is forwarded to it'),
     Spec('leader_truth_connection', '',
-         'link on which the autopilot of a second vehicle, the leader, reports its place, with '
-         "vehicle = external; none: the leader is the scenario's. PX4's second SIH: "
+         'link on which the autopilot of the leader, a second vehicle, reports its true place '
+         "(vehicle = external); empty: the leader of the scenario. PX4's second SIH: "
          "udpin:127.0.0.1:19411, ArduPilot's second SITL: tcp:127.0.0.1:5772"),
-    Spec('leader_target_system', 2, 'MAVLink system id of that autopilot', IDS),
+    Spec('leader_target_system', 2, "MAVLink system id of the leader's autopilot", IDS),
     Spec('leader_topic', '',
-         'topic on which another simulator publishes the true motion of its vehicle, the leader '
-         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded; none: the leader is the '
-         "scenario's"),
+         'topic with the true motion of the leader from another simulator (nav_msgs/Odometry, its '
+         'truth/motion; vehicle = embedded); empty: the leader of the scenario'),
     Spec('leader_offset', [1.5, 0.0, 0.0],
-         'origin of the odom frame of that vehicle in the own one',
+         "origin of the leader's odom frame in the own odom frame",
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
-         'end with exit code 3 in flight if the machine is too busy for what its parent started'),
-    Spec('log', '', '.npz file for the true flight; none: no log'),
+         'end the flight with exit code 3 if the machine is too busy for the nodes of the parent '
+         'process'),
+    Spec('log', '', '.npz file for the true motion; empty: no log'),
 ]
 
 
@@ -114,7 +114,7 @@ class Simulator(FlockNode):
     Steps a flight in real time, and publishes the output of the sensors.
 
     :raises ValueError: a bad parameter, a scenario that cannot be flown, or no external vehicle.
-    :raises OSError: where the socket cannot be made.
+    :raises OSError: if the socket cannot be made.
     """
 
     def __init__(self) -> None:
@@ -168,7 +168,7 @@ class Simulator(FlockNode):
                                    'mode and planner/engage')
 
     def _links(self) -> ExternalVehicles | None:
-        """Return the links to external vehicles; None if there is none."""
+        """Return the links to external vehicles, or None."""
         leader = self._values['leader_truth_connection']
         topic = self._values['leader_topic']
         if self._values['vehicle'] == 'embedded':

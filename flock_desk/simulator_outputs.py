@@ -61,7 +61,7 @@ class SimulatorOutputs:
         self._motion_sent = 0
 
     def armed_below(self) -> None:
-        """Tell that the vehicle was armed on the ground, at the height 0 of the odometry."""
+        """Publish that the vehicle was armed on the ground, at height 0 of the odometry."""
         message = PointStamped()
         message.header.frame_id = ODOM_FRAME
         self._armed_at.publish(message)
@@ -85,7 +85,7 @@ class SimulatorOutputs:
         self._ranges.publish(message)
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
-        """Publish what is true at an image, and keep the image until it is due."""
+        """Publish the truth of an image, and keep the image until it is due."""
         self._true_own.publish(_message(stamp_ns, BODY_FRAME, frame.follower))
         if frame.leader is not None:
             self._true_leader.publish(_message(stamp_ns, LEADER, frame.leader))
@@ -93,7 +93,7 @@ class SimulatorOutputs:
 
     @property
     def next_image(self) -> float:
-        """Return when an image is due, s since the start; infinity where none is."""
+        """Return when an image is due, s since the start; infinity without one."""
         return self._pending[0][1].due_ns * 1e-9 if self._pending else math.inf
 
     def send_images(self, now: float, start: float) -> None:

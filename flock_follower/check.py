@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Report what is wrong with a running system, or with a recording, before anything flies.
+Report the faults of a running system, or of a recording, before a flight.
 
 ``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes and the
 autopilot's messages through the bridge. ``check BAG`` reads a recording, without ROS, and reports
@@ -69,7 +69,7 @@ _COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m',
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(
-        prog='check', description='Say in plain words what is wrong with a system (without BAG), '
+        prog='check', description='Report the faults of a running system (without BAG), '
         'or a recording, before anything flies. It changes nothing.')
     parser.add_argument('bag', type=Path, nargs='?', metavar='BAG',
                         help='.mcap, .db3, .bag or ROS 2 bag folder; none: the running system')
@@ -105,8 +105,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _refuse(error)
     except ModuleNotFoundError as error:
-        return _refuse(f'{error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-                       'package that package.xml names?')
+        return _refuse(f'{error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+                       'package in package.xml')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
@@ -195,7 +195,7 @@ def _rows(finding: Finding, colours: bool) -> list[str]:
         rows[0] = rows[0].replace(level, f'{_COLOURS[finding.level]}{level}\x1b[0m', 1)
     if finding.advice:
         indent = ' ' * _WIDTHS[0]
-        # What is to be copied stays in one piece.
+        # Text to copy is not wrapped.
         whole = finding.advice.replace('--remap ', '--remap\0').replace('-r ', '-r\0')
         rows += [row.replace('\0', ' ') for row in textwrap.wrap(
             f'-> {whole}', COLUMNS, initial_indent=indent, subsequent_indent=f'{indent}   ',

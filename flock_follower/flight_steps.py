@@ -73,7 +73,7 @@ class Reports:
     battery: str = ''
 
     def value(self, node: str, key: str) -> str:
-        """Return a value of a node's diagnostics, '' if there is none."""
+        """Return a value of a node's diagnostics, or ''."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
     def missing(self, now: float) -> list[str]:

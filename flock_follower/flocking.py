@@ -107,8 +107,8 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
 
     L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
 
-    :param relative_positions: neighbours' positions minus one's own, (m, n), n = 2 or 3, m.
-    :param relative_velocities: neighbours' velocities minus one's own, (m, n), m/s.
+    :param relative_positions: neighbours' positions minus the own one, (m, n), n = 2 or 3, m.
+    :param relative_velocities: neighbours' velocities minus the own one, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
     x, v = checked(relative_positions, relative_velocities,
@@ -119,10 +119,10 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
 
 def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams) -> float:
     """
-    Return W, which falls strictly along every solution of the law, whatever the flock.
+    Return W, which strictly decreases along every solution of the law, for any flock.
 
     W = L + 1/2 sum_{i>j} [F(r^2 - d0) + F(d1 - r^2)], where F(g) is g^(1 - theta) / (theta - 1)
-    (1/g for theta = 2), or ln((d1 - d0) / g) for theta = 1. It is positive, and infinite where
+    (1/g for theta = 2), or ln((d1 - d0) / g) for theta = 1. W is positive, and infinite if
     any pair is outside the band; the paper's E tends to minus infinity instead.
 
     :param positions: (k, n), n = 2 or 3, m.

@@ -52,8 +52,8 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         from flock_follower.nodes.pilot import fly
     except ModuleNotFoundError as error:
-        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-              'package that package.xml names?', file=sys.stderr)
+        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+              'package in package.xml', file=sys.stderr)
         return 2
     return fly(options.namespace, not options.yes, verdict, SECONDS)
 

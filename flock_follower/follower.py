@@ -124,7 +124,7 @@ class Listener:
     def cycle(self, cycle: ControlCycle) -> None:
         """Take the outcome of a cycle of the control."""
 
-    def words(self, time: int, words: list[OdometryState]) -> None:
+    def send(self, time: int, messages: list[OdometryState]) -> None:
         """Take messages to other followers, at a time in ns."""
 
     def rejected(self, reason: str, detail: str) -> None:
@@ -140,7 +140,7 @@ class Follower:
     Perception, planner and setpoint control on one clock; every time is in ns.
 
     :param planner: gathers inputs and takes one step per tick, with ``params``.
-    :param control: what may go out, and what it is; None while the bridge is dead.
+    :param control: the setpoint gate; None while the bridge is dead.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None if neighbors come from elsewhere.
@@ -178,28 +178,28 @@ class Follower:
         self._gate_received = 0
         self._state: State | None = None
         self._bridge_state = ''
-        self._bridge_told = 0
+        self._bridge_ended = 0
 
     # Events.
 
-    def engage(self, time: int, wanted: bool) -> None:
+    def engage(self, time: int, requested: bool) -> None:
         """Take a call of ``planner/engage``."""
         self.advance(time)
-        self.planner.engage(wanted)
+        self.planner.engage(requested)
 
     def permit(self, time: int, event: Event) -> None:
         """Take a request to the bridge, or its result; see ``permission``."""
         self.advance(time)
         if self.control is not None:
             self.control.permit(event)
-            self._tell_bridge_state()
+            self._announce_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
         """Take the status of the vehicle."""
         self.advance(time)
         if self.control is not None:
             self.control.see(status, self._seconds(), airborne)
-            self._tell_bridge_state()
+            self._announce_bridge_state()
 
     def estimate(self, time: int, velocity: Array) -> None:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
@@ -235,13 +235,13 @@ class Follower:
     def bridge_died(self, time: int) -> None:
         """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
         self.advance(time)
-        self._bridge_told, self.control = self._now, None
+        self._bridge_ended, self.control = self._now, None
 
     def bridge_started(self, time: int, control: Gate) -> None:
         """Let a new bridge start, which knows nothing of the one before."""
         self.advance(time)
         self.control = control
-        self._tell_bridge_state()
+        self._announce_bridge_state()
 
     def odometry(self, time: int, state: OdometryState) -> None:
         """Take the own state."""
@@ -294,9 +294,9 @@ class Follower:
             self.sharing.take_seen(state)
         self._take_neighbor(state)
 
-    def _take_neighbor(self, state: OdometryState, heard: bool = False) -> None:
+    def _take_neighbor(self, state: OdometryState, received: bool = False) -> None:
         try:
-            self.planner.take_neighbor(state, heard)
+            self.planner.take_neighbor(state, received)
         except ValueError as error:
             self._listener.rejected('invalid neighbors', str(error))
 
@@ -305,11 +305,11 @@ class Follower:
         self.advance(time)
         self._see_frame(stamp)
 
-    def word(self, time: int, state: OdometryState) -> None:
+    def receive(self, time: int, state: OdometryState) -> None:
         """Take a message of another vehicle; see ``sharing``."""
         self.advance(time)
         if self.sharing is not None:
-            self.sharing.take_word(state, time)
+            self.sharing.take_message(state, time)
 
     def advance(self, time: int) -> None:
         """Let everything happen that is due up to a time."""
@@ -330,7 +330,7 @@ class Follower:
             self._now = max(self._now, waited)
             self._process_due()
 
-    # What is due.
+    # Due work.
 
     def _seconds(self, time: int | None = None) -> float:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""
@@ -372,7 +372,7 @@ class Follower:
             for rejection in sighting.rejections:
                 self._listener.rejected(*rejection)
             for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
-                self._tell(perceiver, image.stamp_ns, name, estimate)
+                self._publish_neighbor(perceiver, image.stamp_ns, name, estimate)
             if seen.usable:
                 self._see_frame(image.stamp_ns)
             self._listener.image(ImageOutcome(
@@ -382,11 +382,12 @@ class Follower:
     def _use_ranges(self, perceiver: Perceiver) -> None:
         for outcome in perceiver.tracker.ranged():
             if isinstance(outcome, Ranged):
-                self._tell(perceiver, outcome.stamp, outcome.name, outcome.estimate)
+                self._publish_neighbor(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:
                 self._listener.rejected(*outcome)
 
-    def _tell(self, perceiver: Perceiver, stamp: int, name: str, estimate: Estimate) -> None:
+    def _publish_neighbor(self, perceiver: Perceiver, stamp: int, name: str,
+                          estimate: Estimate) -> None:
         assert self._make is not None, 'perception gives messages'
         message, accelerating = perceiver.messages(self._make, stamp, name, estimate)
         self._listener.publish('neighbors', ODOMETRY, self._now, message)
@@ -401,13 +402,13 @@ class Follower:
     def _tick(self) -> None:
         if self.sharing is not None:
             for state in self.sharing.neighbors(self._now):
-                self._take_neighbor(state, heard=True)
-            if words := self.sharing.words(self._now):
-                self._listener.words(self._now, words)
-            for event in self.sharing.told():
+                self._take_neighbor(state, received=True)
+            if messages := self.sharing.messages(self._now):
+                self._listener.send(self._now, messages)
+            for event in self.sharing.new_events():
                 self._listener.rejected(*event)
         start = self._cpu_time()
-        bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_told) * 1e-9
+        bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_ended) * 1e-9
         decision, command = self.planner.tick(self._now, self.params, bridge_age)
         cpu = self._cpu_time() - start
         for rejection in decision.rejected:
@@ -451,7 +452,7 @@ class Follower:
                                     stamp=self._now)))
         self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
 
-    def _tell_bridge_state(self) -> None:
+    def _announce_bridge_state(self) -> None:
         """Pass a new announcement of the bridge to the planner."""
         assert self.control is not None
         text = self.control.permission.announced()

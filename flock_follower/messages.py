@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Messages to numpy and back; the only place where their fields are spelled out.
+Conversion of messages to numpy and back; the only module that reads and writes their fields.
 
-Nothing here knows whose classes the messages are of: rclpy's in the nodes, the type store's where
-bags are read. Whoever wants one built hands in ``make``, which returns an empty message of a type
-such as 'nav_msgs/msg/Odometry'.
+It works with any message classes: rclpy's in the nodes, the type store's when bags are read. To
+build a message, the caller passes ``make``, which returns an empty message of a type such as
+'nav_msgs/msg/Odometry'.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
-LIFT = 'lift'
+THRUST_BIAS = 'lift'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
 RELATIVE = 'flock_relative'
@@ -57,8 +57,8 @@ RELATIVE = 'flock_relative'
 MOTION_TOPIC = 'mavlink/relative'
 #: s without a message in that frame after which odometry counts again.
 RELATIVE_SILENCE = 0.15
-#: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
-#: be it. It is kept clear of, and never followed.
+#: Suffix of a neighbour's name on ``neighbors``: another object with the same marker. The planner
+#: keeps clear of it, and never follows it.
 DUPLICATE = '/duplicate'
 
 # Plausible values: each room that judges a value from outside uses these.
@@ -210,7 +210,7 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
     that put the linear velocity in the header's frame.
 
-    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``, or
+    :raises ValueError: if position, attitude or velocity is not finite, or beyond ``SANE``, or
         the stamp is none.
     """
     pose, twist = message.pose.pose, message.twist.twist
@@ -293,7 +293,7 @@ def from_acceleration(message: Any) -> AccelerationState:
     """
     Return what an AccelWithCovarianceStamped of a neighbour says.
 
-    :raises ValueError: where the acceleration is not finite, or beyond ``SANE``.
+    :raises ValueError: if the acceleration is not finite, or beyond ``SANE``.
     """
     linear = message.accel.accel.linear
     vector = np.array([linear.x, linear.y, linear.z], dtype=float)
@@ -305,16 +305,17 @@ def from_acceleration(message: Any) -> AccelerationState:
 
 
 def with_acceleration(state: OdometryState, acceleration: AccelerationState) -> OdometryState:
-    """Return a neighbour's state with the acceleration that a message gave in its own frame."""
+    """Return a neighbour's state with an acceleration given in the neighbour's frame."""
     return state._replace(
         acceleration=quaternion_to_matrix(state.quaternion) @ acceleration.vector)
 
 
 class Command(NamedTuple):
     """
-    What the planner wants flown: one name from its tick to the setpoint gate.
+    A command of the planner, from its tick to the setpoint gate.
 
-    ``stamp``, ns, is that of what the command rests on, 0 for none; it applies ``ahead`` ns later.
+    ``stamp``, ns, is that of the estimate that the command is based on, 0 without one; the command
+    applies ``ahead`` ns later.
     """
 
     acceleration: ArrayLike
@@ -323,19 +324,19 @@ class Command(NamedTuple):
     """rad."""
     yaw_rate: float = 0.0
     """rad/s, anticlockwise."""
-    away: Array | None = None
+    separation_axis: Array | None = None
     """Unit vector (3,) away from a neighbour that would come too near: the part of the
-    acceleration along it is cut last. None where nobody does."""
+    acceleration along it is cut last. None if nobody does."""
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
-    lift: float = 0.0
+    thrust_bias: float = 0.0
     """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
     relative: bool = False
     """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
 
     def ages(self, now: int) -> tuple[float, float]:
-        """Return how long ago, s, it applied at a time, ns, and how old is what it rests on."""
+        """Return the ages of the command and of its image, s, at a time, ns."""
         source = stamp_age(self.stamp, now)
         return source - (self.ahead / NANOSECONDS if self.stamp > 0 else 0.0), source
 
@@ -344,9 +345,9 @@ def trajectory(make: Make, command: Command) -> Any:
     """
     Return a command as a MultiDOFJointTrajectory of one point.
 
-    Position and velocity are NaN: they are not commanded. A joint 'separation' has ``away`` as
-    its acceleration, a joint 'lift' has ``lift`` upwards; whoever knows the first joint only does
-    not see them.
+    Position and velocity are NaN: they are not commanded. The acceleration of a joint 'separation'
+    is ``separation_axis``, that of a joint 'lift' is ``thrust_bias`` upwards. A receiver of only
+    the first joint ignores both.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
@@ -362,9 +363,9 @@ def trajectory(make: Make, command: Command) -> Any:
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
     point.transforms, point.velocities, point.accelerations = (
         [transform], [velocity], [acceleration])
-    more = [] if command.away is None else [(SEPARATION, command.away)]
-    if command.lift:
-        more.append((LIFT, np.array([0.0, 0.0, command.lift])))
+    more = [] if command.separation_axis is None else [(SEPARATION, command.separation_axis)]
+    if command.thrust_bias:
+        more.append((THRUST_BIAS, np.array([0.0, 0.0, command.thrust_bias])))
     for name, vector in more:
         beside = make('geometry_msgs/msg/Twist')
         set_vector(beside.linear, vector)
@@ -381,7 +382,7 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     """
     Return the command of a MultiDOFJointTrajectory's first point.
 
-    :raises ValueError: where its frame is neither ``odom_frame`` nor ``RELATIVE``, or something
+    :raises ValueError: if its frame is neither ``odom_frame`` nor ``RELATIVE``, or something
         is missing.
     """
     frame = message.header.frame_id
@@ -394,13 +395,13 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     q = point.transforms[0].rotation
     more = {name: to_array(beside.linear) for name, beside in zip(
         message.joint_names[1:], point.accelerations[1:])}
-    away = _direction(more[SEPARATION]) if SEPARATION in more else None
-    lift = float(more[LIFT][2]) if LIFT in more else 0.0
+    separation_axis = _direction(more[SEPARATION]) if SEPARATION in more else None
+    thrust_bias = float(more[THRUST_BIAS][2]) if THRUST_BIAS in more else 0.0
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
-        point.velocities[0].angular.z if point.velocities else 0.0, away, frame,
+        point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,
         read_stamp(message.header.stamp), read_stamp(point.time_from_start),
-        lift if math.isfinite(lift) else 0.0, frame == RELATIVE)
+        thrust_bias if math.isfinite(thrust_bias) else 0.0, frame == RELATIVE)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -39,7 +39,7 @@ class Range:
     whole: bool = False
 
     def __str__(self) -> str:
-        """Return what is valid, in words: 'a number in (0, 20] m/s^2'."""
+        """Return the valid range as text: 'a number in (0, 20] m/s^2'."""
         low, high = (str(int(bound)) if self.whole and math.isfinite(bound) else f'{bound:g}'
                      for bound in (self.low, self.high))
         if math.isinf(self.low) and math.isinf(self.high):
@@ -60,7 +60,7 @@ class Range:
         """
         Check the value of a parameter.
 
-        :raises ValueError: naming the parameter, its value and what is valid.
+        :raises ValueError: naming the parameter, its value and the valid range.
         """
         if not self.holds(value):
             shown = value if isinstance(value, Real) else repr(value)
@@ -84,7 +84,7 @@ class Checked:
     """
     A frozen dataclass whose numbers and choices are checked as it is made, see :func:`parameter`.
 
-    :raises ValueError: naming the field, its value and what is valid.
+    :raises ValueError: naming the field, its value and the valid range.
     """
 
     @classmethod

@@ -63,7 +63,7 @@ STATES: Mapping[str, Color] = {
 
 
 class Shape(NamedTuple):
-    """One shape; ``name`` tells it from others, and replaces the one drawn before."""
+    """One shape; it replaces the shape of the same ``name`` that was drawn before."""
 
     name: str
     kind: str
@@ -179,13 +179,13 @@ def image_corners(width: int, height: int, k: ArrayLike, fisheye: bool = False) 
         raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
                          'must all be above 0')
     pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
-    away = (pixels - (cx, cy)) / (fx, fy)
+    rays = (pixels - (cx, cy)) / (fx, fy)
     if not fisheye:
-        return SIGHT_DEPTH * np.column_stack([away, np.ones(4)])
-    angle = np.hypot(*away.T)
+        return SIGHT_DEPTH * np.column_stack([rays, np.ones(4)])
+    angle = np.hypot(*rays.T)
     seen = np.minimum(angle, WIDEST)[:, None]
     return SIGHT_DEPTH * np.column_stack([
-        np.sin(seen) * away / np.maximum(angle, 1e-9)[:, None], np.cos(seen)])
+        np.sin(seen) * rays / np.maximum(angle, 1e-9)[:, None], np.cos(seen)])
 
 
 def shapes(known: Snapshot) -> list[Shape]:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files that are whole or not there: what a full disk cuts short is not left under its name."""
+"""Atomic file writes: if the disk is full, no partial file remains under the final name."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     """
     Open a file for writing that gets its name only once everything is in it.
 
-    :raises OSError: naming the file, where it cannot be written; nothing is left of it then.
+    :raises OSError: naming the file, if it cannot be written; nothing is left of it then.
     """
     path = Path(path)
     part = path.with_name(f'{path.name}.part')

@@ -43,17 +43,17 @@ ARGUMENTS = {
 
 
 def start(context: LaunchContext) -> list[Any]:
-    """Return what is started for each follower."""
-    said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    if not (said['followers'].isdigit() and 1 <= int(said['followers']) <= MOST):
-        raise ValueError(f'followers = {said["followers"]!r}: must be an integer in [1, {MOST}]')
+    """Return the launch actions of each follower."""
+    values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    if not (values['followers'].isdigit() and 1 <= int(values['followers']) <= MOST):
+        raise ValueError(f'followers = {values["followers"]!r}: must be an integer in [1, {MOST}]')
     source = PythonLaunchDescriptionSource(
         str(Path(__file__).with_name('simulation.launch.py')))
     return [IncludeLaunchDescription(source, launch_arguments={
-        'namespace': f'follower_{i}', 'system': str(i), 'scenario': said['scenario'],
-        'seed': str(int(said['seed']) + i - 1), 'port': str(int(said['port']) + i - 1),
+        'namespace': f'follower_{i}', 'system': str(i), 'scenario': values['scenario'],
+        'seed': str(int(values['seed']) + i - 1), 'port': str(int(values['port']) + i - 1),
         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else '',
-    }.items()) for i in range(1, int(said['followers']) + 1)]
+    }.items()) for i in range(1, int(values['followers']) + 1)]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -70,6 +70,8 @@ PARAMETERS = {
     'visualizer': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
+#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
+END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 NUMBERS = ('a_max', 'v_max')
 WHOLE = ('target_system', 'disk_used')
 #: By which argument a node is started or not.
@@ -86,35 +88,36 @@ def value(name: str, text: str) -> Any:
     return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
 
 
-def yes(said: dict[str, str], name: str) -> bool:
+def yes(values: dict[str, str], name: str) -> bool:
     """Return whether an argument is true: `record:=yes` must not mean that none is recorded."""
-    if said[name].lower() not in ('true', 'false'):
-        raise ValueError(f'{name}:={said[name]}: must be true or false')
-    return said[name].lower() == 'true'
+    if values[name].lower() not in ('true', 'false'):
+        raise ValueError(f'{name}:={values[name]}: must be true or false')
+    return values[name].lower() == 'true'
 
 
 def start(context: LaunchContext) -> list[Node]:
     """Return the nodes as the arguments say."""
-    said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     started = []
     for node, names in PARAMETERS.items():
-        if node in BY_CHOICE and not yes(said, BY_CHOICE[node]):
+        if node in BY_CHOICE and not yes(values, BY_CHOICE[node]):
             continue
-        parameters = {name: value(name, said[name]) for name in names if said[name]}
-        parameters['use_sim_time'] = yes(said, 'use_sim_time')
+        parameters = {name: value(name, values[name]) for name in names if values[name]}
+        parameters['use_sim_time'] = yes(values, 'use_sim_time')
         if node in ('relative_pose', 'planner'):
-            parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
-        files = [] if node in BY_CHOICE else [f'{said["config"]}/follower.yaml']
-        if said['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
-            files.append(said['cameras'])
+            parameters['neighbors_file'] = f'{values["config"]}/neighbors.yaml'
+        files = [] if node in BY_CHOICE else [f'{values["config"]}/follower.yaml']
+        if values['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
+            files.append(values['cameras'])
+        prefix = values['bridge_prefix'] if node == 'mavlink_bridge' else ''
         started.append(Node(
-            package='flock_follower', executable=node, output='screen',
-            prefix=(said['bridge_prefix'] or None) if node == 'mavlink_bridge' else None,
-            respawn=yes(said, 'respawn'), respawn_delay=1.0,
-            namespace=said['namespace'], parameters=[*files, parameters],
-            remappings=[('image_raw', said['image']),
-                        ('image_raw/compressed', f'{said["image"]}/compressed'),
-                        ('camera_info', said['camera_info']), ('odom', said['odom'])]))
+            package='flock_follower', executable=node, exec_name=node, output='screen',
+            prefix=f'{END_WITH_LAUNCH} {prefix}',
+            respawn=yes(values, 'respawn'), respawn_delay=1.0,
+            namespace=values['namespace'], parameters=[*files, parameters],
+            remappings=[('image_raw', values['image']),
+                        ('image_raw/compressed', f'{values["image"]}/compressed'),
+                        ('camera_info', values['camera_info']), ('odom', values['odom'])]))
     return started
 
 

@@ -63,7 +63,8 @@ def generate_launch_description() -> LaunchDescription:
     refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *of_follower})
     port = LaunchConfiguration('port')
     simulator = Node(
-        package='flock_follower', executable='simulator', output='screen',
+        package='flock_follower', executable='simulator', exec_name='simulator', output='screen',
+        prefix='setpriv --pdeathsig TERM',  # as follower.launch.py
         namespace=LaunchConfiguration('namespace'), parameters=[{
             'scenario': LaunchConfiguration('scenario'),
             'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),

@@ -182,7 +182,7 @@ class TruthLink:
         self._flown, self._start = flown, now
         truth = (mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION if flown.controller.PROFILE.px4
                  else mavlink.MAVLINK_MSG_ID_SIM_STATE)
-        self._tells = {
+        self._encoders = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat, truth: self._truth,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda now: mavlink.MAVLink_system_time_message(
                 0, round((now - self._start) * 1e3)),
@@ -198,7 +198,7 @@ class TruthLink:
             if message.get_type() != 'COMMAND_LONG':
                 continue
             granted = (message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-                       and message.param1 in self._tells and message.param2 > 0.0)
+                       and message.param1 in self._encoders and message.param2 > 0.0)
             if granted:
                 self._periods[int(message.param1)] = max(message.param2 * 1e-6, STEP)
                 self._due[int(message.param1)] = now
@@ -211,7 +211,7 @@ class TruthLink:
         for kind in due:
             self._due[kind] += self._periods[kind] * max(
                 1, (now - self._due[kind]) // self._periods[kind])
-        return [self._packed(self._tells[kind](now)) for kind in due]
+        return [self._packed(self._encoders[kind](now)) for kind in due]
 
     def _packed(self, message):
         data = bytes(message.pack(self._codec))

@@ -54,7 +54,7 @@ LONGEST = 10  # s for one step of the fuzzing; more is a hang
 NASTY = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1e308, -1e308, 3.5e38, 5e-324, 1.0, -1.0)
 COVARIANCES = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e9, 1e308, 0.01)
 #: Message ids that the bridge acts on.
-HEARD = (0, 1, 22, 31, 32, 33, 77, 111, 147, 245, 253)
+RECEIVED = (0, 1, 22, 31, 32, 33, 77, 111, 147, 245, 253)
 # Masks with the acceleration of at least x and y.
 MASKS = (0x83F, 0xC3F, 0x43F, 0xD3B, 0x93B)
 
@@ -102,7 +102,7 @@ class Traffic:
                        for number, kind in sorted(mavlink.mavlink_map.items())]
         self._ending = {number for number, kind in mavlink.mavlink_map.items()
                         if number == 0 or 'time_boot_ms' in kind.fieldnames}
-        self._heard = [entry for entry in self._types if entry[0] in HEARD]
+        self._received = [entry for entry in self._types if entry[0] in RECEIVED]
         self.autopilot = EmbeddedAutopilot(personality, now=0.0, signing=signing)
         self.now = 0.0
         self._queue = deque()
@@ -132,7 +132,7 @@ class Traffic:
         elif kind == 'old':
             data = b'\xfe' + self._flipped(data)[1:]
         else:
-            data = self._forged(self._heard if kind == 'heard' else self._types)
+            data = self._forged(self._received if kind == 'heard' else self._types)
         return data, r.choice(PEERS)
 
     def _valid(self):

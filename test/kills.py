@@ -129,9 +129,9 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
             wait_until(lambda: wire.setpoints[-1][1].afx < 0.0, 5.0, 'braking')
             time_of_braking = next(t for t, m in wire.setpoints if t > killed and m.afx < 0.0)
             # It stays at that: the last command does not come back.
-            heard = len(wire.setpoints)
-            wait_until(lambda: len(wire.setpoints) > heard + 6, 5.0, 'the stream to go on')
-            assert all(m.afx < 0.0 for _, m in wire.setpoints[heard:]), 'commands came back'
+            received = len(wire.setpoints)
+            wait_until(lambda: len(wire.setpoints) > received + 6, 5.0, 'the stream to go on')
+            assert all(m.afx < 0.0 for _, m in wire.setpoints[received:]), 'commands came back'
             for child in processes.children.values():
                 child.kill()
             return time_of_braking - killed

@@ -82,13 +82,14 @@ class Node(NamedTuple):
 
     package: str
     executable: str
+    exec_name: str
     output: str
     namespace: str
     parameters: list[Any]
     remappings: Sequence[tuple[str, str]] = ()
     respawn: bool = False
     respawn_delay: float = 0.0
-    prefix: str | None = None
+    prefix: str = ''
 
 
 def ignored(*_: Any, **__: Any) -> None:

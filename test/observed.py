@@ -27,10 +27,10 @@ from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import (
     Machine,
+    NodeStatus,
     Observations,
     OURS,
     Picture,
-    Told,
     TopicEnd,
     TopicSeen,
 )
@@ -163,7 +163,7 @@ def sighting_rows(scale: float = 1.0, mounted: Array | None = None) -> list[list
     return rows
 
 
-def heard(rate: float, late: float) -> dict[str, Any]:
+def at_rate(rate: float, late: float) -> dict[str, Any]:
     """Return when messages of a topic came, and their stamps."""
     stamps = [START + n / rate for n in range(round(SECONDS * rate))]
     return {'stamps': stamps, 'arrivals': [stamp + late for stamp in stamps]}
@@ -174,7 +174,7 @@ def healthy(live: bool = True) -> Observed:
     names = names_there('', {})
     topics = {names[name]: TopicSeen([TopicEnd(sender if live else '', TYPES[name], *qos)],
                                      [TopicEnd(f'/{node}', TYPES[name], False, qos[1:] == (True,))
-                                      for node in takers if live], **heard(rate, late))
+                                      for node in takers if live], **at_rate(rate, late))
               for name, sender, qos, takers, rate, late in (
         ('image_raw', '/camera', (False,), ('relative_pose',), 30.0, 0.02),
         ('camera_info', '/camera', (False,), ('relative_pose', 'planner'), 30.0, 0.02),
@@ -186,7 +186,7 @@ def healthy(live: bool = True) -> Observed:
         ('mavlink_bridge/state', '/mavlink_bridge', (True, True), ('planner',), 2.0, 0.0),
         ('planner/state', '/planner', (True, True), (), 2.0, 0.0))}
     if not live:
-        topics |= {f'/truth/{name}': TopicSeen([TopicEnd('', TYPES['odom'])], **heard(30.0, 0.0))
+        topics |= {f'/truth/{name}': TopicSeen([TopicEnd('', TYPES['odom'])], **at_rate(30.0, 0.0))
                    for name in ('odom', 'neighbors')}
     rows = odometry_rows()
     parameters = read_parameters(resource('config/follower.yaml'), TABLE)
@@ -201,7 +201,7 @@ def healthy(live: bool = True) -> Observed:
         pictures=[Picture(START + 0.4 * n, 640, 480, 'mono8', 307200, 120.0, 40.0, {0: 60.0})
                   for n in range(12)],
         shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
-        told={node: Told(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
+        statuses={node: NodeStatus(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
               for node in OURS} if live else {},
         machine=Machine(4, 0.6, 8000.0, True, domain='0'))
 

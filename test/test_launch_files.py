@@ -35,6 +35,7 @@ SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SP
          'mavlink_bridge': mavlink_bridge_table.SPECS, 'black_box': black_box_table.SPECS}
 RECIPES = ('d435i_openvins', 'd435i_vins_fusion', 'd435i_rtabmap', 't265', 'usb_camera')
 FOLLOWER, CAMERA = 'follower.launch.py', 'camera.launch.py'
+END_WITH_LAUNCH = ['setpriv', '--pdeathsig', 'TERM']
 
 
 def parameters(file: str, **arguments: str) -> dict[str, dict[str, Any]]:
@@ -98,11 +99,12 @@ def test_a_node_that_ends_is_started_again_unless_respawn_is_false() -> None:
     assert not any(node.respawn for node in nodes.values())
 
 
-def test_only_the_bridge_is_started_by_the_command_that_is_given() -> None:
+def test_nodes_end_with_their_launch_and_the_bridge_is_started_by_the_command_given() -> None:
     for prefix in ('', 'taskset -c 3'):
         nodes, _ = launched(FOLLOWER, bridge_prefix=prefix)
-        assert {name: node.prefix for name, node in nodes.items() if node.prefix} == (
-            {'mavlink_bridge': prefix} if prefix else {})
+        assert {name: node.prefix.split() for name, node in nodes.items()} == {
+            name: [*END_WITH_LAUNCH, *(prefix.split() if name == 'mavlink_bridge' else ())]
+            for name in nodes}
 
 
 def test_visualizer_and_black_box_start_by_choice() -> None:

@@ -42,7 +42,7 @@ class Face(NamedTuple):
     normal: Array
     """(3,), outwards."""
     middle: Array
-    """(3,), m, of the box that it is of: what is farther away is painted first."""
+    """(3,), m, of the box that it is part of: farther boxes are painted first."""
     value: float = 0.0
     opacity: float = 1.0
     """Below 1 it is seen from both sides."""

@@ -55,7 +55,7 @@ _SPREAD = 0.607  # px: of the lens's blur, 17 % of a pixel's light on either sid
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes numbers: exposure, noise, gamma."""
+    """Model of the image sensor: exposure, noise, gamma."""
 
     exposure: float = 0.005
     """s."""

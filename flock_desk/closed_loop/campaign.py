@@ -15,7 +15,7 @@
 """
 Flights in lock step: leader, air, vehicle and sensors around the real followers.
 
-No clock, no rendering, no messages: what is flown is ``follower.Follower``, the object that the
+No clock, no rendering, no messages: the runs fly ``follower.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
 STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
 whose noise has the covariance given with them; a marker is seen if it is in the field of view and
@@ -57,7 +57,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         progress: Callable[[float], None] | None = None,
         cpu_time: Callable[[], float] = lambda: 0.0) -> Flights:
     """
-    Fly some runs of a scenario and return what they did.
+    Fly some runs of a scenario and return their results.
 
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.

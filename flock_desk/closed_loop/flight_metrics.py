@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How well flights went: the figures of each run from engaging on, and of all runs of a scenario.
+Figures of flights: of each run from the engagement on, and of all runs of a scenario.
 
 All is true, not estimated. A row of ``measure`` is a follower. Of a flock, ``of_runs`` puts the
 rows of its followers together run by run: the worst of them if safety or a share of runs asks for
@@ -195,10 +195,10 @@ def band_exits(flights: Flights) -> list[BandExit]:
 
 def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float, float]:
     """
-    Return the greatest of all handovers of a run, (k,) each.
+    Return the greatest values over all handovers of a run; the inputs are (k,) each.
 
-    They are the change of height in the first second, the vertical speed after it, and the change
-    of height until the vehicle flies setpoints no longer.
+    The values are the change of height in the first second, the vertical speed after it, and the
+    change of height until the vehicle no longer flies setpoints.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
     early = late = change = 0.0

@@ -15,8 +15,8 @@
 """
 Records simulated flights from engaging on: every planner tick, and the extremes between ticks.
 
-Every follower is a row, see ``world``. A lone one follows the leader. In a flock each follows the
-edges of its planner; before the first of them, the vehicle that it begins behind.
+Each array has one row per follower, see ``world``. A single follower follows the leader. In a
+flock each follows the edges of its planner; before the first edge, the vehicle ahead of its start.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Flights:
     """
     The motion of n rows of a scenario, from engaging on, at every planner tick (k of them).
 
-    Everything is true, not estimated; vectors are ENU. A row is a follower: see ``world``.
+    All values are ground truth; vectors are ENU. Each row is a follower: see ``world``.
     """
 
     scenario: Scenario
@@ -65,7 +65,7 @@ class Flights:
     outside: Array
     """(n, k), time out of the band up to the next tick, mean over those that it follows, s."""
     command: Array
-    """(n, k, 3), commanded acceleration, m/s^2; NaN where there was none."""
+    """(n, k, 3), commanded acceleration, m/s^2; NaN without one."""
     state: Any
     """(n, k), index into ``STATES``."""
     guarded: Any
@@ -163,14 +163,14 @@ class FlightsLog:
                 self._edges[row] = [self._names[v] in decision.edges for v in self._others[row]]
 
     def _close(self) -> None:
-        """End the interval since the last tick; what was before the first does not count."""
+        """End the interval since the last tick; time before the first tick does not count."""
         if self._times:
             for name, value in (('nearest', self._nearest), ('farthest', self._farthest),
                                 ('outside', self._outside)):
                 self._rows.setdefault(name, []).append(value)
 
     def flights(self) -> Flights:
-        """Return what was collected."""
+        """Return the collected figures."""
         self._close()
         return Flights(self._world.scenario, np.array(self._times), **{
             name: np.stack(rows, axis=1) for name, rows in self._rows.items()})

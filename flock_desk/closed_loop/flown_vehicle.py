@@ -108,9 +108,9 @@ class ExternalVehicle(_Flown):
 
     def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
         self.offboard = False
-        """Whether it obeys the bridge's setpoints, by the bridge's state; its owner sets it."""
+        """Whether it obeys the bridge's setpoints, by the bridge's state; set by the owner."""
         self.armed, self.mode = False, ''
-        """Likewise, by its HEARTBEAT; for the log."""
+        """Armed and mode by the HEARTBEAT, for the log; set by the owner."""
         self.log = FlightLog()
         self._motion, self._start_ns = motion, start_ns
         self.origin = np.array([0.0, 0.0, height])

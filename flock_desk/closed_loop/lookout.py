@@ -126,9 +126,9 @@ class Lookout:
         self._images: list[_Coming[float]] = [[] for _ in rows]
         self._coming: list[_Coming[Sighted]] = [[] for _ in rows]
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
-        """Which of the others an image has shown since this was last set to False."""
+        """Which of the other vehicles an image has shown since this was last set to False."""
         self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
-        """Those in the newest image, outages and missed detections left out."""
+        """Which of them are in the newest image, ignoring outages and missed detections."""
 
     def look(self, k: int, scene: Scene, vio: Vio, travel: Array, placed: float,
              lost: bool) -> None:
@@ -282,7 +282,7 @@ class Lookout:
         """
         Return the arrivals at the planner of each row since the last call.
 
-        These are the stamps of the images processed, s, and the newest estimate of each vehicle.
+        An arrival is the stamp of a processed image, s, or the newest estimate of a vehicle.
         """
         return [(_due(images, now), [*{
             (each.name, each.relative): each for each in _due(coming, now)}.values()])
@@ -327,8 +327,8 @@ def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any
     """
     Return the random draws of the c images of one row.
 
-    These are the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of the
-    others is found if it is in sight (c, m).
+    The draws are the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of
+    the others is found if it is in sight (c, m).
     """
     sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
     count = round(scenario.duration / STEP) // IMAGE_STEPS + 1

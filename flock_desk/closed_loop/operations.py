@@ -82,7 +82,7 @@ class OperatedVehicle:
         self.asked = False
         """Whether offboard was called, by the operations and HEARTBEATs so far."""
         self.unasked = 0
-        """How many setpoints left while it was not."""
+        """Number of setpoints sent while offboard was not requested."""
         self.obeying_since: float | None = None
         """Since when the vehicle flies setpoints, s; None while it does not."""
 
@@ -107,7 +107,7 @@ class OperatedVehicle:
         if self._taking_off and position[2] > self._goal[2] - 0.2:
             self._taking_off = False
             self._enter(self._dialect.takeoff_modes[-1], np.array([*position[:2], self._goal[2]]))
-        self._tell(now, on_ground)
+        self._report_status(now, on_ground)
         return self._fly(now, position, velocity)
 
     def _do(self, operation: Operation, now: float, position: Array, yaw: float) -> None:
@@ -137,7 +137,7 @@ class OperatedVehicle:
     def _enter(self, mode: str, goal: Array) -> None:
         self.mode, self._goal = mode, goal
 
-    def _tell(self, now: float, on_ground: bool) -> None:
+    def _report_status(self, now: float, on_ground: bool) -> None:
         if now - self._beat < HEARTBEAT_PERIOD[self._autopilot] - 1e-9:
             return
         self._beat = now

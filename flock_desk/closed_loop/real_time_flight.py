@@ -57,17 +57,17 @@ SENSOR = Sensor(sub_poses=2)
 
 
 class RenderedImage(NamedTuple):
-    """One image, and what was true at its stamp."""
+    """One image, and the truth at its stamp."""
 
     stamp_ns: int
     due_ns: int
-    """When it is delivered."""
+    """Time of delivery."""
     time: float
-    """Of the scenario at the stamp, s; negative before it begins."""
+    """Scenario time at the stamp, s; negative before the scenario begins."""
     pixels: NDArray[np.uint8]
     follower: Odometry
     leader: Odometry | None
-    """None where there is none."""
+    """None without one."""
     usable: bool
     """Whether the leader can be seen in it, and placed by odometry."""
 
@@ -76,8 +76,8 @@ class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
-    :param latest_ns: an image that is due for longer than this is left out.
-    :param leader: None: the scenario's own leader.
+    :param latest_ns: images that are later than this are skipped.
+    :param leader: a leader flown elsewhere; None: the scenario's own leader.
     """
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
@@ -109,7 +109,7 @@ class RealTimeFlight:
 
     @property
     def distance(self) -> float:
-        """Return the true distance between the vehicles, m; NaN where there is no leader."""
+        """Return the true distance between the vehicles, m; NaN without a leader."""
         leader = self._leader.pose(self.time_ns, self.time)
         return (math.nan if leader is None
                 else float(np.linalg.norm(leader.translation - self.follower.position)))
@@ -155,7 +155,7 @@ class RealTimeFlight:
         return self.scenario.scenario.fails(what, time)
 
     def look(self, now_ns: int) -> RenderedImage | None:
-        """Return the next image, if its exposure is over; leave out what is too late anyway."""
+        """Return the next image, if its exposure is over; leave out images that are too late."""
         while True:
             stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
             end_ns = stamp_ns + round(0.5e9 * SENSOR.exposure)

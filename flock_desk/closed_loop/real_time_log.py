@@ -67,7 +67,7 @@ class RealTimeLog:
         self._rows[_ODOM].append((stamp_ns, *_moving(state)))
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
-        """Record what was true at an image, from when there is a leader on."""
+        """Record the truth at an image, from the first image with a leader on."""
         if frame.leader is None:
             return
         self._rows[_IMAGE].append((
@@ -94,7 +94,7 @@ class RealTimeLog:
         :param sources: the messages that placed the ``vehicle`` and the ``leader`` elsewhere.
         :param clock: our time and that of the vehicle's autopilot elsewhere, s.
         :param early: when the scenario ended before that, s, and why; None: it did not.
-        :raises OSError: naming the file, where it cannot be written.
+        :raises OSError: naming the file, if it cannot be written.
         """
         columns = self._autopilot.arrays()
         for names, rows in self._rows.items():

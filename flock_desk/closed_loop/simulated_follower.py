@@ -127,7 +127,7 @@ class SimulatedFollower(Listener):
     def receive(self, now: float, message: OdometryState) -> None:
         """Take a message of another follower."""
         if not self.failed:
-            self.follower.word(to_nanoseconds(now), message)
+            self.follower.receive(to_nanoseconds(now), message)
 
     def plan(self, now: float, looked: list[float], seen: list[Sighted]) -> None:
         """Tick with what has arrived: stamps of images, s, and estimates."""
@@ -172,9 +172,9 @@ class SimulatedFollower(Listener):
         self.failed, self.decision = True, Decision(State.IDLE)
         self.follower.bridge_died(to_nanoseconds(now))
 
-    def words(self, time: int, words: list[OdometryState]) -> None:
+    def send(self, time: int, messages: list[OdometryState]) -> None:
         if not self.failed:
-            self.outbox += words
+            self.outbox += messages
 
     def tick(self, tick: Tick) -> None:
         if not self.failed:

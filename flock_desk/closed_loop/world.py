@@ -227,7 +227,7 @@ class World:
             self.lookout.look_alone(self._step, self._scene(), motions, attitudes)
 
     def odometry(self, now: float) -> list[OwnState | None]:
-        """Return the newest odometry that has arrived in each row; None where it is lost."""
+        """Return the newest odometry that has arrived in each row; None if it is lost."""
         if self._odometry_lost:
             return [None] * len(self._rows)
         return [next((states[row] for states in self._odometry

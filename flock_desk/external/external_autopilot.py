@@ -15,8 +15,8 @@
 """
 The link on which an external autopilot reports the place of its vehicle.
 
-A thread of its own receives, since messages of ground truth carry no time: they count as of their
-arrival. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+A separate thread receives, since messages of ground truth have no time: their time is that of
+arrival. The link requests the messages that it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
 nothing else.
 """
 
@@ -70,7 +70,7 @@ class ExternalAutopilot:
     Collects the messages of one autopilot, and keeps ``motion`` up to date with them.
 
     :param url: see ``mavlink.transport``; :param parameter: that gave it, for errors.
-    :raises ValueError: where the URL is not one. :raises OSError: where it cannot be opened.
+    :raises ValueError: if the URL is not one. :raises OSError: if it cannot be opened.
     """
 
     def __init__(self, url: str, target_system: int = 1,
@@ -107,7 +107,7 @@ class ExternalAutopilot:
 
         :param why_truth: why an estimate will not do; '': it will.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: where nothing comes within ``timeout`` s, or no truth where it has to.
+        :raises ValueError: if nothing comes within ``timeout`` s, or no truth where it has to.
         """
         deadline = time.monotonic() + timeout
         while wanted():
@@ -154,9 +154,9 @@ class ExternalAutopilot:
         if link.telemetry.dialect is None:
             return link.silence()
         title, name = link.telemetry.dialect.title, link.telemetry.dialect.name
-        return (f'{title} is heard, but sends no {_TRUTH_OF.get(name, "truth")}'
+        return (f'{title} is connected, but sends no {_TRUTH_OF.get(name, "truth")}'
                 if self.motion.source != ESTIMATE
-                else f'{title} is heard, but sends no {ESTIMATE}: it has no position')
+                else f'{title} is connected, but sends no {ESTIMATE}: it has no position')
 
     def close(self) -> None:
         """End the thread and release the port."""

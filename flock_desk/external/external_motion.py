@@ -44,13 +44,13 @@ ATTITUDE: Final[str] = 'ATTITUDE_QUATERNION'
 CLOCK: Final[str] = 'SYSTEM_TIME'
 TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
 MEMORY: Final[int] = 256
-"""Poses that are remembered: more than a second of them."""
+"""Number of poses kept: more than one second."""
 LONGEST_GAP: Final[int] = 150_000_000
 """Poses further apart than this, ns, have no known motion between them."""
 SMOOTHING: Final[float] = 1.0
-"""s in which the integrated velocity approaches the reported place, in steps of 1.1 cm."""
+"""Time constant, s, of the correction of the integrated velocity by reported places."""
 JUMP: Final[float] = 0.5
-"""m between the two; beyond it the vehicle was moved, not flown."""
+"""Largest difference of integrated and reported place, m; a larger one is a jump."""
 _DEGREE = 111_320.0  # m along a meridian
 _WRAP = 2**32  # ms of time_boot_ms, 50 days
 _RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clocks differ
@@ -253,7 +253,7 @@ class ExternalMotion:
 
 def _attitude(wxyz: list[float],
               rates: tuple[float, float, float]) -> tuple[Array, Array] | None:
-    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are none."""
+    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are invalid."""
     try:
         quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
     except ValueError:

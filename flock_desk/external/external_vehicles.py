@@ -15,8 +15,8 @@
 """
 The vehicles that external autopilots fly in one flight: the follower, perhaps its leader.
 
-Each has a link of its own. They share a frame, ENU from the follower's first reported place, since
-both truths are latitude, longitude and height.
+Each has its own link. Both vehicles share a frame, ENU from the follower's first reported place,
+since both truths are latitude, longitude and height.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LOST: Final[float] = 10.0
 PACE_WINDOW: Final[float] = 5.0
 """s over which the time of an autopilot is compared with ours."""
 SLOW: Final[float] = 0.95
-"""Of the own clock's pace: a slower simulator is less agile than its model."""
+"""Least pace relative to the own clock: a slower simulator is less agile than its model."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 
@@ -122,7 +122,7 @@ class ExternalVehicles:
         return '; '.join(problems)
 
     def slow(self, now: float) -> str:
-        """Return, for people, whose simulator is too slow; '' where none is."""
+        """Return, for people, whose simulator is too slow; '' if none is."""
         paces = ((name, link.motion.pace(now - PACE_WINDOW)) for name, link in self._links)
         return '; '.join(
             f'the time of the autopilot of the {name} goes at {pace:.2f} of ours: its simulator '

@@ -15,6 +15,6 @@
 """
 Flocks of point agents under the law and its predecessors: the simulations of the paper.
 
-They need scipy, which is imported in the functions that use it: a command without it ends with one
-line.
+The simulations need scipy, which is imported in the functions that use it: without scipy a command
+ends with one line.
 """

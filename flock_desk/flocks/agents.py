@@ -47,7 +47,7 @@ Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mea
 Neighbors = Literal['all', 'graph', 'nearest']
 Integrator = Literal['adaptive', 'semi_implicit']
 
-NEAREST = 7  # how many a starling attends to (Ballerini et al. 2008)
+NEAREST = 7  # neighbours that a starling follows (Ballerini et al. 2008)
 _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
@@ -78,7 +78,7 @@ class Simulation:
     graph: Graph | None = field(default=None, repr=False)
     """The neighbour graph at the end, where the model acts on one; its edges only ever join."""
     joined: Array | None = field(default=None, repr=False)
-    """When each of the graph's edges joined (edges,), s."""
+    """Time at which each edge of the graph was added (edges,), s."""
 
     @cached_property
     def metrics(self) -> Metrics:
@@ -114,7 +114,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
-    :raises RuntimeError: where no finite solution goes on.
+    :raises RuntimeError: if no finite solution goes on.
     """
     params = FlockingParams() if params is None else params
     _check_names(model, neighbors, coupling, integrator)
@@ -180,7 +180,7 @@ class _Flock:
                                          self.near(before))
 
     def near(self, x: Array) -> flock_graph.Pairs:
-        """Return the pairs with r^2 < d1, or all where they are few; asked for twice a step."""
+        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
         if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
             self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
                           else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))
@@ -214,7 +214,7 @@ def _led(acceleration: integrators.Acceleration, leader: Leader) -> integrators.
 
 def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: float, model: Model,
             leader: Leader | None) -> Iterator[State]:
-    """Yield the states after every so many steps of dt."""
+    """Yield the first state, and one after every ``every`` steps of dt."""
     yield x, v
     for n in range(samples * every):
         after = velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
@@ -267,7 +267,7 @@ def _checked_start(positions: ArrayLike, velocities: ArrayLike) -> State:
 
 
 def _check_band(x: Array, params: FlockingParams, model: Model, flock: _Flock) -> None:
-    """Raise ValueError where the law has no value, or cannot hold what it promises."""
+    """Raise ValueError if the law is undefined, or cannot keep its guarantees."""
     if model == 'cucker_smale' or len(x) < 2:
         return
     close = flock_graph.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))

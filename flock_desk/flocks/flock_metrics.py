@@ -48,9 +48,9 @@ class Metrics:
     disagreement: Array
     """L, the length of the velocities' deviation from their mean, m/s."""
     order: Array
-    """Length of the mean heading: 1 where all move the same way, near 0 where none agree."""
+    """Length of the mean heading: 1 if all move the same way, near 0 where none agree."""
     lyapunov: Array
-    """W, infinite where a pair is outside the band."""
+    """W, infinite if a pair is outside the band."""
 
     def time_to_agree(self, share: float = 0.01) -> float:
         """Return from when on L stays below a share of its first value, s; NaN if never."""
@@ -91,7 +91,7 @@ def metrics(time: Array, positions: Array, velocities: Array, params: FlockingPa
     """
     Return the metrics of positions, m, and velocities, m/s, both (m, k, n).
 
-    :param graph: the neighbour graph at the end, where there is one.
+    :param graph: the neighbour graph at the end, if any.
     :param joined: when each of its edges joined (edges,), s.
     """
     least, greatest, mean = _distances(positions)

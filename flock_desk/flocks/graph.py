@@ -64,7 +64,7 @@ class Graph:
     edges: Pairs
 
     def with_edges(self, pairs: Pairs) -> Graph:
-        """Return the graph with these pairs as edges too; itself where it has them already."""
+        """Return the graph with these pairs as edges too; itself if it has them already."""
         new = pairs[~self.joins(pairs)]
         return Graph(self.count, np.concatenate([self.edges, new])) if len(new) else self
 
@@ -99,7 +99,7 @@ def grown(graph: Graph, positions: Array, params: FlockingParams,
     """
     Return the graph with an edge more for every two agents that have come near enough.
 
-    :param near: all pairs with r^2 < d1 at least, where known; found here otherwise.
+    :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
     """
     near = pairs_within(positions, np.sqrt(params.d1)) if near is None else near
     return graph.with_edges(near[squared_distances(positions, near) < _joining(params)])
@@ -114,8 +114,8 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     :param velocities: (k, n), m/s, in the same frame.
     :param coupling: 'flock' scales separation and cohesion with the L of the whole flock, as the
         paper does; 'pair' with each pair's own |v_i - v_j| / sqrt(2), which two agents can know
-        by themselves. The same for two agents; nothing is proven of it for more.
-    :param near: all pairs with r^2 < d1 at least, where known; found here otherwise.
+        by themselves. Both are equal for two agents; for more, nothing is proven of 'pair'.
+    :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
     :raises ValueError: for another coupling, another number of agents than the graph's, other
         shapes, or values not finite or beyond 1e100.
     """
@@ -160,7 +160,7 @@ def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Gr
 def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
                           neighbors: NDArray[np.int64], coupling: Coupling = 'flock') -> Array:
     """
-    Return the acceleration (k, n), m/s^2, of agents that attend to some others, as birds do.
+    Return the acceleration (k, n), m/s^2, of agents that each follow some others, as birds do.
 
     The law over those only, its cohesion f1 psi: bounded, because neighbours come and go. This
     loses what the law is for: attending is not mutual, so the mean velocity drifts; nothing

@@ -40,7 +40,7 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
 
     :param start: the state at ``times[0]``.
     :param breaks: where the acceleration jumps, s: no step straddles these.
-    :raises RuntimeError: where no step is small enough, as at a singularity of the law.
+    :raises RuntimeError: if no step is small enough, as at a singularity of the law.
     """
     from scipy.integrate import DOP853
     shape = np.shape(start)
@@ -79,7 +79,7 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
 
     :param acceptable: of the positions before and after a step: if it returns False the step is
         halved, and lengthened again, doubling, by the steps that follow.
-    :raises RuntimeError: where a step a millionth of dt long is not acceptable yet.
+    :raises RuntimeError: if a step a millionth of dt long is not acceptable yet.
     """
     x, v = start
     t, h = float(times[0]), dt

@@ -84,7 +84,7 @@ def velocities_after(positions: Array, velocities: Array, radius: float = 1.0,
     :param positions: (k, n), m, now.
     :param velocities: (k, n), m/s, now.
     :param radius: how far an agent sees, m.
-    :param mean_velocity: take the mean velocity, not the mean heading at one's own speed.
+    :param mean_velocity: take the mean velocity, not the mean heading at the agent's own speed.
     """
     speed = np.linalg.norm(velocities, axis=1, keepdims=True)
     seen = velocities if mean_velocity else velocities / np.where(speed > 0.0, speed, 1.0)

@@ -35,8 +35,8 @@ def mapped(address: str, function: Callable[[Given], Result],
     Yield what a function makes of each task, in their order, computed by a cluster's workers.
 
     :param address: of its scheduler, such as ``tcp://192.168.1.5:8786``.
-    :raises RuntimeError: where Dask is not installed here.
-    :raises OSError: where no scheduler answers there, or it is lost.
+    :raises RuntimeError: if Dask is not installed here.
+    :raises OSError: if no scheduler answers there, or it is lost.
     """
     try:
         from distributed import CancelledError, Client

@@ -68,7 +68,7 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     """
     Return the topics of a bag that a follower uses, and the truth.
 
-    Of images that are there raw and compressed the raw ones are used.
+    If the bag has raw and compressed images, the raw ones are used.
 
     :param remaps: their names in the bag, by ours, if they differ.
     :param several: cameras with topics of their own, in place of the only one.
@@ -136,12 +136,12 @@ def _topics_of(camera: CameraValues, bag: Bag, published: Collection[str],
 @dataclass
 class Evaluation:
     """
-    The record of a run; per image, tick and setpoint a few numbers each.
+    The record of a run: a few numbers for each image, tick and setpoint.
 
     ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s
     since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
     index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
-    ``reasons`` are those of every tick in HOLD, with its time.
+    ``reasons`` has the time and the reason of every tick in HOLD.
     ``setpoints`` (n, 5): time, the acceleration sent (NaN: none), 1 for a command.
     """
 
@@ -153,7 +153,7 @@ class Evaluation:
     incomplete: str = ''
     """Why the bag was never finished, '' if it was."""
     findings: list[Finding] = field(default_factory=list)
-    """Those of the rules of ``check`` in the bag; none if they were not applied."""
+    """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
     images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
@@ -241,7 +241,7 @@ class _Recorder(Listener):
         if self.own is not None:
             self.own.events[reason] += 1
             if reason == INVALID_ODOMETRY:
-                self.own.lost, self.own.why = self.own.lost + 1, detail
+                self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self._start) / NANOSECONDS

@@ -52,7 +52,7 @@ READY_TIMEOUT = 90.0  # s for an external estimator, without which the autopilot
 TAKEOFF_TIMEOUT = 20.0
 LAND_TIMEOUT = 5.0  # s of requests for a landing after something failed
 LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
-MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
+MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a little later
 #: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended

@@ -230,9 +230,9 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
 
 def _at(states: array[float], stamps: Array) -> _States:
     """
-    Return the states at stamps (n,), ns, between two of them that are half a second apart at most.
+    Return the states at stamps (n,), ns, between two states at most half a second apart.
 
-    They are interpolated as perception does it, so that interpolation adds no error of its own.
+    The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     n = len(stamps)
     result = _States(np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),

@@ -61,13 +61,13 @@ class FigureBound(NamedTuple):
     most: float | None = None
 
     def __str__(self) -> str:
-        """Return it as '≥ 9.9, ≤ 10.1'."""
+        """Return the bounds as text, such as '≥ 9.9, ≤ 10.1'."""
         return ', '.join(f'{sign} {value:g}' for sign, value in (
             ('≥', self.least), ('≤', self.most)) if value is not None)
 
 
 class Judgement(NamedTuple):
-    """A bound, the figure found, and what is wrong with it, or ''."""
+    """A bound, the figure found, and its fault, or ''."""
 
     bound: FigureBound
     figure: float | None
@@ -78,8 +78,8 @@ def load_bounds(path: str | Path) -> list[FigureBound]:
     """
     Read a file of bounds.
 
-    :raises ValueError: naming the file, the key and what is wrong with it.
-    :raises OSError: where the file cannot be read.
+    :raises ValueError: naming the file, the key and its fault.
+    :raises OSError: if the file cannot be read.
     """
     try:
         return parse_bounds(yaml.safe_load(Path(path).read_text(encoding='utf-8')))
@@ -93,7 +93,7 @@ def parse_bounds(document: Any) -> list[FigureBound]:
     """
     Return the bounds of a parsed file.
 
-    :raises ValueError: naming the key and what is wrong with it.
+    :raises ValueError: naming the key and its fault.
     """
     if not isinstance(document, Mapping) or not document:
         raise ValueError('must map figures of the summary to {min: ..., max: ...}')

@@ -215,7 +215,7 @@ def pdf(pages: Sequence[Page], title: str) -> bytes:
     """
     Return a PDF to scale, uncompressed, with the outlines of its letters, without a date.
 
-    It asks viewers to print without scaling, the usual reason for a wrong print. A user's
+    The PDF asks viewers to print without scaling, the usual reason for a wrong print. A user's
     matplotlibrc has no effect: a tight bounding box would crop the page.
     """
     out = BytesIO()

@@ -16,8 +16,8 @@
 """
 The figures for a paper: simulated flocks, a panel for each model; flights of ``fly``.
 
-They are one column wide, told apart in grey too, without a title, which is the caption's, and
-every font is legible at that width.
+Each is one column wide and legible at that width; its lines are distinguishable in grey. The title
+belongs to the caption.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from flock_follower.geometry import Array
 from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
-# Okabe and Ito's palette, for the colour-blind, and a dash for each where there is no colour.
+# Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
 COLOURS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
 INK, PALE = '#333333', '#BBBBBB'
 KINDS = ('png', 'svg', 'pdf')
@@ -349,7 +349,7 @@ def distance(flight: LiveRecord) -> Figure:
 
 
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
-    """Return the columns drawn; NaN where images are missing, and so no line."""
+    """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column
             for who, places in (('leader', flight.leader), ('follower', flight.follower))
             for name, column in zip('xy', places.T)}

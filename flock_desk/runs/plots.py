@@ -41,7 +41,7 @@ from flock_follower.planner.params import PlannerParams
 
 matplotlib.use('Agg')
 
-# Okabe and Ito's palette: told apart by the colour-blind, and by lightness in grey.
+# Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 _OTHERS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
@@ -288,7 +288,7 @@ def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> byt
 
 
 def with_gaps(table: Table) -> Mapping[str, Array]:
-    """Return a table with a row of NaN where images are missing, and so no line."""
+    """Return a table with a row of NaN if images are missing, and so no line."""
     breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
     return {name: np.insert(column, breaks, np.nan) for name, column in table.items()}
 

@@ -51,7 +51,7 @@ def claim_domain() -> int:
     """
     Return a ROS domain id that no other process of this package on this machine uses.
 
-    It is in 1 to 100, the range that is valid on every platform.
+    The id is in 1 to 100, the range that is valid on every platform.
 
     :raises RuntimeError: if all of them are in use.
     """
@@ -89,8 +89,8 @@ def free_udp_port() -> int:
     """
     Return a UDP port of the loopback interface that is free now.
 
-    It is above those that the system gives to whoever asks for any, as DDS does: else one of them
-    may have it before it is used.
+    The port is above the ephemeral ports: otherwise another process, such as DDS, could receive
+    the same port before it is used.
     """
     chance = random.SystemRandom()
     while True:
@@ -117,7 +117,7 @@ def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """End this process by an exception, so that ``with`` blocks stop what they started."""
+    """End this process by an exception, so that ``with`` blocks stop their processes."""
     raise SystemExit(128 + number)
 
 
@@ -225,8 +225,8 @@ class Processes:
         """
         Wait until a child has printed a text.
 
-        :raises TimeoutError: where it does not within ``timeout`` seconds.
-        :raises RuntimeError: where the child ends before.
+        :raises TimeoutError: if it does not within ``timeout`` seconds.
+        :raises RuntimeError: if the child ends before.
         """
         def printed() -> bool:
             if text in self.log(name):
@@ -248,7 +248,7 @@ class Processes:
 
         :param given_up: returns why to stop asking, '' to go on.
         :param value: ``('false',)``, or ``()`` for a Trigger.
-        :raises RuntimeError: where it has not succeeded after ``timeout`` seconds; says why.
+        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds; says why.
         """
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout
@@ -268,7 +268,7 @@ class Processes:
                 raise RuntimeError(answer.removeprefix('error: '))
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
-        """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""
+        """Send SIGINT, wait, and return the exit code; None if SIGKILL was needed."""
         child = self.children.pop(name)
         if child.poll() is None:
             child.send_signal(signal.SIGINT)

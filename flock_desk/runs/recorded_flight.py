@@ -63,11 +63,11 @@ class RecordedFlight:
     Feeds a follower from the messages of a bag, CDR bytes with the time of recording in ns.
 
     :param values: the checked values of every parameter, by node, see ``TABLE``.
-    :param listener: whom to tell what happens.
+    :param listener: receives the events of the flight.
     :param make: returns an empty message of a type.
     :param cpu_time: see ``Follower``.
-    :raises ValueError: where values do not fit together, or the neighbours file is wrong.
-    :raises OSError: where the neighbours file cannot be read.
+    :raises ValueError: if values do not fit together, or the neighbours file is wrong.
+    :raises OSError: if the neighbours file cannot be read.
     """
 
     def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,
@@ -97,7 +97,7 @@ class RecordedFlight:
         except ValueError as error:
             self._listener.rejected(INVALID_ODOMETRY, str(error))
             return
-        for event in self.source.told():
+        for event in self.source.new_events():
             self._listener.rejected(*event)
         if state is not None:
             self.follower.odometry(time, state)
@@ -142,7 +142,7 @@ class RecordedFlight:
         self.follower.finish()
 
     def _begin(self, time: int) -> None:
-        """Let happen what is due before a message; with the first the flight begins."""
+        """Process all events before a message; the flight begins with the first message."""
         self.follower.advance(time)
         if not self._began:
             self._began = True

@@ -85,11 +85,11 @@ _NAMES = {
     'altitude_off_m': "farthest from the leader's height",
     'skipped_images': 'images not rendered in time', 'ended_early': 'ended early by the bridge',
     'speed_max_m_s': 'greatest speed', 'missed_ticks': 'ticks missed',
-    'missed_ticks_share': 'share of ticks missed', 'warnings': 'warnings (times told)',
+    'missed_ticks_share': 'share of ticks missed', 'warnings': 'warnings (count)',
     'warning': 'first warning', 'hold_count': 'times in HOLD', 'hold_s': 'time in HOLD',
     'acceleration_max_m_s2': 'greatest acceleration', 'rate_hz': 'rate',
     'outages': 'outages', 'hold_after_s': 'it held after', 'track_after_s': 'followed again after',
-    'reason': 'reason', 'problems': 'problems told by the nodes, seconds each',
+    'reason': 'reason', 'problems': 'problems reported by the nodes, seconds each',
     'external': 'autopilot elsewhere', 'pace': 'pace of its clock by ours',
     'nearest_m': 'nearest any two came', 'pairs': 'nearest by pair, m',
     'column_of': 'scenario', 'min': 'least', 'max': 'greatest',
@@ -189,8 +189,8 @@ def report(folder: Path, title: str, introduction: str, summary: Mapping[str, An
     """
     Judge a summary, write summary.json and report.html to a folder, and return the judgements.
 
-    :param draw: returns the chapters, and imports matplotlib for it.
-    :param warnings: to be read first.
+    :param draw: returns the chapters; imports matplotlib.
+    :param warnings: shown at the top of the report.
     :param parts: summaries of the parts, which are judged and written, too, but not shown.
     :raises OSError: if a file cannot be written.
     """
@@ -210,7 +210,7 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
     Write the page; without matplotlib it has no pictures, and says so.
 
     :param draw: the chapters, or what returns them, and imports matplotlib for it.
-    :param warnings: to be read first.
+    :param warnings: shown at the top of the report.
     :raises OSError: if it cannot be written.
     """
     try:
@@ -296,7 +296,7 @@ def _remark(key: str, value: Any) -> str:
 
 
 def _path_name(key: str) -> str:
-    """Return the name of a figure by its whole key: what it is of, and what it is."""
+    """Return the title of a figure by its whole key: subject and quantity."""
     return ': '.join(map(name, key.split('.')))
 
 def name(key: str) -> str:

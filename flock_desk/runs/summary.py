@@ -58,7 +58,7 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     Return how often and how well neighbours were measured, from the tables of ``frame_errors``.
 
     Images count once for each neighbour. ``recall`` is the share with an estimate, of those in
-    which the truth has a marker in view, or of all where there is no truth. Errors are over all
+    which the truth has a marker in view, or of all without a truth. Errors are over all
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
     a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
@@ -270,11 +270,11 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
 
 def _altitude_off(flight: LiveRecord) -> Array:
     """
-    Return the distance of the follower's height from the leader's, m, at the images that count.
+    Return the height difference between follower and leader, m, at the images that count.
 
-    Those count whose leader has been in view for ``LEVEL_WITHIN``: the follower cannot know the
-    height of a leader that it does not see. One of the scenario begins at the follower's height,
-    so all images from the beginning count; one flown by an autopilot begins at any height.
+    An image counts if the leader has been in view for ``LEVEL_WITHIN``: the follower does not know
+    the height of a leader out of view. A scenario's leader begins at the follower's height, so all
+    images from the beginning count. A leader flown by an autopilot begins at any height.
     """
     times, hidden = flight.table['time'], flight.table['visible'] == 0.0
     begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf
@@ -310,7 +310,7 @@ def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
 
 
 def _problems(flight: LiveRecord) -> dict[str, int]:
-    """Return how often each node reported which problem in the scenario, without its numbers."""
+    """Return the count of each problem reported by each node; numbers in its text are masked."""
     reported = Counter(
         f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
         for t, array in flight.diagnostics if 0.0 < t <= flight.duration
@@ -378,14 +378,14 @@ def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """
     Write a summary as JSON.
 
-    :raises OSError: where it cannot be written.
+    :raises OSError: if it cannot be written.
     """
     with whole_file(path) as file:
         file.write((json.dumps(summary, indent=2, ensure_ascii=False) + '\n').encode())
 
 
 def jsonable(value: Any) -> Any:
-    """Return a summary with None for what is NaN or infinite, which JSON does not know."""
+    """Return a summary with None for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: jsonable(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is flown: scenarios and their files, the leader's course, the wind, and what fails when."""
+"""Scenarios and their files: the leader's course, the wind, and failures with their times."""

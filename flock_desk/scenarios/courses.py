@@ -71,8 +71,8 @@ def turn_rate(heading: Any, offset: Array) -> Any:
     :param heading: theirs (...), rad.
     :param offset: their positions minus those of the followers (..., 3), m.
     """
-    away = np.arctan2(offset[..., 1], offset[..., 0])
-    error = (away - heading + math.pi) % (2.0 * math.pi) - math.pi
+    direction = np.arctan2(offset[..., 1], offset[..., 0])
+    error = (direction - heading + math.pi) % (2.0 * math.pi) - math.pi
     return np.clip(TURN_GAIN * error, -TURN_RATE, TURN_RATE)
 
 
@@ -80,7 +80,7 @@ def course(scenario: Scenario, run: int) -> Course:
     """
     Return the leader's course in one run; the follower starts at the origin, facing along x.
 
-    :raises ValueError: where the motion needs more than its acceleration.
+    :raises ValueError: if the motion needs more than its acceleration.
     """
     motion, rng = scenario.leader, scenario.random(run, 'leader')
     distance = rng.uniform(*scenario.start.distance)

@@ -35,11 +35,11 @@ _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from
 
 @dataclass(frozen=True)
 class FollowerFailure(Part):
-    """One follower's computer fails: it sends nothing, hovers, and then is gone."""
+    """Failure of one follower's computer: the vehicle is silent, hovers, and then disappears."""
 
-    follower: int = parameter(MISSING, Range(1, whole=True), 'Its number, from 1 on.')
-    at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')
-    gone: float = parameter(8.0, Range(0.0, 3600.0, 's'), 'How long after that it is gone, s.')
+    follower: int = parameter(MISSING, Range(1, whole=True), 'Number of the follower, from 1 on.')
+    at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 'Time of the failure, s.')
+    gone: float = parameter(8.0, Range(0.0, 3600.0, 's'), 'Time from failure to disappearance, s.')
 
 
 @dataclass(frozen=True)
@@ -49,27 +49,27 @@ class Flock(Part):
     followers: int = parameter(4, Range(1, 50, whole=True))
     formation: str = parameter(
         'line', FORMATIONS,
-        "In which they begin: 'line', one behind the other; 'wedge'; 'ring' round the leader; "
-        "'grid', abreast in rows.")
-    spacing: float = parameter(1.8, Range(0.1, 20.0, 'm'), 'From each to the one ahead of it, m.')
+        "Initial formation: 'line', one behind the other; 'wedge'; 'ring' round the leader; "
+        "'grid', in rows.")
+    spacing: float = parameter(1.8, Range(0.1, 20.0, 'm'), 'Distance of each to the one ahead, m.')
     faces: tuple[str, ...] = parameter(
         ('back',), None,
         "Sides of every body that carry a marker, the leader's too: some of ``SIDES``.")
     cameras: tuple[str, ...] = parameter(
-        ('front',), None, 'Where the cameras of every follower look, likewise.')
+        ('front',), None, "Viewing directions of every follower's cameras: some of ``SIDES``.")
     half_width: float = parameter(
         0.5, Range(0.1, 5.0),
-        "Tangent of a camera's horizontal half angle of view; its height has the same ratio as "
-        'ever, and a pixel the same angle. Four cameras leave no gap from about 1.1 on.')
+        "Tangent of a camera's horizontal half angle of view. The image's aspect ratio and the "
+        'angle per pixel do not change. Four cameras leave no gap from about 1.1 on.')
     farthest: float = parameter(
         5.0, Range(0.5, 100.0, 'm'), 'Distance up to which a marker is found, m.')
     words: bool = parameter(
-        False, None, 'Whether they send each other their states and detections.')
+        False, None, 'Whether followers send each other their states and detections.')
     ranges: bool = parameter(
         False, None,
-        "Whether they measure the distances to each other by radio, with the errors of 'ranges'.")
+        "Whether followers measure their distances by radio, with the errors of 'ranges'.")
     delay: float = parameter(
-        0.05, Range(0.0, 2.0, 's'), "From a message's sending to its arrival, s.")
+        0.05, Range(0.0, 2.0, 's'), 'Delay of a message from sender to receiver, s.')
     loss: float = parameter(0.0, Range(0.0, 1.0), 'Share of messages that do not arrive.')
     fails: FollowerFailure | None = None
 

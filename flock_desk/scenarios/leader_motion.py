@@ -39,7 +39,7 @@ class Leg(Part):
 @dataclass(frozen=True)
 class LeaderMotion(Part):
     """
-    How the leader flies, after hovering for a while.
+    Motion of the leader, after an initial hover.
 
     'legs' keeps given velocities one after the other, 'circle' and 'figure_eight' are level,
     'wander' is a random smooth course that stays near. Random in three dimensions, each run

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What is flown in a simulated flight: a leader's motion, the air, the sensors and what fails.
+A scenario of a simulated flight: the leader's motion, the wind, the sensors and their failures.
 
 Everything that chance decides in a flight is drawn from a generator of its own, so a run of a
 scenario is the same whichever runs are flown beside it.
@@ -45,13 +45,14 @@ _ALONE = Flock(followers=1)
 
 @dataclass(frozen=True)
 class Start(Part):
-    """Where the follower begins: behind the leader, facing it, both hovering."""
+    """Start of the follower: behind the leader, facing it, both hovering."""
 
-    distance: Interval = parameter((1.5, 1.5), Range(0.2, 100.0, 'm'), 'm; each run draws one.')
+    distance: Interval = parameter((1.5, 1.5), Range(0.2, 100.0, 'm'),
+                                   'Distance to the leader, m; each run draws one.')
     bearing: Interval = parameter(
         (-0.3, 0.3), Range(-3.2, 3.2, 'rad'),
-        "Direction of the leader's motion from straight away, rad; each run draws one.")
-    altitude: float = parameter(1.5, Range(0.5, 100.0, 'm'), 'm.')
+        "Direction of the leader's motion, rad; 0: away from the follower; each run draws one.")
+    altitude: float = parameter(1.5, Range(0.5, 100.0, 'm'), 'Altitude of the follower, m.')
     above: float = parameter(
         0.0, Range(-10.0, 10.0, 'm'), 'Height of the leader above the follower, m.')
 
@@ -60,116 +61,122 @@ class Start(Part):
 class Wind(Part):
     """A steady wind from a random direction, and gusts: first-order Gauss-Markov, per axis."""
 
-    speed: Interval = parameter((0.0, 0.0), Range(0.0, 20.0, 'm/s'), 'm/s; each run draws one.')
+    speed: Interval = parameter(
+        (0.0, 0.0), Range(0.0, 20.0, 'm/s'), 'Mean wind speed, m/s; each run draws one.')
     gust: float = parameter(
         0.0, Range(0.0, 10.0, 'm/s'),
-        'Standard deviation of a gust along each axis, half of it vertically, m/s.')
+        'Standard deviation of gusts along each horizontal axis, m/s; half of it vertically.')
     gust_time: float = parameter(2.0, Range(0.1, 60.0, 's'), 'Correlation time of gusts, s.')
 
 
 @dataclass(frozen=True)
 class Response(Part):
-    """How the follower's vehicle errs and lags in flights in lock step."""
+    """Errors and delays of the follower's vehicle in lock-step flights."""
 
     delay: Interval = parameter(
         (0.06, 0.1), Range(0.0, 0.5, 's'),
-        'From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each '
-        'run draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 '
-        's.')
+        'Delay of setpoints, s, without the 0.15 s of the tilt; each run draws one. Measured from '
+        'the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 s.')
     odometry_delay: Interval = parameter(
         (0.03, 0.06), Range(0.0, 0.5, 's'),
-        "From the odometry's sample to the follower, s, besides its latency; each run draws one.")
+        'Delay of the odometry to the follower, s, besides its latency; each run draws one.')
     thrust_error: float = parameter(
         0.3, Range(0.0, 5.0, 'm/s^2'),
-        'Error of the hover thrust, a standard deviation, m/s^2 ...')
+        'Standard deviation of the error of the hover thrust, m/s^2.')
     thrust_memory: float = parameter(
         10.0, Range(0.1, 600.0, 's'),
-        '... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s.')
+        'Correlation time of that error, s; PX4 erred by 1 m/s^2 for 10 s.')
 
 
 @dataclass(frozen=True)
 class Sensing(Part):
-    """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
+    """Detection of the leader; ``sensing`` has the figures of the measurement noise."""
 
     latency: Interval = parameter(
         (0.05, 0.15), Range(0.0, 0.5, 's'),
-        'From an image to the planner, s; each run draws one, each image varies by a tenth.')
+        'Delay from an image to the planner, s; each run draws one, each image varies by a tenth.')
     recall: float = parameter(
         0.98, Range(0.0, 1.0), 'Share of images in which a leader in the field of view is found.')
     noise: float = parameter(1.0, Range(0.0, 100.0), 'Factor on the measurement noise.')
     marker_angle: float = parameter(
         1.22, Range(0.0, 3.15, 'rad'),
-        "Angle from the marker's normal, at the leader's tail, up to which it is found, rad.")
+        "Largest angle between line of sight and marker's normal at which it is found, rad.")
     velocity_noise: float = parameter(
         0.0, Range(0.0, 2.0, 'm/s'),
         'White noise added to each axis of the relative velocity, m/s.')
     light_changes: float = parameter(
         0.0, Range(0.0, 600.0, '1/min'), 'How often glare or shadow hides the marker, 1/min.')
     light_change: Interval = parameter(
-        (0.1, 0.4), Range(0.01, 60.0, 's'), 'For how long, s; each draws one.')
+        (0.1, 0.4), Range(0.01, 60.0, 's'),
+        'Duration of each such change of light, s; each draws one.')
 
 
 @dataclass(frozen=True)
 class VioErrors(Part):
-    """How the follower's visual-inertial odometry errs; standard deviations but for the first."""
+    """Errors of the follower's visual-inertial odometry; most are standard deviations."""
 
     rate: float = parameter(
         200.0, Range(1.0, 1000.0, 'Hz'),
-        'Hz; simulated flights have at most 100 with the nodes, 60 in lock step.')
+        'Rate of the odometry, Hz; at most 100 in flights with the nodes, 60 in lock step.')
     latency: Interval = parameter(
         (0.0, 0.0), Range(0.0, 0.5, 's'),
-        'From a sample to its use, s, in whole steps of a simulation; each run draws one.')
+        'Delay from a sample to its use, s, in whole simulation steps; each run draws one.')
     position_walk: float = parameter(
         0.02, Range(0.0, 10.0, 'm'),
         'Drift of each horizontal coordinate, m after 1 s, growing with the root of time.')
-    height_walk: float = parameter(0.02, Range(0.0, 10.0, 'm'), 'Likewise of the height.')
+    height_walk: float = parameter(0.02, Range(0.0, 10.0, 'm'),
+        'Drift of the height, m after 1 s.')
     yaw_walk: float = parameter(
-        0.0017, Range(0.0, 1.0, 'rad'), 'Drift of yaw, rad after 1 s; it turns the way to come.')
+        0.0017, Range(0.0, 1.0, 'rad'),
+        'Drift of the yaw, rad after 1 s; it turns the later course.')
     position: float = parameter(
-        0.003, Range(0.0, 1.0, 'm'), 'Error of the newest correction, m ...')
+        0.003, Range(0.0, 1.0, 'm'), 'Error of the position corrections, m.')
     position_memory: float = parameter(
-        0.5, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
-    tilt: float = parameter(0.003, Range(0.0, 0.5, 'rad'), 'Error of roll and pitch, rad ...')
+        0.5, Range(0.01, 600.0, 's'), 'Correlation time of that error, s.')
+    tilt: float = parameter(0.003, Range(0.0, 0.5, 'rad'), 'Error of roll and pitch, rad.')
     tilt_memory: float = parameter(
-        5.0, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
+        5.0, Range(0.01, 600.0, 's'), 'Correlation time of that error, s.')
     tilt_bias: float = parameter(
         0.005, Range(0.0, 0.5, 'rad'),
-        "What of their error does not change, that of the camera's mounting included, rad.")
+        "Constant error of roll and pitch, with that of the camera's mounting, rad.")
     attitude: float = parameter(
-        0.0004, Range(0.0, 0.5, 'rad'), 'White noise about each axis, rad.')
-    velocity: float = parameter(0.02, Range(0.0, 5.0, 'm/s'), 'Error per axis, m/s ...')
+        0.0004, Range(0.0, 0.5, 'rad'), 'White noise of the attitude about each axis, rad.')
+    velocity: float = parameter(0.02, Range(0.0, 5.0, 'm/s'),
+        'Error of the velocity per axis, m/s.')
     velocity_memory: float = parameter(
-        0.3, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
-    velocity_white: float = parameter(0.006, Range(0.0, 5.0, 'm/s'), 'm/s.')
+        0.3, Range(0.01, 600.0, 's'), 'Correlation time of that error, s.')
+    velocity_white: float = parameter(0.006, Range(0.0, 5.0, 'm/s'),
+        'White noise of the velocity, m/s.')
     gyro_bias: float = parameter(
-        0.002, Range(0.0, 1.0, 'rad/s'), "What is left of the gyroscopes' bias, rad/s, constant.")
+        0.002, Range(0.0, 1.0, 'rad/s'), 'Remaining bias of the gyroscopes, rad/s, constant.')
     gyro: float = parameter(
         0.006, Range(0.0, 1.0, 'rad/s'), 'White noise of the gyroscopes, rad/s.')
 
 
 @dataclass(frozen=True)
 class RangeErrors(Part):
-    """Radios that measure the distance to the leader, in a flock to everyone; how they err."""
+    """Errors of radios that measure the distance to the leader, or in a flock to every vehicle."""
 
-    rate: float = parameter(0.0, Range(0.0, 60.0, 'Hz'), 'Hz; 0: there are none.')
-    noise: float = parameter(0.1, Range(0.0, 10.0, 'm'), 'A standard deviation, m.')
+    rate: float = parameter(0.0, Range(0.0, 60.0, 'Hz'), 'Rate of the ranges, Hz; 0: no ranges.')
+    noise: float = parameter(0.1, Range(0.0, 10.0, 'm'),
+        'Standard deviation of the white noise, m.')
     bias: float = parameter(
         0.1, Range(0.0, 10.0, 'm'),
-        'Standard deviation of what is wrong all the time, m; each run draws one ...')
+        'Standard deviation of the constant error, m; each run draws one.')
     bias_walk: float = parameter(
         0.003, Range(0.0, 1.0, 'm'),
-        '... that drifts, m after 1 s, growing with the root of time.')
-    outliers: float = parameter(0.05, Range(0.0, 1.0), 'Share of ranges measured on a detour ...')
+        'Drift of that error, m after 1 s, growing with the root of time.')
+    outliers: float = parameter(0.05, Range(0.0, 1.0), 'Share of ranges measured along a detour.')
     outlier: float = parameter(
-        1.0, Range(0.0, 100.0, 'm'), '... which adds at most so much, m; each draws one.')
+        1.0, Range(0.0, 100.0, 'm'), 'Largest error by a detour, m; each draws one.')
     latency: Interval = parameter(
         (0.01, 0.03), Range(0.0, 0.5, 's'),
-        'From a measurement to its use, s; each run draws one.')
+        'Delay from a measurement to its use, s; each run draws one.')
 
 
 @dataclass(frozen=True)
 class Outage(Part):
-    """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
+    """A temporary failure: of the view of the marker, or of the odometry ('vio')."""
 
     what: str = parameter(MISSING, OUTAGES)
     at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')

@@ -60,7 +60,7 @@ def load(name: str) -> Scenario:
     """
     Return a scenario of the package by its name, or another one by the path of its file.
 
-    :raises ScenarioError: where there is none, or its file is wrong.
+    :raises ScenarioError: if it does not exist, or its file is wrong.
     """
     path = Path(name)
     if path.suffix not in ('.yaml', '.yml'):
@@ -78,7 +78,7 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+    :raises ScenarioError: also if it has operations or a flock, which flights in lock step
         alone know.
     """
     scenario = load(name)
@@ -95,7 +95,7 @@ def parse(text: str, path: str) -> Scenario:
     """
     Return the scenario in the text of a file.
 
-    :raises ScenarioError: naming file, line, key, value and what is allowed.
+    :raises ScenarioError: naming file, line, key, value and the allowed values.
     """
     root = _composed(text, path)
     if root is None:
@@ -114,7 +114,7 @@ def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
     Return a scenario with some keys of its flock changed, to those of a YAML mapping.
 
     :param path: what to call it in an error.
-    :raises ScenarioError: also where the scenario has no flock.
+    :raises ScenarioError: also if the scenario has no flock.
     """
     if scenario.flock is None:
         raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')

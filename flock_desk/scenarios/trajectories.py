@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-How the two vehicles of a rendered flight move: a leader on a winding course and its follower.
+Trajectories of a rendered flight: a leader on a winding course and its follower.
 
 The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form
 and the course goes on for as long as wanted, forwards. The follower is flown in closed loop by
 the project's own law at 10 Hz, through an attitude lag, and turns its camera towards the leader,
-so that what a planner commands in replay resembles what was flown. Where a wider range is wanted
+so that a planner's commands in replay resemble the recorded flight. Where a wider range is wanted
 than the law allows, it falls back from the leader and catches up again instead (:class:`Swing`).
 
 Everything is in the odom frame (ENU, origin below the follower's start), m, s, rad. States are
@@ -122,7 +122,7 @@ class Swing:
     period: float
     """s."""
     phase: float
-    """At time 0, rad: 0 is nearest, and leaving."""
+    """Phase at time 0, rad; 0: nearest, and moving away."""
 
     def at(self, time: float) -> tuple[float, float, float]:
         """Return the distance, m, and its first two derivatives at a time, s."""
@@ -137,7 +137,7 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> LeaderAnd
     Fly leader and follower for a duration, s; the seed moves the buffeting of their attitudes.
 
     :param swing: the distance that the follower keeps, instead of obeying the flocking law.
-    :raises ValueError: where the duration is not in [0.1, 600] s.
+    :raises ValueError: if the duration is not in [0.1, 600] s.
     """
     Range(0.1, 600.0, 's').check('duration', duration)
     count = round(duration / STEP) + 1

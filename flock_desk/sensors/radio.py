@@ -25,41 +25,41 @@ import numpy as np
 from flock_desk.scenarios.scenario import RangeErrors
 from flock_follower.geometry import Array
 
-Word = TypeVar('Word')
+Message = TypeVar('Message')
 
 
-class Radio(Generic[Word]):
+class Radio(Generic[Message]):
     """
-    Messages within flocks of m; no flock receives those of another.
+    Messages within flocks of m vehicles; no flock receives messages of another.
 
-    :param company: m.
-    :param delay: from sending to arrival, s.
+    :param company: m, the number of vehicles in each flock.
+    :param delay: time from sending to arrival, s.
     :param loss: share of messages that do not arrive at one of the receivers.
-    :param generators: of chance, one for each follower, flock by flock.
+    :param generators: random generators, one for each follower, flock by flock.
     """
 
     def __init__(self, company: int, delay: float, loss: float,
                  generators: Sequence[np.random.Generator]) -> None:
         self._company, self._delay, self._loss = company, delay, loss
         self._generators = generators
-        self._coming: deque[tuple[float, int, Word]] = deque()
+        self._coming: deque[tuple[float, int, Message]] = deque()
 
-    def send(self, now: float, teller: int, words: Sequence[Word]) -> None:
+    def send(self, now: float, sender: int, messages: Sequence[Message]) -> None:
         """Take messages that a follower, counted through all flocks, sends at a time, s."""
-        first = teller - teller % self._company
-        draws = self._generators[teller].random((len(words), self._company))
-        for word, luck in zip(words, draws.tolist()):
+        first = sender - sender % self._company
+        draws = self._generators[sender].random((len(messages), self._company))
+        for message, luck in zip(messages, draws.tolist()):
             self._coming += [
-                (now + self._delay, first + k, word) for k, p in enumerate(luck)
-                if first + k != teller and p >= self._loss]
+                (now + self._delay, first + k, message) for k, p in enumerate(luck)
+                if first + k != sender and p >= self._loss]
 
-    def arrived(self, now: float) -> list[tuple[int, Word]]:
+    def arrived(self, now: float) -> list[tuple[int, Message]]:
         """Return the messages that have arrived since the last call, each with its receiver."""
-        heard = []
+        received = []
         while self._coming and self._coming[0][0] <= now + 1e-9:
-            _, hearer, word = self._coming.popleft()
-            heard.append((hearer, word))
-        return heard
+            _, receiver, message = self._coming.popleft()
+            received.append((receiver, message))
+        return received
 
 
 class Radios:
@@ -75,7 +75,7 @@ class Radios:
         self._walk = errors.bias_walk * errors.rate ** -0.5
 
     def measure(self, distance: Array) -> Array:
-        """Return what is measured of true distances (n,), m, one period after the last."""
+        """Return measurements of true distances (n,), m, one period after the last."""
         errors = self._errors
         drawn = np.stack([g.standard_normal(2) for g in self._generators])
         chance = np.stack([g.random(2) for g in self._generators])

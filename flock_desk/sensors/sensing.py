@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How simulated followers see others in lock step: the view of a camera, and measurement noise."""
+"""Simulated detection in lock step: the field of view of a camera, and measurement noise."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PerceptionNoise:
     """
 
     lateral: float = 0.0005
-    """Across the line of sight, rad times the distance: one's own attitude, image by image."""
+    """Across the line of sight, rad times the distance: the own attitude, image by image."""
     range_constant: float = 0.0003
     """Along the line of sight, m ..."""
     range_growth: float = 0.0003
@@ -94,9 +94,9 @@ def facing(offsets: Array, rotations: Array, angle: float,
     """
     Return which vehicles (n, 3, 3) show a marker to the observer, not too oblique (n,).
 
-    :param offsets: of the vehicles from there (n, 3), m.
-    :param angle: from a marker's normal up to which it is found, rad.
-    :param faces: their sides that have one, keys of ``DIRECTIONS``.
+    :param offsets: positions of the vehicles relative to it (n, 3), m.
+    :param angle: largest angle to a marker's normal at which it is found, rad.
+    :param faces: sides of a vehicle with a marker, keys of ``DIRECTIONS``.
     """
     on_body = np.einsum('nji,nj->ni', rotations, offsets)
     least = math.cos(angle) * np.linalg.norm(offsets, axis=1)
@@ -105,11 +105,11 @@ def facing(offsets: Array, rotations: Array, angle: float,
 
 def hidden(offsets: Array, present: Any, radius: float) -> Any:
     """
-    Return behind which of m vehicles (..., m) another one stands in the way.
+    Return which of m vehicles are hidden by another one (..., m).
 
-    :param offsets: of all of them from the observer (..., m, 3), m.
-    :param present: which are there (..., m).
-    :param radius: of a vehicle, m.
+    :param offsets: positions of the vehicles relative to the observer (..., m, 3), m.
+    :param present: which vehicles exist (..., m).
+    :param radius: radius of a vehicle, m.
     """
     distance = np.linalg.norm(offsets, axis=-1)
     # [..., b, j]: how far b is along the way to j, and how far beside it.

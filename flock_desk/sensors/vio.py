@@ -136,7 +136,7 @@ class VioEstimator:
         self._twist_covariance = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
                                          + [errors.gyro_bias ** 2 + errors.gyro ** 2] * 3)
         self._position = start.position
-        self.estimate = self._told(start)
+        self.estimate = self._reported(start)
         """The newest odometry."""
 
     def step(self, true: Odometry) -> Odometry:
@@ -150,10 +150,10 @@ class VioEstimator:
         self._drift = 0.5 * (drift + drift.T) + np.diag(self._walk)
         self._tilt = _renewed(self._tilt, self._keep,
                               self._errors.tilt * self._rng.standard_normal(2))
-        self.estimate = self._told(true)
+        self.estimate = self._reported(true)
         return self.estimate
 
-    def _told(self, true: Odometry) -> Odometry:
+    def _reported(self, true: Odometry) -> Odometry:
         vio, fresh = self._vio, self._rng.standard_normal(6)
         tilt = self._tilt + self._tilt_bias
         error = np.array([*tilt, 0.0]) + self._errors.attitude * fresh[:3]

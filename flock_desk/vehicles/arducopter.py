@@ -13,16 +13,16 @@
 # limitations under the License.
 
 """
-ArduCopter, as far as a companion computer meets it: GUIDED, take-off, landing, the EKF failsafe.
+ArduCopter as a companion computer uses it: GUIDED, take-off, landing, the EKF failsafe.
 
-Measured on ArduCopter 4.7, and as its source has it, see docs/autopilots.md. On the ground
-setpoints do nothing, MAV_CMD_NAV_TAKEOFF comes first. Each group of three ignore bits counts as
-set where any of them is, so that setpoints of mixed axes are none, and stop the vehicle without a
-word; so do those of positions and velocities here, which the bridge never sends it. Nothing checks
-for NaN; no speed limit applies to accelerations; without setpoints it goes on for GUID_TIMEOUT
-(3 s), then stops. Unlike PX4 it integrates an acceleration to a velocity and a position and holds
-on to those: vertical acceleration 0 keeps the height. A position that the EKF has lost ends in
-LAND without a position. After landing it stays in LAND, in which it does not arm.
+Measured on ArduCopter 4.7, and by its source code, see docs/autopilots.md. On the ground setpoints
+have no effect: MAV_CMD_NAV_TAKEOFF comes first. A group of three ignore bits counts as set if any
+of them is: setpoints of mixed axes stop the vehicle without a message. Here setpoints of position
+and velocity, which the bridge never sends, do so, too. NaN is not checked, and no speed limit
+applies to accelerations. Without setpoints the last one is flown for GUID_TIMEOUT (3 s); then the
+vehicle stops. Unlike PX4, ArduCopter integrates an acceleration to a velocity and a position, and
+holds those: vertical acceleration 0 keeps the height. If the EKF loses its position, the vehicle
+enters LAND without a position. After landing it stays in LAND, in which it cannot be armed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from flock_follower.geometry import Array
 
 POSITION_TIMEOUT: Final[float] = 7.1
 _CHECK_TIME: Final[float] = 0.8
-_AIDING_END: Final[float] = 14.5
+_FUSION_TIMEOUT: Final[float] = 14.5
 PREARM_PERIOD: Final[float] = 30.0
 _LANDED: Final[float] = 1.0  # s on the ground that count as a landing
 _BRAKE_ACCELERATION: Final[float] = 7.5  # m/s^2, BRAKE_MODE_DECEL_RATE
@@ -57,7 +57,7 @@ _STOP_ACCELERATION: Final[float] = 2.5  # m/s^2, WPNAV_ACCEL
 _ALWAYS, _HORIZONTAL, _STANDING = 0x25, 0x31A, 0x82
 _POSITION_BITS, _VELOCITY_BITS, _ACCELERATION_BITS = 0b111, 0b111 << 3, 0b111 << 6
 #: Its words for a condition of arming that is not met.
-_WORDS: Final[Mapping[str, str]] = {
+_REASONS: Final[Mapping[str, str]] = {
     'permission': '{denial}', 'vision': 'VisOdom: not healthy',
     'armable': '{mode} mode not armable', 'position': 'Need Position Estimate'}
 
@@ -69,7 +69,7 @@ class ArduCopter(FlightController):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._told_prearm = self._time - PREARM_PERIOD / 2.0
+        self._prearm_sent = self._time - PREARM_PERIOD / 2.0
         self._stop()
 
     @property
@@ -88,15 +88,15 @@ class ArduCopter(FlightController):
         return (self.estimator.ready(now)
                 and self.estimator.vision_age(now) <= POSITION_TIMEOUT)
 
-    def tells_position(self, now: float) -> bool:
+    def reports_position(self, now: float) -> bool:
         """Return whether it sends LOCAL_POSITION_NED: longer than it is valid."""
-        return self.estimator.ready(now) and self.estimator.vision_age(now) <= _AIDING_END
+        return self.estimator.ready(now) and self.estimator.vision_age(now) <= _FUSION_TIMEOUT
 
     def estimator_flags(self, now: float) -> int:
         """Return the flags of EKF_STATUS_REPORT."""
         if self.position_known(now):
             return _ALWAYS | _HORIZONTAL
-        return _ALWAYS if self.tells_position(now) else _ALWAYS | _STANDING
+        return _ALWAYS if self.reports_position(now) else _ALWAYS | _STANDING
 
     def on_setpoint(self, message: Any, now: float) -> None:
         """Take an acceleration, in GUIDED only; whatever else comes stops it."""
@@ -123,7 +123,7 @@ class ArduCopter(FlightController):
         """Change the mode; a refusal says why."""
         result = super().change_mode(name, now)
         if result != ACCEPTED:
-            self._say(f'Mode change to {name} failed: requires position')
+            self._send_text(f'Mode change to {name} failed: requires position')
         return result
 
     def arm(self, value: bool, force: bool, now: float) -> int:
@@ -132,22 +132,22 @@ class ArduCopter(FlightController):
         if result == ACCEPTED:
             self._stop()
         elif value:
-            self._say(f'Arm: {self._reason(now)}')
+            self._send_text(f'Arm: {self._reason(now)}')
         return result
 
     def run_checks(self, now: float) -> int:
         """Say what keeps it from arming."""
-        self._told_prearm = now
+        self._prearm_sent = now
         if self.armed:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
         if self.unfit(now):
-            self._say(f'PreArm: {self._reason(now)}')
+            self._send_text(f'PreArm: {self._reason(now)}')
         return ACCEPTED
 
     def _reason(self, now: float) -> str:
-        return _WORDS[self.unfit(now)[0]].format(denial=self.arming_denial, mode=self.mode)
+        return _REASONS[self.unfit(now)[0]].format(denial=self.arming_denial, mode=self.mode)
 
-    def _say(self, text: str) -> None:
+    def _send_text(self, text: str) -> None:
         self.outbox.append(mavlink.MAVLink_statustext_message(
             mavlink.MAV_SEVERITY_CRITICAL, text.encode()))
 
@@ -163,14 +163,14 @@ class ArduCopter(FlightController):
         self._velocity = self.estimator.velocity.copy()
 
     def _supervise(self, now: float) -> None:
-        if now - self._told_prearm >= PREARM_PERIOD:
+        if now - self._prearm_sent >= PREARM_PERIOD:
             self.run_checks(now)
         needs_position = ARDUCOPTER.modes[self.mode].needs or self._flies == LAND
         age = self.estimator.vision_age(now)
         if self.armed and needs_position and not self.in_failsafe and (
                 POSITION_TIMEOUT + _CHECK_TIME < age < math.inf):
             mode = 'ALT_HOLD' if self.parameters['FS_EKF_ACTION'] == 2 else 'LAND'
-            self._say(f'EKF Failsafe: changed to {mode} Mode')
+            self._send_text(f'EKF Failsafe: changed to {mode} Mode')
             self._enter(mode)
             self.in_failsafe = True
         elif self.position_known(now):
@@ -200,7 +200,7 @@ class ArduCopter(FlightController):
         self._velocity = self._velocity + forward * dt
         self._position = self._position + self._velocity * dt
         if not np.all(np.isfinite([self._velocity, self._position])):
-            # A real one does not refuse NaN; what it then does is undefined. This one lets the
+            # A real one does not refuse NaN; its behaviour then is undefined. This one lets the
             # motors idle and falls, so that no test overlooks it.
             return IDLE
         self._follow_yaw(dt)

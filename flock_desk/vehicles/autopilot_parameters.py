@@ -16,8 +16,8 @@
 The parameters of the embedded autopilot, served the way PX4 and ArduPilot each serve them.
 
 PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself: who mixes them up
-reads 1 as 1.4e-45.
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself. A decoder that uses
+the wrong encoding reads 1 as 1.4e-45.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class AutopilotParameters:
         if name not in self._values:
             return []
         if message.get_type() == 'PARAM_SET':
-            with contextlib.suppress(ValueError):  # the answer tells the old value then
+            with contextlib.suppress(ValueError):  # the answer then has the old value
                 self.set(name, self._recode(message.param_value, name, '<f', '<i'))
         # ArduPilot does not look up the index of a parameter asked for by its name.
         return [self._message(name)]

@@ -41,12 +41,12 @@ CURRENT: Final[float] = 18.0  # A in flight
 
 
 class BarometerErrors(NamedTuple):
-    """How a barometer errs; standard deviations, m, of its height."""
+    """Errors of a barometer: standard deviations of its height, m."""
 
     noise: float = 0.05
     """White, of each sample."""
     drift: float = 0.1
-    """Of weather and temperature, zero at the start; first-order Gauss-Markov ..."""
+    """Drift by weather and temperature, zero at the start; first-order Gauss-Markov ..."""
     drift_time: float = 300.0
     """... with this time constant, s."""
 
@@ -90,7 +90,7 @@ class Equipment:
         self._vehicle = vehicle
         self.barometer = Barometer([np.random.default_rng([seed, 1])], errors)
         self.charge: float | None = 1.0
-        """What is left of the battery's capacity, a share; None: unknown."""
+        """Remaining charge of the battery, a share; None: unknown."""
 
     def step(self, armed: bool, dt: float) -> None:
         """Let the battery drain for ``dt``, s."""

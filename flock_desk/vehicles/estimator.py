@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the embedded autopilot believes of its own motion: GPS, or external vision that can go stale.
+Position estimator of the embedded autopilot: GPS, or external vision that can become stale.
 
 With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
 they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
@@ -92,11 +92,11 @@ class Estimator:
         return quaternion_multiply(quaternion_from_yaw(self.yaw_error), self._vehicle.quaternion)
 
     def vision_age(self, now: float) -> float:
-        """Return for how long no usable vision has come, s; 0 where none is needed."""
+        """Return the time since the last valid vision, s; 0 if it does not use vision."""
         return now - self._vision_time if self.uses_vision else 0.0
 
     def ready(self, now: float) -> bool:
-        """Return whether there has been an estimate of the position."""
+        """Return whether the position has been estimated."""
         return self.started(now) and math.isfinite(self.vision_age(now))
 
     def started(self, now: float) -> bool:

@@ -48,7 +48,7 @@ ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 
 
 class TrackedSetpoint(NamedTuple):
-    """A setpoint, ENU; NaN where an axis is not given."""
+    """A setpoint, ENU; NaN if an axis is not given."""
 
     position: Array = _NOWHERE
     velocity: Array = _NOWHERE
@@ -124,7 +124,7 @@ class FlightController(ABC):
 
     @property
     def has_origin(self) -> bool:
-        """Return whether it knows where on Earth it is: by GPS, or as it was told."""
+        """Return whether it has a global origin: by GPS, or by SET_GPS_GLOBAL_ORIGIN."""
         return self._origin_set or not self.estimator.uses_vision
 
     @property
@@ -163,7 +163,7 @@ class FlightController(ABC):
         """Return whether the estimate of the position is valid."""
 
     @abstractmethod
-    def tells_position(self, now: float) -> bool:
+    def reports_position(self, now: float) -> bool:
         """Return whether it sends LOCAL_POSITION_NED."""
 
     @abstractmethod
@@ -180,7 +180,7 @@ class FlightController(ABC):
 
     @abstractmethod
     def run_checks(self, now: float) -> int:
-        """Obey MAV_CMD_RUN_PREARM_CHECKS: report what is not well; return the MAV_RESULT."""
+        """Obey MAV_CMD_RUN_PREARM_CHECKS: report failed checks; return the MAV_RESULT."""
 
     @abstractmethod
     def _supervise(self, now: float) -> None:

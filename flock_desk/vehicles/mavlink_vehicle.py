@@ -60,14 +60,14 @@ class MavlinkVehicle:
                            for message, rate in controller.PROFILE.rates.items()}
         self._due = {message: now if math.isfinite(interval) else math.inf
                      for message, interval in self._intervals.items()}
-        self._mode_told = controller.custom_mode, now
+        self._mode_sent = controller.custom_mode, now
         self._clock_offset: float | None = None
         ids = {name: getattr(mavlink, f'MAVLINK_MSG_ID_{name}') for name in (
             'HEARTBEAT', 'TIMESYNC', 'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION',
             'EXTENDED_SYS_STATE', 'GLOBAL_POSITION_INT', 'HOME_POSITION', 'SCALED_PRESSURE',
             'AUTOPILOT_VERSION', 'ESTIMATOR_STATUS', 'EKF_STATUS_REPORT', 'CURRENT_MODE',
             'SYS_STATUS', 'BATTERY_STATUS')}
-        self._tells: Mapping[int, Callable[[float], Any]] = {
+        self._encoders: Mapping[int, Callable[[float], Any]] = {
             number: getattr(self, f'_{name.lower()}') for name, number in ids.items()}
 
     def handle(self, message: Any, now: float) -> list[Any]:
@@ -95,58 +95,58 @@ class MavlinkVehicle:
         return []
 
     def _answer_timesync(self, message: Any, now: float) -> list[Any]:
-        # Zero would make an answer a question, and two polite ends talk for ever.
+        # Zero would turn an answer into a request, and both ends would answer for ever.
         nanoseconds = max(1, round((now - self._start) * 1e9))
         if message.tc1 == 0:
             return [mavlink.MAVLink_timesync_message(nanoseconds, message.ts1)]
         if 0 <= nanoseconds - message.ts1 < _LONGEST_WAY:
-            # Whoever answered did so half way between question and answer.
+            # The other end answered half way between request and answer.
             self._clock_offset = (0.5 * (message.ts1 + nanoseconds) - message.tc1) * 1e-9
         return []
 
     def step(self, now: float) -> list[Any]:
         """Fly on to ``now`` and return the messages that are due."""
         self.controller.step(now)
-        messages = self._said()
+        messages = self._status_texts()
         self._note_mode(now)
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
-                messages += self._told(message_id, now)
+                messages += self._encoded(message_id, now)
                 # From the time it was due: the mean rate is exact.
                 interval = self._intervals[message_id]
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
         return messages
 
     def _note_mode(self, now: float) -> None:
-        """Let what tells of the mode be due when it changes: as PX4 1.16 and ArduCopter 4.7 do."""
-        told, time = self._mode_told
-        news = told != self.controller.custom_mode
+        """Send the message with the mode at each change, as PX4 1.16 and ArduCopter 4.7 do."""
+        mode, time = self._mode_sent
+        news = mode != self.controller.custom_mode
         if not self._px4:
-            self._mode_told = self.controller.custom_mode, now
+            self._mode_sent = self.controller.custom_mode, now
             if news:
                 self._due[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = now
             return
         interval = self._intervals[mavlink.MAVLINK_MSG_ID_CURRENT_MODE]
         due = time + (interval if news else max(interval, CURRENT_MODE_PERIOD))
         if now >= due - 0.5 * STEP:
-            self._mode_told = self.controller.custom_mode, now
+            self._mode_sent = self.controller.custom_mode, now
         self._due[mavlink.MAVLINK_MSG_ID_CURRENT_MODE] = due
 
-    def _said(self) -> list[Any]:
-        said, self.controller.outbox = self.controller.outbox, []
-        return said
+    def _status_texts(self) -> list[Any]:
+        texts, self.controller.outbox = self.controller.outbox, []
+        return texts
 
-    def _told(self, message_id: int, now: float) -> list[Any]:
-        """Return the message with an id; none where there is nothing to tell."""
-        message = self._tells[message_id](now)
+    def _encoded(self, message_id: int, now: float) -> list[Any]:
+        """Return the message with an id; an empty list if it has no content."""
+        message = self._encoders[message_id](now)
         return [] if message is None else [message]
 
     def _command(self, message: Any, now: float) -> list[Any]:
         results = self._obey(message, now)
-        asked = message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and results == [ACCEPTED]
-        return [*self._said(), *(mavlink.MAVLink_command_ack_message(
+        reply = message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and results == [ACCEPTED]
+        return [*self._status_texts(), *(mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
-            for result in results), *(self._told(int(message.param1), now) if asked else [])]
+            for result in results), *(self._encoded(int(message.param1), now) if reply else [])]
 
     def _obey(self, message: Any, now: float) -> list[int]:
         controller, command = self.controller, message.command
@@ -197,7 +197,7 @@ class MavlinkVehicle:
         estimate = self.controller.estimator
         return mavlink.MAVLink_local_position_ned_message(
             self._boot_ms(now), *enu_to_ned(estimate.position).tolist(),
-            *enu_to_ned(estimate.velocity).tolist()) if self.controller.tells_position(
+            *enu_to_ned(estimate.velocity).tolist()) if self.controller.reports_position(
                 now) else None
 
     def _attitude_quaternion(self, now: float) -> Any:
@@ -258,7 +258,7 @@ class MavlinkVehicle:
             0, self.controller.custom_mode, self.controller.intended_mode)
 
     def _battery(self) -> tuple[int, int, int]:
-        """Return the voltage of a cell, mV, the current, cA, and what is left, per cent."""
+        """Return the voltage of a cell, mV, the current, cA, and the remaining charge, %."""
         charge = self.equipment.charge
         current = round(1e2 * (CURRENT if self.controller.armed else 0.5))
         if charge is None:

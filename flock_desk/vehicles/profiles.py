@@ -87,7 +87,7 @@ class Profile:
     frames: tuple[int, ...]
     """The frames of ODOMETRY that it takes."""
     oldest_vision: float
-    """s; what is older, by the clock it has learnt, is not used."""
+    """s; older odometry, by the estimated clock offset, is not used."""
     drift: Array
     """Acceleration (3,), m/s^2, by which its estimate drifts without vision."""
     tilt_max: float
@@ -130,7 +130,7 @@ PX4: Final = Profile(
         'COM_RC_OVERRIDE': (INT32, 1),
         'COM_SPOOLUP_TIME': (FLOAT, 1.0),     # s after arming until it can take off
         'EKF2_BARO_CTRL': (INT32, 1),
-        'EKF2_EV_CTRL': (INT32, 0),           # what is taken of vision; 15: everything
+        'EKF2_EV_CTRL': (INT32, 0),           # parts of vision that are fused; 15: all
         'EKF2_EV_DELAY': (FLOAT, 0.0),
         'EKF2_EV_NOISE_MD': (INT32, 0),
         'EKF2_GPS_CTRL': (INT32, 7),          # 0: fly without GPS

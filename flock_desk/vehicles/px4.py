@@ -53,16 +53,16 @@ from flock_desk.vehicles.vehicle import GRAVITY
 from flock_follower.geometry import Array
 
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
-AIDING_TIMEOUT: Final[float] = 0.55
+FUSION_TIMEOUT: Final[float] = 0.55
 _SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
 _ALWAYS, _HORIZONTAL, _AIDED, _ABSOLUTE, _AT_REST = 0x65, 0xA, 0x100, 0x210, 0x80
-#: What is flown after the loss of the stream, by COM_OBL_RC_ACT: the first that can be.
+#: Modes after the loss of the stream, by COM_OBL_RC_ACT: the first possible one.
 _LOST_STREAM: Final[Mapping[int, tuple[str, ...]]] = {
     4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
 _CLIMB_MAX: Final[float] = 3.0  # m/s, MPC_Z_VEL_MAX_UP
 _RAMP_START: Final[float] = -GRAVITY / 4.0
 _DESCENT: Final[float] = 0.275  # m/s; a faster commanded descent counts as a landing
-_LIFTING: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
+_FLYING_THRUST: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
 _LANDING_TIME: Final[float] = 1.0  # s, LNDMC_TRIG_TIME
 REPORT_PERIOD: Final[float] = 2.0  # s between reports of changes, at least
 _EVENT, _EVENT_CRC = 410, 160
@@ -71,7 +71,7 @@ _BEGIN, _END, _PROTOCOL = 0xA893E0, 0x1D3727, 8
 
 
 class Check(NamedTuple):
-    """How the EVENTs of arming checks tell that a condition is not met."""
+    """How the EVENTs of arming checks report a condition that is not met."""
 
     number: int
     """Hash of the name, as captured."""
@@ -140,7 +140,7 @@ class Px4(FlightController):
         patience = self.parameters['EKF2_NOAID_TOUT'] * 1e-6 + PX4.oldest_vision
         return self.estimator.ready(now) and self.estimator.vision_age(now) <= patience
 
-    def tells_position(self, now: float) -> bool:
+    def reports_position(self, now: float) -> bool:
         """Return whether it sends LOCAL_POSITION_NED: valid or not."""
         return self.estimator.started(now)
 
@@ -149,7 +149,7 @@ class Px4(FlightController):
         flags = _ALWAYS | (_AT_REST if self._landed else 0)
         if self.position_known(now):
             flags |= _HORIZONTAL
-        if self.estimator.ready(now) and self.estimator.vision_age(now) <= AIDING_TIMEOUT:
+        if self.estimator.ready(now) and self.estimator.vision_age(now) <= FUSION_TIMEOUT:
             flags |= _AIDED | (_ABSOLUTE if self.has_origin else 0)
         return flags
 
@@ -177,7 +177,7 @@ class Px4(FlightController):
         """
         Climb to an altitude, m above sea level, then hold; once armed, where it is not.
 
-        NaN, and what is lower, becomes MIS_TAKEOFF_ALT above the ground.
+        NaN, or a lower altitude, becomes MIS_TAKEOFF_ALT above the ground.
         """
         if self.armed and self.missing(TAKEOFF, now):
             return PX4.refused
@@ -188,7 +188,7 @@ class Px4(FlightController):
         return ACCEPTED
 
     def run_checks(self, now: float) -> int:
-        """Report what is not well: an EVENT for each condition, between two summaries."""
+        """Report failed conditions: an EVENT for each, between two summaries."""
         met = self.conditions(now)
         self._reported = [name for name in CHECKS if not met[name]]
         self._report_time = now
@@ -284,10 +284,10 @@ class Px4(FlightController):
         return super()._track(setpoint)
 
     def _detect_landing(self, thrust: float, dt: float) -> None:
-        """Follow the land detector; ``thrust``, m/s^2, is what is commanded."""
+        """Follow the land detector; ``thrust``, m/s^2, is the commanded one."""
         rests = self.vehicle.landed and self._descends and not self._landed
         self._resting_for = self._resting_for + dt if rests else 0.0
-        self._landed = (not self.armed or (self._landed and thrust <= _LIFTING)
+        self._landed = (not self.armed or (self._landed and thrust <= _FLYING_THRUST)
                         or self._resting_for >= _LANDING_TIME)
 
     @property

@@ -15,8 +15,8 @@
 """
 A quadrotor that flies acceleration setpoints: thrust, tilt, gravity and the lags in between.
 
-Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It flies
-one vehicle, or as many as its arrays have rows, each for itself.
+Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It has
+one vehicle, or as many independent ones as its arrays have rows.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class VehicleParams:
-    """How the vehicle answers; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
+    """Dynamics of the vehicle; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
 
     attitude_time: float = 0.15
     """Time constant of tilting, s."""
@@ -117,7 +117,7 @@ class Quadrotor:
         """
         landed = self.landed
         self._before = self.axis, self.yaw, dt
-        thrust, tilt = self._wanted(np.asarray(acceleration, dtype=float))
+        thrust, tilt = self._nominal(np.asarray(acceleration, dtype=float))
         if not powered:
             thrust = np.zeros_like(thrust)
         tilt = np.where(landed[..., None], _UP, tilt)
@@ -130,7 +130,7 @@ class Quadrotor:
         self.yaw = _wrapped(self.yaw + np.where(landed, 0.0, rate * dt))
         self._move(dt, powered, landed, np.asarray(wind, dtype=float))
 
-    def _wanted(self, acceleration: Array) -> tuple[Array, Array]:
+    def _nominal(self, acceleration: Array) -> tuple[Array, Array]:
         force: Array = acceleration + GRAVITY * _UP
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = np.maximum(force[..., 2], 0.1 * GRAVITY)

@@ -90,7 +90,7 @@ class Bag:
 
     ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
     read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
-    ``incomplete`` says why the bag was never finished, '' where it was.
+    ``incomplete`` says why the bag was never finished, '' if it was.
     """
 
     def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader,
@@ -267,7 +267,7 @@ def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
     if isinstance(connection.ext, ConnectionExtRosbag1):
         return bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
     if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
-        raise ValueError(f'a message of {topic.name} does not begin as CDR does')
+        raise ValueError(f'a message of {topic.name} has no valid CDR header')
     return raw
 
 

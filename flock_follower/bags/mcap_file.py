@@ -15,7 +15,7 @@
 """
 An MCAP file with an index and checksums: the one writer of bags and of recordings in flight.
 
-If wanted, what was written is on the disk after every write: a recording has to survive a kill or
+On request every write is flushed to the disk: a recording has to survive a kill or
 a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
 at the end (https://mcap.dev/spec, which names the records). A file without its end is good up to
 its last whole chunk: ``end_mcap`` finds that.
@@ -49,7 +49,7 @@ _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # rosbag2's spelling
 
 
 class RecordedTopic(NamedTuple):
-    """A topic as a recording names it; ``source`` is the name it was heard under."""
+    """A topic in a recording; ``source`` is the name under which it was received."""
 
     name: str
     msgtype: str
@@ -58,7 +58,7 @@ class RecordedTopic(NamedTuple):
 
     @property
     def qos(self) -> list[dict[str, Any]]:
-        """Return the profile for whoever plays it: reliable matches every subscriber."""
+        """Return the QoS profile for playback: reliable matches every subscriber."""
         return [{'history': 'keep_last', 'depth': 10, 'reliability': 'reliable',
                  'durability': 'transient_local' if self.latched else 'volatile',
                  'deadline': _INFINITE, 'lifespan': _INFINITE, 'liveliness': 'automatic',
@@ -76,12 +76,12 @@ class TakenMessage(NamedTuple):
 
 class McapFile:
     """
-    One file, made now.
+    One MCAP file that is being written.
 
-    ``size`` [bytes] and ``counts``, messages by topic, tell what is on the disk; ``start_ns`` and
+    ``size`` [bytes] and ``counts``, messages by topic, describe the file on disk; ``start_ns`` and
     ``end_ns`` are the stamps of its first and last message, 0 without one.
 
-    :param durable: whether what was written is on the disk when ``write`` returns.
+    :param durable: whether the data is on the disk when ``write`` returns.
     :raises OSError: it exists, or cannot be written.
     """
 
@@ -107,7 +107,7 @@ class McapFile:
         """
         Write messages as one chunk, in the order of their stamps.
 
-        :raises OSError: where that fails; the file ends where it did before, and only ``close``
+        :raises OSError: if that fails; the file ends where it did before, and only ``close``
             makes sense after it.
         :raises KeyError: for a type that ROS 2 Jazzy does not have.
         """
@@ -140,7 +140,7 @@ class McapFile:
         """
         Write the summary and close the file.
 
-        :raises OSError: where the summary cannot be written; the file is closed all the same.
+        :raises OSError: if the summary cannot be written; the file is closed all the same.
         """
         try:
             self._append(self._end())
@@ -237,7 +237,7 @@ def definition(msgtype: str) -> str:
 @cache
 def type_hash(msgtype: str) -> str:
     """
-    Return the hash by which ROS 2 tells a type.
+    Return the type hash of ROS 2.
 
     :raises KeyError: for a type that ROS 2 Jazzy does not have.
     """

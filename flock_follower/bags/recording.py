@@ -15,7 +15,7 @@
 """
 Recordings in flight: one folder each, in files of limited size, of which the oldest make way.
 
-Each recording is a ROS 2 bag of several MCAP files. What was written is on the disk when ``write``
+Each recording is a ROS 2 bag of several MCAP files. The data is on the disk when ``write``
 returns. Whatever is at hand goes with it as files beside them, see ``note``.
 """
 
@@ -70,11 +70,11 @@ class Limits:
 
 class FlightRecording:
     """
-    The recordings in a folder, and the one under way, which begins with the first message.
+    The recordings in a folder, and the current one, which begins with the first message.
 
-    Those that were broken off are finished. ``now`` is s of a monotonic clock throughout.
+    Interrupted recordings are completed. ``now`` is s of a monotonic clock throughout.
 
-    :param folder: for the recordings of one vehicle; made where it is not there.
+    :param folder: for the recordings of one vehicle; created if missing.
     :param clock: the time of day, s since 1970.
     :raises OSError: it cannot be read or made, or another process records there.
     """
@@ -120,7 +120,7 @@ class FlightRecording:
         """
         Write messages and have them on the disk.
 
-        :raises OSError: where that fails; nothing of the messages is kept then, the file is
+        :raises OSError: if that fails; nothing of the messages is kept then, the file is
             closed, and the next ones go into a new one.
         """
         if not messages:
@@ -155,7 +155,7 @@ class FlightRecording:
         """
         Finish the recording under way.
 
-        :raises OSError: where that fails; it can be read all the same.
+        :raises OSError: if that fails; it can be read all the same.
         """
         try:
             self._end()
@@ -216,7 +216,7 @@ class FlightRecording:
         used = sum(sizes.values())
         if self._file is not None:
             sizes.pop(self._file.path)
-        # Where somebody else fills the disk, to delete what is new would only lose that, too.
+        # If another program fills the disk, deleting new recordings would not help.
         helps = _free(self.folder) + sum(sizes.values()) > _MEGABYTE * (
             limits.disk_free + limits.file_size)
         for oldest, size in sizes.items():
@@ -261,7 +261,7 @@ def _free(folder: Path) -> int:
 
 
 def _locked(folder: Path) -> int:
-    """Make a folder and lock it for as long as what is returned is open."""
+    """Make a folder and lock it for as long as the returned file is open."""
     folder.mkdir(parents=True, exist_ok=True)
     opened = os.open(folder, os.O_RDONLY)
     try:

@@ -142,7 +142,7 @@ def progress(
     paused: bool = False, width: int = 0,
 ) -> str:
     """
-    Return one line of progress, with a bar of what is left of ``width`` columns.
+    Return one line of progress, with a bar in the rest of ``width`` columns.
 
     ``position`` and ``end`` are s into the bag, ``fraction`` the part of the section played.
     """

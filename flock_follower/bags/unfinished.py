@@ -17,7 +17,7 @@ Reading ROS 2 recordings in MCAP that were never finished: as far as they go, ch
 
 rosbags wants a file's end, and a folder's ``metadata.yaml``. If one is missing, the library mcap
 reads the files of the folder one after the other, each up to its last good chunk. On a vehicle it
-need not be installed: the black box finishes what was broken off by itself.
+need not be installed: the black box completes unfinished files by itself.
 """
 
 from __future__ import annotations

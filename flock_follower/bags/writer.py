@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Writing ROS 2 bags in MCAP: what was written stays, whatever ends the writing."""
+"""Writing ROS 2 bags in MCAP: written messages stay readable, even after a crash."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class BagWriter:
         """
         Finish the bag: its index and ``metadata.yaml``.
 
-        :raises BagError: if that fails, or a write failed before; what was written up to then is
+        :raises BagError: if that fails, or a write failed before; messages written until then are
             kept, and marked incomplete.
         """
         self._end('')

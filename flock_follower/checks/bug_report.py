@@ -54,8 +54,8 @@ def write_report(path: Path, seen: Observations, table: str, findings: Mapping[s
         archive.writestr('versions.txt', versions())
         archive.writestr('check.txt', f'{table}\n')
         for name, content in (('check.json', findings), ('parameters.json', seen.parameters),
-                              ('diagnostics.json', {
-                                  node: asdict(told) for node, told in seen.told.items()})):
+                              ('diagnostics.json', {node: asdict(status) for node, status
+                                                    in seen.statuses.items()})):
             archive.writestr(name, json.dumps(content, indent=1, default=str))
         if recording is not None:
             _add_recording(archive, recording)

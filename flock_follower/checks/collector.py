@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from flock_follower.checks.image_motion import shift, small
-from flock_follower.checks.observations import Observations, Picture, Told, TopicSeen
+from flock_follower.checks.observations import NodeStatus, Observations, Picture, TopicSeen
 from flock_follower.checks.pictures import camera_model
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
@@ -99,7 +99,7 @@ class Collector:
         """Take a DiagnosticArray; the newest of each name counts."""
         for status in message.status:
             level = status.level
-            self.observations.told[status.name] = Told(
+            self.observations.statuses[status.name] = NodeStatus(
                 level[0] if isinstance(level, bytes) else int(level), status.message,
                 {item.key: item.value for item in status.values})
 

@@ -66,11 +66,11 @@ def _nodes(seen: Observations) -> Iterator[Finding]:
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = [name for name, number in count.items() if number == 0]
     twice = [name for name, number in count.items() if number > 1]
-    away = [full for full in seen.nodes if _plain(full) in missing]
-    if away:
-        namespace = away[0].rsplit('/', 1)[0].strip('/')
+    elsewhere = [full for full in seen.nodes if _plain(full) in missing]
+    if elsewhere:
+        namespace = elsewhere[0].rsplit('/', 1)[0].strip('/')
         yield error('nodes', f'{", ".join(missing)} not in /{seen.namespace.strip("/")}, but '
-                    f'{", ".join(away)}', wanted,
+                    f'{", ".join(elsewhere)}', wanted,
                     f'check --namespace {namespace}; or start all in one namespace'
                     if namespace else 'check without --namespace')
     elif missing:
@@ -131,7 +131,7 @@ def _voices(seen: Observations) -> Iterator[Finding]:
                         f'{", ".join(nodes)}', 'one', 'end all but one, or remap them')
         elif nodes and name == 'command/trajectory' and _plain(nodes[0]) != 'planner':
             yield warning(name, f'{nodes[0]} commands', 'planner',
-                          'end it, if it is not yours: the bridge flies what it says')
+                          'end it, if it is not yours: the bridge flies its commands')
 
 
 def _misfits(seen: Observations) -> Iterator[Finding]:
@@ -145,7 +145,7 @@ def _misfits(seen: Observations) -> Iterator[Finding]:
             if why and sender.type == taker.type and (
                     _plain(taker.node) in OURS or _plain(sender.node) in OURS):
                 yield error(f'{name} QoS',
-                            f'{taker.node} hears nothing: {sender.node} sends {why}',
+                            f'{taker.node} receives nothing: {sender.node} sends {why}',
                             'QoS that fit', f'change the QoS of {sender.node}, by its parameters '
                             'qos_overrides if it has them')
 
@@ -171,7 +171,7 @@ def _files(seen: Observations) -> Iterator[Finding]:
     """Report parameter files that match no node, or that were not loaded."""
     for problem in seen.file_problems:
         yield error('parameter file', problem, 'one section for each node, by its full name',
-                    'name the sections /**/planner, or as the nodes are called')
+                    'name each section /**/planner, or by the full name of the node')
     for node, values in seen.file_parameters.items():
         running = seen.parameters.get(node, {})
         other = [f'{name} is {running[name]!r}, the file says {value!r}'
@@ -198,7 +198,7 @@ def _recording(seen: Observations) -> Iterator[Finding]:
     """Check a bag as a whole."""
     if seen.incomplete:
         yield warning('bag', f'incomplete: {seen.incomplete}', 'finished',
-                      'what is there can be used; record anew for the rest')
+                      'the part that exists can be used; record again for the rest')
     missing = [name for name in ('truth/odom', 'truth/neighbors') if not seen.topic(name).arrivals]
     if missing:
         yield unmeasured('truth', f'no {" and no ".join(missing)}: evaluate reports no errors',

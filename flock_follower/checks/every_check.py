@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All checks, in the order in which to settle what they find."""
+"""All checks, in the order in which their findings should be fixed."""
 
 from __future__ import annotations
 

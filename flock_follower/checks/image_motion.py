@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Image motion compared with the rotation by odometry: it shows the axes and the time offset.
+Comparison of image motion with the odometry's rotation: finds wrong axes and a time offset.
 
 A camera that turns by a small rotation vector r (its own axes: x right, y down, z ahead) sees the
-scene move by (-f r_y, f r_x) px, at any distance. The motion of the camera adds a shift whose mean
-is nearer to zero. So the shift of the middle of the image gives two of the three components of r
+scene move by (-f r_y, f r_x) px, at any distance. The camera's translation adds a shift with a
+smaller mean. So the shift of the middle of the image gives two of the three components of r
 for each pair of images. Many pairs give the rotation between body and camera: of the 24 rotations
 that lay three axes onto three others, the one that explains the shifts best.
 """
@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array
 from flock_follower.perception.images import GrayImage
 
-#: Width, px, at which images are compared, in so many parts.
+#: Width, px, to which images are scaled for the comparison; rows and columns of parts.
 WIDTH = 192
 ROWS, COLUMNS = 2, 3
 #: Least quality of a match, 0 to 1.
@@ -65,7 +65,7 @@ def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]
     """
     Return the shift of the scene right and down, px of images of that width, and its quality.
 
-    It is the median over the parts of the image: the leader may fill one of them.
+    The shift is the median over the parts of the image: the leader may fill one of them.
     """
     if before.shape != after.shape:
         return 0.0, 0.0, 0.0
@@ -84,7 +84,7 @@ def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]
 
 class AxesFit(NamedTuple):
     """
-    How well rotation explains the shifts: shares of their squares, 1 is all of it.
+    Shares of the squared shifts that rotation explains, up to 1.
 
     ``configured`` is the share with the configured axes, ``best`` that with the best rotation
     ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset

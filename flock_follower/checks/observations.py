@@ -46,7 +46,7 @@ class TopicEnd:
 
 @dataclass
 class TopicSeen:
-    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is none."""
+    """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is missing."""
 
     publishers: list[TopicEnd] = field(default_factory=list)
     subscribers: list[TopicEnd] = field(default_factory=list)
@@ -88,7 +88,7 @@ class Picture:
 
 
 @dataclass
-class Told:
+class NodeStatus:
     """The newest status of a node on /diagnostics; ``level`` 0 ok, 1 warning, 2 error, 3 stale."""
 
     level: int
@@ -124,14 +124,14 @@ class OwnMotion:
     """
     The odometry, read as our nodes read it.
 
-    ``lost`` is the number of messages without attitude or position, ``why`` the reason of the
-    newest of them.
+    ``lost`` is the number of messages without attitude or position, ``last_error`` the reason of
+    the newest of them.
     """
 
     source: OdometrySource
     states: list[OdometryState] = field(default_factory=list)
     lost: int = 0
-    why: str = ''
+    last_error: str = ''
     events: Counter[str] = field(default_factory=Counter)
 
     def take(self, message: Any, arrival: int) -> None:
@@ -139,9 +139,9 @@ class OwnMotion:
         try:
             state = self.source.take(message, arrival)
         except ValueError as problem:
-            self.lost, self.why = self.lost + 1, str(problem)
+            self.lost, self.last_error = self.lost + 1, str(problem)
             return
-        self.events.update(reason for reason, _ in self.source.told())
+        self.events.update(reason for reason, _ in self.source.new_events())
         if state is not None:
             self.states.append(state)
 
@@ -191,8 +191,8 @@ class Observations:
     """Markers of other dictionaries, by the dictionary, if none of ours was found."""
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)
-    told: dict[str, Told] = field(default_factory=dict)
-    """By the full name of the node, without the slash before it."""
+    statuses: dict[str, NodeStatus] = field(default_factory=dict)
+    """Newest status by the full name of the node, without its first slash."""
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""

@@ -77,7 +77,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} say nothing: {motion.why}',
+                     f'{motion.lost} of {count} say nothing: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialised; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
@@ -136,7 +136,7 @@ def _twist(motion: OwnMotion) -> Finding:
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
         return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
-                       f'{DERIVED}; look at the source')
+                       f'{DERIVED}; check the velocity of the odometry source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
@@ -178,8 +178,8 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
                     f'odom_child_rpy:={rpy} fits the images' if turned else
                     'its child frame is a camera or its IMU (x right, y down): '
                     'odom_child_rpy:=[-1.5708,0.0,-1.5708]' if axis == '-y' else
-                    'its child frame is not base_link: set odom_child_rpy to how it sits on the '
-                    'body (child_frame_id tells which it is), see docs/sensors.md')
+                    'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its '
+                    'attitude on the body, see docs/sensors.md')
     elif turned and fit is not None and fit.turn[2, 2] < -0.5:
         yield error(what, 'images turn the other way round: its z is down', wanted,
                     'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '

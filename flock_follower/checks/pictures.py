@@ -79,10 +79,11 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     if straight and not rectified and np.any(camera.distortion):
-        return error(what, f'{measured}, distorted, but the topic says rectified', wanted,
-                     'start relative_pose with rectified:=true')
+        return error(what, f'{measured}, distorted, but the topic is marked as rectified',
+                     wanted, 'start relative_pose with rectified:=true')
     if rectified and not straight and any(seen.calibration.d):
-        return warning(what, f'{measured}; rectified is true, the topic does not say so', wanted,
+        return warning(what, f'{measured}; rectified is true, but the topic is not marked as '
+                       'rectified', wanted,
                        'rectified:=true only for images whose distortion was removed')
     return ok(what, measured, wanted)
 

@@ -109,7 +109,7 @@ class RecordedSystem:
                     deserialize(data, msgtype))
             except ValueError as problem:
                 if name == 'odom' and self._reads:
-                    self._own.lost, self._own.why = self._own.lost + 1, str(problem)
+                    self._own.lost, self._own.last_error = self._own.lost + 1, str(problem)
                 self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
                 return None
         if name == 'camera_info':

@@ -15,17 +15,17 @@
 """
 A marker at rest, seen by a moving camera: it shows its size, and how the camera is mounted.
 
-By odometry and image it must stay in place. If it approaches by more, or less, than the camera
-moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns, the
-mounting is wrong. With y from the camera to the marker as seen, q the position of the camera by
-odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
+By odometry and image the marker must stay in place. If it approaches by more, or less, than the
+camera moves towards it, its size (or the focal length) is wrong. If it swings as the camera turns,
+the mounting is wrong. With y from the camera to the marker as seen, q the position of the camera
+by odometry, both along odom's axes, and s the ratio of the distance seen to the true one,
 
     y = c - s q - turn x y - ...    (least squares; c is s times the position of the marker)
 
 A leader that moves can look the same: if it goes ahead by half of the follower's way, it looks
-like a marker whose configured size is too small. Relative positions alone cannot tell. So a result
-is given only if a single s explains nearly all changes of y, and the marker keeps its attitude, as
-it does if it stands on the ground and the camera is carried before it.
+like a marker whose configured size is too small. Relative positions alone cannot distinguish the
+two cases. So a result is given only if a single s explains nearly all changes of y, and the marker
+keeps its attitude, as it does if it stands on the ground and the camera is carried before it.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _mounting(fit: RestFit, rpy: list[float]) -> Finding:
                               @ quaternion_to_matrix(quaternion_from_rpy(*rpy)))
     shown = ','.join(str(round(angle, 3) + 0.0) for angle in fitting.tolist())
     return judged(
-        off > BAD_LOOKS, True, what, f'camera {looks} than told', _MOUNTED,
+        off > BAD_LOOKS, True, what, f'camera {looks} than configured', _MOUNTED,
         f'camera_rpy:=[{shown}] would fit, in relative_pose and planner; or is the pose of the '
         'odometry on the body (odom_child_rpy) wrong?')
 
@@ -226,7 +226,7 @@ def fit_rest(seen: Sightings, own: OwnPath) -> RestFit | None:
         return None
     R, w = own.rotations, own.rates
     q = own.positions + R @ seen.camera
-    away = q - q.mean(axis=0)
+    offsets = q - q.mean(axis=0)
     moving = own.velocities + _turned(R, np.cross(w, seen.camera))
     times = own.times - own.times.mean()
     variance = (seen.deviations**2 + ODOMETRY**2
@@ -241,12 +241,12 @@ def fit_rest(seen: Sightings, own: OwnPath) -> RestFit | None:
         y = _turned(R, arms)
         late = -(_turned(R, np.cross(w, arms)) + scale * moving)
         design = np.concatenate([
-            eye, times[:, None, None] * eye, -away[:, :, None],
+            eye, times[:, None, None] * eye, -offsets[:, :, None],
             R @ np.array([skew(arm) for arm in arms]), -R, late[:, :, None]], axis=2)
         weights = (robust / variance)[:, None, None]
         information = np.sum(np.swapaxes(design, 1, 2) @ (weights * design), axis=0) + prior
         moment = np.sum(np.swapaxes(design, 1, 2) @ (weights * y[:, :, None]), axis=0)[:, 0]
-        # The prior is of the whole turn, not of what is added to it, and of s - 1.
+        # The prior is of the whole turn, not of its increment, and of s - 1.
         moment[6] += prior[6, 6]
         moment[7:10] -= prior[7:10, 7:10] @ turn
         solution = np.linalg.solve(information, moment)
@@ -259,7 +259,7 @@ def fit_rest(seen: Sightings, own: OwnPath) -> RestFit | None:
     deviations = WIDENED * np.sqrt(spread * np.linalg.inv(information).diagonal())
     return RestFit(
         scale, float(deviations[6]), turn, deviations[7:10],
-        float(np.sqrt(np.mean(np.sum(away**2, axis=1)))),
+        float(np.sqrt(np.mean(np.sum(offsets**2, axis=1)))),
         float(np.sqrt(np.average(np.sum(residual**2, axis=1), weights=robust))),
         _sway(R @ (rotation_vector_to_matrix(turn) @ seen.attitudes)))
 

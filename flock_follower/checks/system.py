@@ -58,7 +58,7 @@ FEW = 10
 PARAMETER: Final = 'parameter '
 NOT_READY: Final = 'not ready to arm'
 REFUSED: Final = 'offboard would be refused'
-#: The action to take for a status of a node, by words of it.
+#: The action for a status of a node, by a part of its text.
 ADVICE: Final[Mapping[str, str]] = {
     'cannot keep up': 'fly behind a slower leader, or raise v_max',
     'not aligned': 'let the autopilot fuse this odometry (forward_odometry:=true)',
@@ -96,7 +96,7 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
             f'{min(share, 1.0):.0%} of the images' if frames.arrivals else 'none',
             f'{PROCESSED:.0%} or more',
             'less to do for the processor, or a lower frame rate' if frames.arrivals else
-            'see images, calibration and odometry; its log says what it drops')
+            'see images, calibration and odometry; its log names the dropped messages')
 
 
 def _shared_memory(seen: Observations) -> Iterator[Finding]:
@@ -149,17 +149,17 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
     """Report the status of our nodes and of the autopilot."""
     for node in OURS:
         full = full_name(node, seen.namespace)
-        told = seen.told.get(full.lstrip('/'))
-        if told is None:
+        status = seen.statuses.get(full.lstrip('/'))
+        if status is None:
             if full in seen.nodes:
                 yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
             continue
-        advice = next((advice for words, advice in ADVICE.items() if words in told.message),
+        advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
-        found = [judged(told.level > 1, told.level == 1, f'{node} says', told.message, 'running',
-                        advice)]
+        found = [judged(status.level > 1, status.level == 1, f'{node} says', status.message,
+                        'running', advice)]
         if node == 'mavlink_bridge':
-            found += _autopilot(told.values)
+            found += _autopilot(status.values)
         # Faults at the time of a recording do not prevent its use.
         yield from (finding if seen.live or finding.level != ERROR else
                     finding._replace(level=WARNING) for finding in found)
@@ -172,7 +172,7 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
                     'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
         return
-    yield ok(what, f'{values.get("autopilot") or "heard"}, {values.get("mode") or "no mode"}, '
+    yield ok(what, f'{values.get("autopilot") or "received"}, {values.get("mode") or "no mode"}, '
              f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
     differing = [key for key in values if key.startswith(PARAMETER)]
     wanted = 'as config/ recommends'

@@ -118,7 +118,7 @@ def _latency(what: str, topic: TopicSeen, limits: _Limits, live: bool) -> Findin
                       'clocks (chrony, PTP); have the driver stamp by the clock of ROS')
     return judged(middle > limits.latency[1], middle > limits.latency[0]
                   or most > limits.latency[1], what,
-                  f'{1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms', wanted,
+                  f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms', wanted,
                   limits.sooner)
 
 

@@ -51,7 +51,7 @@ def parse_remaps(remaps: Iterable[str]) -> dict[str, str]:
     """
     Return the topics by our names, of ``from:=to`` as ROS writes it: ours first.
 
-    :raises ValueError: naming one that is malformed, or whose ``from`` is none of our names.
+    :raises ValueError: naming one that is malformed, or whose ``from`` is not one of our names.
     """
     found: dict[str, str] = {}
     for remap in remaps:
@@ -131,7 +131,7 @@ def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> st
 
 
 def elsewhere(full: str, topics: Iterable[str], ours: Iterable[str]) -> list[str]:
-    """Return the topics of the same name in another namespace, which are none of ours."""
+    """Return the topics of the same name in other namespaces."""
     last = full.rsplit('/', 1)[-1]
     return sorted(name for name in set(topics) - set(ours) if name.rsplit('/', 1)[-1] == last)
 

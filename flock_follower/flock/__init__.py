@@ -13,8 +13,8 @@
 # limitations under the License.
 
 """
-More than one follower: their neighbour graph, and what they tell each other.
+Several followers: their neighbour graph and their messages.
 
-Every vehicle's odometry has a frame of its own; where the frames lie to each other is found from
-whom several vehicles saw at one time, or was where it says it was. Nothing here reads a clock.
+Every vehicle's odometry has its own frame. The transform between two frames is estimated from
+vehicles that both saw at one time, or that report their own position. Nothing here reads a clock.
 """

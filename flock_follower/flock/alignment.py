@@ -16,16 +16,16 @@
 Alignment of the odometry frames of other vehicles with the own frame, in one Kalman filter.
 
 All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
-state of each frame is the yaw, which turns its coordinates to the own ones, and the place in the
-own frame of an anchor in it. The anchor moves with its vehicle, about which the drift of its
-odometry turns the frame: yaw and place are then nearly independent, and the lever is short. The
-drift of the own odometry moves all frames at once, as their joint covariance knows: so a frame
-may be related to another instead of the own one, and nothing counts twice.
+state of each frame is the yaw, which turns its coordinates to the own ones, and the place of an
+anchor point in the own frame. The anchor moves with the sending vehicle, because the drift of its
+odometry turns the frame about the vehicle. So yaw and place are nearly independent, and the lever
+is short. The drift of the own odometry moves all frames together; their joint covariance includes
+that. So two other frames can be related to each other without counting information twice.
 
 The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
 best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
 so that no first guess is needed; attitudes of a vehicle known in both frames add to the same sum.
-The length of that sum is the information about the yaw: zero if all points are at one place.
+The length of this sum of vectors is the information about the yaw; zero if all points coincide.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _SIZE = 4
 
 class FirstFit(NamedTuple):
     """
-    First estimate of a frame in another one: see ``first_fit``.
+    Initial estimate of the transform between two frames: see ``first_fit``.
 
     ``yaw``, rad, turns its coordinates to the other's; ``anchor`` (3,), m, in it is at ``place``
     (3,), m, in the other; ``covariance`` (4, 4) is of yaw and place.
@@ -97,9 +97,9 @@ class Frame:
     rotation: Array
     """(3, 3), the same."""
     place: Array
-    """Of its anchor in the own frame (3,), m."""
+    """Place of the anchor in the own frame (3,), m."""
     anchor: Array
-    """In the frame itself (3,), m."""
+    """Anchor in the frame itself (3,), m."""
 
     def lever(self, position: Array) -> Array:
         """Return the vector (3,), m, in the own frame from the anchor to a position."""
@@ -262,7 +262,7 @@ class FrameAlignment:
 
 
 def _lever_matrix(lever: Array) -> Array:
-    """Return the Jacobian (3, 4) of a point at a lever (3,) by the errors of yaw and place."""
+    """Return the Jacobian (3, 4) of a point's position at a lever (3,), m, to yaw and place."""
     H = np.zeros((3, _SIZE))
     H[:, 0], H[:, 1:] = sideways(lever), np.eye(3)
     return H
@@ -271,11 +271,11 @@ def _lever_matrix(lever: Array) -> Array:
 #: Pairs kept, and for how long, ns: drift makes older ones worthless.
 MOST, LONGEST = 100, 20 * NANOSECONDS
 FEWEST = 5
-#: Errors of sightings last: the variances of a fit that takes them for independent, times this.
+#: Errors of sightings are correlated in time: factor on the variances of a fit.
 WARINESS = 4.0
 #: A yaw less certain than this, rad, is no start for a linear filter.
 START_YAW = 0.35
-#: chi^2 of 3 beyond which a pair is left out; all are where it is not that of most.
+#: Pairs with a larger chi^2 (3 degrees of freedom) are excluded; share of the pairs that must fit.
 OUTLIER, AGREEING = 25.0, 0.7
 
 
@@ -289,7 +289,7 @@ class PairedFrames:
     def __init__(self) -> None:
         self._pairs: deque[Pair] = deque(maxlen=MOST)
         self.yaw_std = math.pi
-        """Of the yaw between them, rad, at the last fit."""
+        """Standard deviation of the yaw between the frames, rad, at the last fit."""
 
     def add(self, one: TrackPoint, other: TrackPoint) -> None:
         """Add the track points of one vehicle in both frames, at one stamp."""

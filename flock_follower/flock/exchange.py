@@ -41,6 +41,7 @@ from flock_follower.flock.peers import (
     FUTURE,
     is_covariance,
     leapt,
+    MESSAGE_AGE_MAX,
     position_covariance,
     POSITION_STD_MAX,
     refusal,
@@ -53,7 +54,6 @@ from flock_follower.flock.peers import (
     Track,
     track_point,
     TrackPoint,
-    WORD_AGE_MAX,
     WRONG,
     YAW_STD_MAX,
 )
@@ -70,7 +70,7 @@ FORGOTTEN = 30 * NANOSECONDS
 #: Vehicles that one vehicle may see, or report.
 SEEN_MAX = 40
 #: A state that a vehicle sent of itself is replaced only by one with this share of its variance.
-OWN_WORD = 0.5
+OWN_STATE_SHARE = 0.5
 #: Own messages that may come back, and events that wait to be read.
 REMEMBERED, EVENTS = 500, 500
 #: One vehicle relates two frames once in this time, ns: errors of sightings last.
@@ -84,7 +84,7 @@ class Sharing:
     :param name: of this vehicle, unique in the flock.
     :raises ValueError: see ``checked_name``.
 
-    Refused inputs are reported by :meth:`told`, as (reason, detail).
+    Refused inputs are reported by :meth:`new_events`, as (reason, detail).
     """
 
     def __init__(self, name: str) -> None:
@@ -147,15 +147,15 @@ class Sharing:
         self._relate(self.name, name, track_point(state, False))
         return None
 
-    def take_word(self, state: OdometryState, received: int) -> None:
+    def take_message(self, state: OdometryState, received: int) -> None:
         """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
         name = sender_of(state.frame)
         if not name:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
-                                f'NAME{FRAME}, NAME being the vehicle that tells')
+                                f'NAME{FRAME}, where NAME is the sending vehicle')
         if name == self.name:
             if _key(state) not in self._echoes:  # else an own message that came back
-                self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
+                self._refuse('somebody uses my name', f'{name} sends {state.child[:70]!r}')
             return None
         sender = self.senders.get(name)
         if refused := refusal(state, received):
@@ -175,9 +175,9 @@ class Sharing:
         """Take a valid message of a sender."""
         of_itself, before = state.child == sender.name, sender.states.get(state.child)
         if before is not None and state.stamp <= before.stamp:
-            return self._refuse('word out of order', f'{sender.name} tells of {state.child}')
+            return self._refuse('word out of order', f'{sender.name} sends {state.child}')
         if before is None and len(sender.states) >= SEEN_MAX:
-            return self._refuse('too many vehicles', f'{sender.name} tells of {state.child}')
+            return self._refuse('too many vehicles', f'{sender.name} sends {state.child}')
         leap = '' if before is None else leapt(before, state)
         if of_itself:
             if leap:
@@ -309,7 +309,7 @@ class Sharing:
 
     # Out.
 
-    def words(self, now: int) -> list[OdometryState]:
+    def messages(self, now: int) -> list[OdometryState]:
         """Return the messages to send: the own state and sightings, each once, at most 10 Hz."""
         own, name = self._own, self.name
         if own is None or now - own.stamp > STALE or (
@@ -319,27 +319,28 @@ class Sharing:
         if own.stamp - now > STALE:
             self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
             return []
-        words = [state._replace(frame=name + FRAME)
+        messages = [state._replace(frame=name + FRAME)
                  for state in (own._replace(child=name), *self._seen.values())
                  if abs(now - state.stamp) <= STALE and state.stamp != self._sent.get(state.child)]
-        for word in words:
-            self._sent[word.child] = word.stamp
-            self._echoes.append(_key(word))
-        return words
+        for message in messages:
+            self._sent[message.child] = message.stamp
+            self._echoes.append(_key(message))
+        return messages
 
     def neighbors(self, now: int) -> list[OdometryState]:
         """
         Return the received vehicles that are not seen, in the own frame, one state per vehicle.
 
-        Each has the stamp of its state; the covariances are those of its prediction to ``now``.
-        Of several states of one vehicle the most certain one is used: they may share errors.
+        Each has the stamp of its state; the covariances are those of its prediction to ``now``. If
+        several states of one vehicle are known, the most certain one is used: their errors may be
+        correlated.
         """
         for sender in list(self.senders.values()):
             if now - sender.received > FORGOTTEN:
                 self._forget_frame(sender.name)
                 del self.senders[sender.name]
         own = self._own
-        if own is None or now - own.stamp > to_nanoseconds(WORD_AGE_MAX):
+        if own is None or now - own.stamp > to_nanoseconds(MESSAGE_AGE_MAX):
             return []
         self.frames.drift(now, own.position)
         surest: dict[str, tuple[float, Sender]] = {}
@@ -349,7 +350,7 @@ class Sharing:
             for state in sender.states.values():
                 age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(state.child)
                 if (state.child == self.name or state.child in sender.doubted
-                        or age > WORD_AGE_MAX or (seen is not None and (
+                        or age > MESSAGE_AGE_MAX or (seen is not None and (
                             now - seen.stamp <= to_nanoseconds(SEEN_TIMEOUT)))):
                     continue
                 of_itself = state.child == sender.name
@@ -360,13 +361,13 @@ class Sharing:
                                  f'{state.child} by {sender.name}: to {math.sqrt(doubt):.2f} m')
                     continue
                 doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
-                    OWN_WORD if of_itself else 1.0)
+                    OWN_STATE_SHARE if of_itself else 1.0)
                 if state.child not in surest or doubt < surest[state.child][0]:
                     surest[state.child] = doubt, sender
         return [aged(in_own_frame(sender.states[name], sender.name, own.frame, self.frames), now)
                 for name, (_, sender) in surest.items()]
 
-    def told(self) -> list[tuple[str, str]]:
+    def new_events(self) -> list[tuple[str, str]]:
         """Return the refusals since the last call."""
         events, self._events = self._events, []
         return events
@@ -383,17 +384,17 @@ class Sharing:
             return 'no own odometry'
         if self._own.stamp - now > STALE:
             return OWN_FUTURE
-        talking = [s for s in self.status(now) if s.silent <= WORD_AGE_MAX]
-        if not talking:
-            return 'nobody else talks'
-        return '' if any(not s.why for s in talking) else '; '.join(
-            f'not aligned with {s.name}: {s.why}' for s in talking)
+        active = [s for s in self.status(now) if s.silent <= MESSAGE_AGE_MAX]
+        if not active:
+            return 'no other sender'
+        return '' if any(not s.why for s in active) else '; '.join(
+            f'not aligned with {s.name}: {s.why}' for s in active)
 
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
             self._events.append((reason, detail))
 
 
-def _key(word: OdometryState) -> tuple[int, str, bytes]:
+def _key(message: OdometryState) -> tuple[int, str, bytes]:
     """Return what identifies a message."""
-    return word.stamp, word.child, word.position.tobytes()
+    return message.stamp, message.child, message.position.tobytes()

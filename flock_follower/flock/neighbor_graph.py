@@ -16,11 +16,11 @@
 Neighbor graph of one vehicle: which neighbors share an edge with it, and the law on the edges.
 
 An edge joins two vehicles if no third one is nearer to both than they are to each other: the
-relative neighborhood graph (Toussaint, Pattern Recognition 12, 1980). It contains the minimum
-spanning tree, so it is connected. Both ends compute the same edge if they know the same
-positions. It has few edges, each about as long as the spacing of the flock. An edge is removed
-only if a third vehicle is nearer to both ends by the factor HELD: every graph in between is
-connected as well.
+relative neighborhood graph (Toussaint, Pattern Recognition 12, 1980). This graph contains the
+minimum spanning tree, so it is connected. Both ends compute the same edge if they know the same
+positions. The graph has few edges, each about as long as the spacing of the flock. An edge is
+removed only if a third vehicle is nearer to both ends by the factor HELD: every graph in between
+is connected as well.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     return joined
 
 
-def attended(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
+def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
              params: FlockingParams, most: float) -> Array:
     """
     Return the acceleration (n,), m/s^2, of one agent of a flock.

@@ -44,7 +44,7 @@ NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
 
 POSITION_STD_MAX = 0.5  # m: a frame or a position known worse is not used; as in the planner
 YAW_STD_MAX = 0.1  # rad: likewise the yaw of a frame
-WORD_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
+MESSAGE_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
 CLOCK_TOLERANCE = 0.02  # s by which a message may be ahead of the own clock
 SEEN_TIMEOUT = 0.5  # s after an own sighting in which received states of that vehicle are not used
 POSITION_DRIFT = 0.025  # m/sqrt(s): random walk of the odometry of each vehicle
@@ -184,7 +184,7 @@ FUTURE = 'word from the future'
 
 
 def sender_of(frame: str) -> str:
-    """Return the vehicle whose odometry frame it is, '' if it is none."""
+    """Return the vehicle of an odometry frame, '' if the frame is not ``NAME/odom``."""
     name = frame.removesuffix(FRAME)
     return name if name != frame and NAME.fullmatch(name) else ''
 
@@ -217,19 +217,20 @@ def refusal(state: OdometryState, received: int) -> Refusal | None:
     if age < -CLOCK_TOLERANCE:
         return FUTURE, (
             f'{sender}: by {-age:.3f} s: its clock is ahead by that at least')
-    if age > WORD_AGE_MAX:
+    if age > MESSAGE_AGE_MAX:
         return 'word too old', (f'{sender}: {age:.2f} s: its clock is behind, or the way is slow')
     known = state.child == sender or is_covariance(state.pose_covariance[:3, :3])
-    return None if known else ('word without a covariance', f'{sender} tells of {state.child}')
+    return None if known else ('word without a covariance', f'{sender} sends {state.child}')
 
 
-#: An odometry that is further from where it led, m or rad, has leapt ...
+#: Odometry that is further from its prediction than this, m or rad, has jumped ...
 LEAP, TURN = 0.25, 0.4
-#: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, nothing can be told.
+#: ... plus the motion of these, m/s^2 and rad/s, since its last message. After LONGEST, s, no
+#: prediction is possible.
 PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
-#: So many leaps in this time, ns, are too many; for as long the sender is ignored.
+#: After this many jumps within BAN, ns, the sender is ignored for BAN.
 LEAPS, BAN = 3, 5 * NANOSECONDS
-#: So many states of itself within this time, ns, come from two: one sends at 10 Hz.
+#: This many own states within this time, ns, come from two senders: one sends at 10 Hz.
 OFTEN, TOO_SHORT = 20, 1_400_000_000
 #: Relations refused in a row: from DOUBTED on nothing is taken from the sender, from WRONG on its
 #: frame is aligned anew.
@@ -274,7 +275,7 @@ class Sender:
     name: str
     states: dict[str, OdometryState] = field(default_factory=dict)
     ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
-    """Of its last messages on reception, s."""
+    """Ages of its last messages on reception, s."""
     doubted: set[str] = field(default_factory=set)
     """Vehicles whose newest states do not fit the alignment: the next ones will decide."""
     received: int = 0
@@ -304,7 +305,7 @@ class Sender:
         self._sent.append(stamp)
         if len(self._sent) == OFTEN and stamp - self._sent[0] < TOO_SHORT:
             rate = (OFTEN - 1) * NANOSECONDS / max(stamp - self._sent[0], 1)
-            self.ban(received, f'talks at {rate:.0f} Hz, one does at 10 Hz')
+            self.ban(received, f'sends at {rate:.0f} Hz instead of 10 Hz')
             self._sent.clear()
 
     def ban(self, received: int, why: str) -> None:
@@ -321,8 +322,8 @@ def aged(state: OdometryState, now: int) -> OdometryState:
     """
     Return a state with the covariances of its prediction to a time, ns.
 
-    Its user predicts it with its velocity, and does not know the vehicle's acceleration since. The
-    stamp stays that of the state.
+    The receiver predicts the state with its velocity, without the vehicle's later acceleration.
+    The stamp stays that of the state.
     """
     age = max((now - state.stamp) / NANOSECONDS, 0.0)
     pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()

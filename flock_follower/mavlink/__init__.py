@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Talks to the autopilot, and decides what is sent to it: link, dialects, requests, setpoint gate.
+MAVLink connection to the autopilot: link, dialects, requests, setpoint gate.
 
-NED exists in here only. The planner is imported for its limits: the gate applies them once more.
+NED exists only here. The planner is imported for its limits: the gate applies them again.
 """

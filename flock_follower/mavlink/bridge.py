@@ -53,10 +53,10 @@ from flock_follower.messages import OdometryState
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
 REST_SPEED: Final[float] = 0.1
 STOP_TIMEOUT: Final[float] = 1.0
-#: What the bridge does, falling silent, where it has no velocity to believe. Silence alone leaves
-#: ArduPilot in GUIDED, and PX4's failsafe first holds for 4 s on the estimate that is lost.
+#: Action if the bridge stops its stream without a valid velocity. Silence alone leaves ArduPilot
+#: in GUIDED, and PX4's failsafe first holds for 4 s on the invalid estimate.
 BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
-#: Whether setpoints offset the wind: 'auto' where the autopilot does not do so itself.
+#: Whether setpoints offset the wind; 'auto': if the autopilot does not.
 WIND_COMPENSATIONS: Final[tuple[str, ...]] = ('auto', 'always', 'never')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 
@@ -75,7 +75,7 @@ class Bridge:
     """
     Turns commands and odometry into a stream of setpoints over a link.
 
-    :param forwarder: where given, what it takes is sent as ODOMETRY.
+    :param forwarder: if given, its odometry is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     :param recommendations: these three are those of ``Housekeeping``.
@@ -98,7 +98,7 @@ class Bridge:
         self.texts = StatusTexts()
         self.forwarder = forwarder
         self.blind_landing: Request | None = None
-        """The landing that was asked for because no velocity could be believed, if any was."""
+        """The landing requested because no velocity was valid, if any."""
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
@@ -124,11 +124,11 @@ class Bridge:
         return self.telemetry.status if self.alive(now) else None
 
     def alive(self, now: float) -> bool:
-        """Return whether the autopilot is heard."""
+        """Return whether the autopilot is connected."""
         return self.telemetry.alive(now, self.gate.limits.link_timeout)
 
     def state(self, now: float) -> str:
-        """Return what ``mavlink_bridge/state`` says at ``now``, s: a word, and the reason."""
+        """Return the text of ``mavlink_bridge/state`` at ``now``, s: the state and its reason."""
         if self.telemetry.dialect is None:
             return f'{NO_AUTOPILOT}: no HEARTBEAT yet'
         if not self.alive(now):
@@ -163,7 +163,7 @@ class Bridge:
         return self.forwarder.take(sample._replace(velocity=velocity), now)
 
     def distrusted(self, now: float) -> str:
-        """Return why the autopilot's own velocity is not believed, or ''."""
+        """Return why the autopilot's own velocity is invalid, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
         return estimator_health.distrusted(
             self.telemetry.estimator, self.telemetry.gps, forwarded, now)
@@ -174,7 +174,7 @@ class Bridge:
         return '' if obstacle is None else obstacle.reason
 
     def unready(self, now: float) -> str | None:
-        """Return what it reports against the service ``arm``, '' for nothing; None: unknown."""
+        """Return the reasons against the service ``arm``, '' without any; None: unknown."""
         status, dialect = self.status(now), self.telemetry.dialect
         if status is None or dialect is None or status.armed or (
                 not self.housekeeping.has_reasons(now)):
@@ -232,7 +232,7 @@ class Bridge:
             self.housekeeping.take(message, now)
 
     def cycle(self, now: float) -> Cycle:
-        """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
+        """Send the messages due at ``now``: a setpoint, HEARTBEAT, commands and requests."""
         status = self.telemetry.status
         if self.telemetry.dialect is not None:
             self.gate.compensates_wind = self._wind_compensation == 'always' or (

@@ -60,7 +60,7 @@ class Vehicle(NamedTuple):
     altitude: float | None = None
     """m above the origin of its local frame."""
     shown_time: float = math.inf
-    """When it last showed what the request is about, by HEARTBEAT or CURRENT_MODE, s."""
+    """When HEARTBEAT or CURRENT_MODE last showed the requested state, s."""
     airborne: bool = True
     """Whether it flies, as far as it reports."""
 
@@ -74,24 +74,24 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What is requested, by which command, and how the vehicle shows that it is reached."""
+    """A request: its command, and how the vehicle shows that it is fulfilled."""
 
     name: str
     command: int
     params: Callable[[Dialect], tuple[float, ...]]
     reached: Callable[[Vehicle], bool]
     modes: Callable[[Dialect], tuple[str, ...]] | None = None
-    """The modes that it leads through; None: any. In another mode the pilot has taken over."""
+    """The modes that it leads through; None: any. In any other mode the pilot has taken over."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
     insists: bool = False
     """Whether it is requested even if the vehicle already shows it."""
     timeout: float = CONFIRM_TIMEOUT
-    """How long to wait for the vehicle to show it, s."""
+    """Time to wait for the requested state, s."""
     before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
     """What has to be reached first, by the state of the vehicle when the request begins."""
     instead: Callable[[Dialect], Goal | None] = lambda dialect: None
-    """What is requested if the autopilot refuses it."""
+    """The request that replaces it if the autopilot refuses it."""
 
 
 def _mode_goal(name: str, mode: Callable[[Dialect], str], **options: Any) -> Goal:
@@ -124,9 +124,9 @@ def arm(value: bool, streaming: bool = False) -> Goal:
     """
     Return the goal of arming or disarming; disarming in the air is refused by autopilots.
 
-    After a landing ArduPilot stays in LAND and PX4 returns to OFFBOARD, in which they do not arm
-    (PX4 does while ``streaming`` setpoints), or to AUTO.TAKEOFF, in which PX4 climbs as soon as it
-    is armed: another mode first.
+    After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
+    does not arm in LAND. PX4 arms in OFFBOARD only while ``streaming`` setpoints, and climbs at
+    once if armed in AUTO.TAKEOFF. So arming requests another mode first.
     """
     def armable(vehicle: Vehicle) -> Goal | None:
         mode, dialect = vehicle.status.mode, vehicle.dialect
@@ -163,7 +163,7 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
             replace(OFFBOARD) if vehicle.dialect.setpoints_end_takeoff else None))
 
 
-def result_words(result: int) -> str:
+def result_text(result: int) -> str:
     """Return a MAV_RESULT in words: 'temporarily rejected'."""
     entry = mavlink.enums['MAV_RESULT'].get(result)
     return entry.name.removeprefix('MAV_RESULT_').lower().replace('_', ' ') if entry else (
@@ -329,18 +329,18 @@ class Request:
             mode = goal.modes(vehicle.dialect)[0] if goal.modes else vehicle.status.mode
         reasons = texts.why(self._since, mode)
         self._advice = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
-        result = 'no result' if self._result is None else result_words(self._result)
+        result = 'no result' if self._result is None else result_text(self._result)
         return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         name = self.current.name
         if self._result is None:
-            told = f'{name}: no answer to {self._attempts} commands' + (
+            problem = f'{name}: no answer to {self._attempts} commands' + (
                 ', and no HEARTBEAT' if vehicle is None else '')
         else:
-            told = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
+            problem = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
                 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
-        return ': '.join(filter(None, (told, '; '.join(texts.since(self._since)))))
+        return ': '.join(filter(None, (problem, '; '.join(texts.since(self._since)))))
 
     def _finish(self, success: bool, message: str) -> None:
         abandoned = self.current is LAND and self.goal is not LAND

@@ -81,9 +81,9 @@ class Dialect:
     setpoints_end_takeoff: bool
     """Whether a setpoint during a take-off ends it, and one on the ground has no effect."""
     stream_before_offboard: float
-    """Time for which setpoints must have been sent before it accepts offboard mode, s."""
+    """Time for which setpoints must be sent before the autopilot accepts offboard mode, s."""
     compensates_wind: bool
-    """Whether it controls the acceleration in a closed loop, so that wind does not move it."""
+    """Whether the autopilot controls accelerations in a closed loop, which rejects wind."""
     bytewise_parameters: bool
     """Whether PARAM_VALUE carries integers as their bytes, else as a float of their value."""
     odometry_frame: int
@@ -176,7 +176,7 @@ PX4: Final[Dialect] = Dialect(
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, mode_rate=50.0, least_mode_rate=2.0,
     reports_checks=True,
-    no_reason='PX4 tells the cause only to a ground station: look there, or set announce_as_gcs')
+    no_reason='PX4 sends the cause only to a ground station: look there, or set announce_as_gcs')
 #: ArduCopter; its behaviour was measured on 4.7.
 ARDUPILOT: Final[Dialect] = Dialect(
     name='ardupilot', title='ArduPilot', firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,

@@ -48,13 +48,14 @@ class GateLimits(Checked):
     """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
 
     a_max: float = parameter(
-        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest acceleration, of the vector', live=True)
+        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest magnitude of the acceleration', live=True)
     v_max: float = parameter(
-        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed, of the vector', live=True)
+        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed', live=True)
     planner_timeout: float = parameter(
-        0.2, Range(0.15, 1.0, 's'), 'oldest command obeyed; the planner sends one each 0.1 s',
+        0.2, Range(0.15, 1.0, 's'), 'largest age of a command; the planner sends one every 0.1 s',
         live=False)
-    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'oldest velocity used', live=True)
+    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'largest age of a '
+                                                                'velocity', live=True)
     link_timeout: float = parameter(
         1.0, Range(0.2, 5.0, 's'), 'silence of the autopilot before braking', live=True)
     blind_timeout: float = parameter(
@@ -71,21 +72,21 @@ class GateLimits(Checked):
         'Time constant of braking, s; longer where the velocity is late.')
     yaw_disagreement: float = parameter(
         0.35, Range(0.01, 3.2, 'rad'),
-        'difference between the yaws of odom and of the autopilot above which it brakes, and '
+        'difference between the yaws of odom and autopilot above which the bridge brakes, and '
         'refuses offboard', live=True)
     velocity_disagreement: float = parameter(
         0.0, Range(0.0, 100.0, 'm/s'),
-        'difference between their velocities above which it believes neither, where odom is the '
-        'velocity source; 0: half of v_max, and 0.4 at least', live=True)
+        'difference between the velocities of odom and autopilot above which neither is used, if '
+        'odom is the velocity source; 0: half of v_max, and 0.4 at least', live=True)
     height_min: float = parameter(
         0.5, Range(0.3, 100.0, 'm'),
-        'least height above the place of arming that setpoints fly to, by barometer or '
+        'least height of setpoints above the place of arming, by barometer or '
         'rangefinder', live=False)
     height_max: float = parameter(
         10.0, Range(0.5, 1000.0, 'm'), 'greatest height above the place of arming', live=False)
     radius_max: float = parameter(
         50.0, Range(1.0, 10000.0, 'm'),
-        'greatest horizontal distance from where it became ACTIVE', live=False)
+        'greatest horizontal distance from the place where the bridge became ACTIVE', live=False)
     relative_flight: bool = parameter(
         False, None,
         'follow the marker without odometry while that is lost or contradicted: without a bound '
@@ -123,7 +124,7 @@ class Location(NamedTuple):
     """Where the vehicle is in its envelope."""
 
     height: float | None = None
-    """m; None where it is not known: then nothing bounds it."""
+    """m; None if it is not known: then nothing bounds it."""
     climb_rate: float = 0.0
     """m/s, by the source of the height."""
     offset: Array | None = None
@@ -137,8 +138,8 @@ def approach_speed(distance: float, deceleration: float) -> float:
     """
     Return the largest speed, m/s, towards a bound from which the vehicle still stops before it.
 
-    It flies on for REACTION_TIME and then brakes; beyond the bound the speed is negative: it
-    returns.
+    The vehicle flies on for REACTION_TIME and then brakes. Beyond the bound the speed is
+    negative: the vehicle returns.
 
     :param distance: to the bound, m; negative beyond it.
     :param deceleration: m/s^2.
@@ -242,7 +243,7 @@ class HeightEstimator:
 
     def __init__(self) -> None:
         self.steps = 0
-        """How often the sensor has jumped, and the reference with it."""
+        """Number of jumps of the sensor, and so of the reference."""
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None
@@ -265,7 +266,7 @@ class HeightEstimator:
         if not elapsed > 0.0:
             return 'not newer'
         if elapsed > TIMEOUT:
-            # A sensor that comes back is believed, with the reference as it was.
+            # A sensor that returns is used again, with the same reference.
             self._altitude, self._velocity_error = altitude, 0.0
             self._differences.clear()
         else:
@@ -276,7 +277,7 @@ class HeightEstimator:
     def _follow(self, altitude: float, climb_rate: float | None, elapsed: float,
                 now: float) -> None:
         if (climb_rate is None) != (self._reported is None):
-            # The rate stays: only what it is made of changes.
+            # The rate stays; only its components change.
             self._velocity_error = self.climb_rate - (climb_rate or 0.0)
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
@@ -340,7 +341,7 @@ class HeightEstimator:
         return self._reference is not None and now - self._time > TIMEOUT
 
     def lost(self, now: float) -> str:
-        """Return why a height that was known cannot be believed at ``now``, or ''."""
+        """Return why a height that was known cannot be used at ``now``, or ''."""
         if self.missing(now):
             return 'height stale'
         jumped = self._reference is not None and now - self._stepped < STEP_PAUSE

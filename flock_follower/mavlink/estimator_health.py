@@ -28,7 +28,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-#: The estimate rests on what was forwarded for this long after the last ODOMETRY, s: PX4's limit.
+#: The estimate uses forwarded odometry for this long after the last ODOMETRY, s: PX4's limit.
 FORWARDED_TIMEOUT: Final[float] = 0.2
 #: What the estimator said of itself longer ago than this, s, is the past.
 STATUS_TIMEOUT: Final[float] = 3.0
@@ -62,7 +62,7 @@ class GpsFix(NamedTuple):
 
     fixed: bool
     lost: float
-    """When it ceased to, s; minus infinity where it never did."""
+    """When the fix was lost, s; minus infinity if never."""
     accuracy: float = 0.0
     """Standard deviation of its horizontal position, m; 0 if it is not reported."""
 
@@ -71,7 +71,7 @@ class EstimatorStatus(NamedTuple):
     """ESTIMATOR_STATUS of PX4, EKF_STATUS_REPORT of ArduPilot."""
 
     time: float
-    """When it came, s."""
+    """Time of reception, s."""
     has_velocity: bool
     """Whether the estimator has a horizontal velocity, and something it rests on."""
     missing: tuple[str, ...]
@@ -84,7 +84,7 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
     missing = tuple(name for flag, name in _NEEDED.items() if not flags & flag)
     if message.get_type() == 'ESTIMATOR_STATUS':
         return EstimatorStatus(now, flags & _PX4 == _PX4, missing)
-    # It integrates nothing at all where it takes its position for constant.
+    # It integrates nothing at all if it takes its position for constant.
     return EstimatorStatus(now, flags & _ARDUPILOT == _ARDUPILOT
                            and not flags & mavlink.EKF_CONST_POS_MODE, missing)
 
@@ -93,9 +93,9 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
     """
     Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks.
 
-    PX4 1.16 publishes no global position while its yaw is not aligned; no flag tells that. Seen
-    after a landing, for 150 s: a compass offset was learnt, which takes the alignment away, and
-    yaw from vision, in use already, does not give it back.
+    PX4 1.16 publishes no global position while its yaw is not aligned; no flag reports that. Seen
+    after a landing, for 150 s: PX4 learnt a compass offset, which ended the alignment, and yaw
+    from vision, already in use, did not restore it.
     """
     if status is None or now - status.time > STATUS_TIMEOUT:
         return refusal
@@ -105,7 +105,7 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
-    """Return what a GPS_RAW_INT says after what was said before."""
+    """Return the state of the GPS fix after a GPS_RAW_INT."""
     fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
     accuracy = message.h_acc * 1e-3 if fixed else 0.0
     if before is None:
@@ -116,11 +116,11 @@ def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
 def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
                now: float) -> str:
     """
-    Return why the autopilot's velocity is not to be believed at ``now``, s, or ''.
+    Return why the autopilot's velocity is invalid at ``now``, s, or ''.
 
-    :param status: the newest, None where it tells none.
-    :param gps: the newest, None where it tells none.
-    :param forwarded: how long ago ODOMETRY was last sent, s; infinite where none ever was.
+    :param status: the newest, None if it sends none.
+    :param gps: the newest, None if it sends none.
+    :param forwarded: how long ago ODOMETRY was last sent, s; infinite if never.
     """
     if FORWARDED_TIMEOUT < forwarded < math.inf:
         return 'rests on odometry that is lost'
@@ -132,14 +132,14 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
     return ''
 
 
-#: Rates and pauses are told of this long, s.
+#: Rates and pauses are reported over this time, s.
 RECENT: Final[float] = 5.0
 #: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
 WINDOW: Final[float] = 1.0
 FEWEST: Final[int] = 5
 #: So many of a kind are remembered: RECENT at 400 Hz.
 MOST: Final[int] = 2000
-#: A message comes too seldom below this share of what was asked for; autopilots round intervals.
+#: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
 #: Time between two requests, s; the longest where asking does no good.
 SHORTEST_WAIT: Final[float] = 2.0
@@ -147,7 +147,7 @@ LONGEST_WAIT: Final[float] = 30.0
 
 
 class Arrivals:
-    """When the messages of one autopilot came, by MAVLink's message id; times in s."""
+    """Times of reception, s, of the messages of one autopilot, by message id."""
 
     def __init__(self) -> None:
         self._times: dict[int, deque[float]] = {}
@@ -176,7 +176,7 @@ class Arrivals:
         return sum(now - window < time for time in times)
 
     def rate(self, message_id: int, now: float) -> float:
-        """Return how often a message comes, Hz; 0 where the last is half of RECENT ago."""
+        """Return how often a message comes, Hz; 0 if the last is half of RECENT ago."""
         times = [time for time in self._times.get(message_id, deque()).copy()
                  if now - time < RECENT]
         if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
@@ -184,12 +184,12 @@ class Arrivals:
         return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
 
     def longest_pause(self, now: float) -> float:
-        """Return the longest time without any message that ended, or lasts, within RECENT, s."""
+        """Return the longest pause in all messages within the last RECENT, s."""
         ended = [pause for time, pause in self._pauses.copy() if now - time <= RECENT]
         return max([*ended, now - self._newest] if math.isfinite(self._newest) else [0.0])
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
-        """Return whether a message comes well below the rate that was asked for, Hz."""
+        """Return whether the rate of a message is well below the requested one, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
         return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window
@@ -197,7 +197,7 @@ class Arrivals:
 
 class AskAgain:
     """
-    When to ask again for messages that come too seldom: soon, but less and less often in vain.
+    Schedule of repeated requests for messages at too low a rate; the period grows without success.
 
     Another one on the same line may have set other rates (MAVProxy does, every 15 s): asking
     helps. A line that cannot carry more is only filled by asking.

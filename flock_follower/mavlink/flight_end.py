@@ -52,9 +52,9 @@ class CommandSources:
         """
         Take a command; return whether it shows that two publishers command.
 
-        Where the one before has fallen silent, the other has replaced it: that is one.
+        A publisher that replaces a silent one does not count as a second.
 
-        :param number: what its publisher counts, from 1; None where the middleware does not tell.
+        :param number: its sequence number, from 1; None if the middleware has none.
         :param time: when it came, s on a monotonic clock.
         """
         if number is None:
@@ -83,17 +83,17 @@ class EndParams(Checked):
 
     engage_timeout: float = parameter(
         60.0, Range(1.0, 3600.0, 's'),
-        'time without a first command after it became ACTIVE, before the hold mode of the '
-        'autopilot is requested', live=False)
+        'time from ACTIVE without a first command, after which the bridge requests the hold mode '
+        'of the autopilot', live=False)
     battery_low: float = parameter(
         0.2, Range(0.0, 1.0),
-        'share of the battery below which, for 5 s, battery_action follows, and offboard is '
-        'refused; 0: never', live=False)
+        'share of the charge below which, after 5 s, the bridge takes battery_action and refuses '
+        'offboard; 0: never', live=False)
     leader_lost_action: str = parameter(
         HOLD, ACTIONS,
-        'what follows 3 s after the last command: the hold mode of the autopilot, or after that a '
-        'landing', live=False)
-    battery_action: str = parameter(HOLD, ACTIONS, 'what follows on a low battery', live=False)
+        'action 3 s after the last command: the hold mode of the autopilot; land: also a landing '
+        'after that', live=False)
+    battery_action: str = parameter(HOLD, ACTIONS, 'action at a low battery', live=False)
 
 
 class FlightEnd:
@@ -149,11 +149,11 @@ class FlightEnd:
             return '', HOLD
         if command_time < active_since:
             waited, most = now - active_since, self.params.engage_timeout
-            told = f'no command within engage_timeout = {most:g} s'
+            reason = f'no command within engage_timeout = {most:g} s'
         else:
             waited, most = now - command_time, COMMAND_TIMEOUT
-            told = f'no command for {COMMAND_TIMEOUT:g} s'
-        return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
+            reason = f'no command for {COMMAND_TIMEOUT:g} s'
+        return (reason, self.params.leader_lost_action) if waited > most else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
              status: VehicleStatus, now: float) -> str:

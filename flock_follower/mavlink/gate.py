@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-The setpoint gate: whether a setpoint may be sent (``permission``), and which one.
+The setpoint gate decides whether a setpoint may be sent (``permission``), and which one.
 
-It stores the newest of each input with its time, and passes them to ``setpoint_rules.decide``.
+The gate stores the newest of each input with its time, and passes them to
+``setpoint_rules.decide``.
 Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a clock.
 """
 
@@ -100,7 +101,7 @@ class Gate:
         self.new_command = False
         """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
-        """When a command was accepted last, s."""
+        """Time of the last accepted command, s."""
         self.permission = Permission()
         self.active_since = math.inf
         """Since when it is ACTIVE, s; infinite while it is not."""
@@ -200,7 +201,7 @@ class Gate:
     def update_height(self, altitude: float, now: float) -> str:
         """Take an altitude, m, of the barometer; return '' or why it is refused."""
         known = self._known(now)
-        # Also of a source that is not believed: a constant error is found and taken out.
+        # Also from an invalid source: a constant error is estimated and removed.
         velocity = None if self.relative.reckoning else known.source_first[0].fresh_velocity(
             self.limits) or known.braking_velocity(self.limits)
         refused = self.heights.take(altitude, None if velocity is None else float(
@@ -215,7 +216,7 @@ class Gate:
         return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
     def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity of the autopilot is not believed, or ''."""
+        """Note, each cycle, why the velocity of the autopilot is invalid, or ''."""
         self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
 
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
@@ -231,7 +232,7 @@ class Gate:
             time, now)
 
     def yaw_difference(self, now: float) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
         return self._known(now).yaw_difference(self.limits)
 
     def contradiction(self, now: float) -> str:

@@ -60,7 +60,7 @@ class Sample(NamedTuple):
     way: int
     """There and back, ns."""
     time: int
-    """When it came, ns."""
+    """Time of reception, ns."""
 
 
 class TimeSync:
@@ -90,11 +90,11 @@ class TimeSync:
 
     def age(self, time_boot_ms: int, now: int) -> float:
         """
-        Return how old, s, a message received now and stamped at ``time_boot_ms`` is at most.
+        Return the largest possible age, s, of a message received now and stamped ``time_boot_ms``.
 
         An answer is written after its question, so the autopilot's clock is ahead of ours by at
         most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
-        to the autopilot, as control loops through it do. It is 0 if nothing is known: without a
+        to the autopilot, as control loops through it do. The age is 0 if unknown: without a
         stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
         ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
         that is behind that clock by any time is as old as it says.
@@ -117,52 +117,53 @@ class TimeSync:
 
     @property
     def best(self) -> Sample | None:
-        """Return the best of the recent answers, None where there was none."""
+        """Return the best of the recent answers, None without one."""
         return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
 
     def forget(self) -> None:
-        """Drop what is known: the autopilot's clock has started anew."""
+        """Drop all samples: the autopilot's clock has restarted."""
         self._samples.clear()
         self._asked.clear()
         self._unanswered_since = None
 
 
-#: All telemetry is asked for again after this, s, until the vehicle tells whether it flies.
+#: Telemetry is requested again after this, s, until the vehicle reports whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
-#: The messages whose rate is told.
+#: The messages whose rate is reported.
 ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
-#: Told below this share of what was asked for. None at all has other causes than the link.
+#: Rates below this share of the requested one are reported, except a rate of zero: its cause is
+#: not the link.
 FEW: Final[float] = 0.5
-#: Told where nothing comes for longer than this, s: as long as a velocity to brake on may be old.
+#: A longer pause in all messages, s, is reported: the largest age of a velocity for braking.
 PAUSE: Final[float] = 0.3
-#: Who answers no TIMESYNC for this long, s, does not hear us.
-UNHEARD: Final[float] = 5.0
-#: Whether it flies is asked for this long, s; some autopilots never tell.
+#: An autopilot that answers no TIMESYNC for this long, s, does not receive our messages.
+UNANSWERED_MAX: Final[float] = 5.0
+#: The landed state is requested for this long, s; some autopilots never send it.
 LANDED_TIMEOUT: Final[float] = 10.0
-#: An origin is told again after this, s, until the autopilot shows that it has one.
+#: An origin is sent again after this, s, until the autopilot reports one.
 ORIGIN_PERIOD: Final[float] = 5.0
-#: Latitude, longitude, deg, and height, m, of the origin that PX4 is told where none is given: the
-#: place at which PX4's simulators begin. It stands for any place. Zeros do not: ground stations
-#: read 0 N 0 E as no position, and the magnetic field that PX4 expects there is that of the sea
-#: off Africa, whose inclination and declination fit hardly anywhere else.
+#: Latitude, longitude, deg, and height, m, of the origin sent to PX4 if none is configured: the
+#: start of PX4's simulators. Zeros are no substitute: ground stations read 0 N 0 E as no position,
+#: and PX4 would expect the magnetic field off Africa, whose inclination and declination are wrong
+#: almost everywhere else.
 ANY_ORIGIN: Final[tuple[float, float, float]] = (47.397742, 8.545594, 0.0)
-#: A disarmed autopilot is asked this often, s, what keeps it from arming. Within so long, s, it
-#: has told.
+#: Period of requests for the reasons that prevent arming, s, while disarmed; and the time within
+#: which the autopilot answers, s.
 WHY_PERIOD: Final[float] = 30.0
 WHY_WAIT: Final[float] = 3.0
 
 
 class Housekeeping:
     """
-    Sends what is due besides setpoints, and takes the answers.
+    Sends HEARTBEAT, requests and origins, and takes the answers.
 
     :param recommendations: the parameters to compare, by the name of the dialect.
     :param estimate_rate: wanted rate of the autopilot's position and attitude, Hz.
-    :param origin: latitude, longitude, deg, and height, m, told to an estimator without an origin.
+    :param origin: latitude, longitude, deg, and height, m, sent to an estimator without an origin.
     :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
-        is told ``ANY_ORIGIN`` where ``origin`` is None.
+        receives ``ANY_ORIGIN`` if ``origin`` is None.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
@@ -171,7 +172,7 @@ class Housekeeping:
         self.timesync = TimeSync()
         self.parameters = ParameterCheck((), bytewise=False)
         self.alive_since = math.inf
-        """When the autopilot was first heard, s."""
+        """When the first message of the autopilot was received, s."""
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
@@ -196,7 +197,7 @@ class Housekeeping:
                 self._link.send(answer)
 
     def step(self, now: float, alive: bool) -> None:
-        """Send HEARTBEAT and questions that are due; ``alive`` is whether anyone hears them."""
+        """Send HEARTBEAT and due requests; ``alive``: whether the autopilot is connected."""
         if now - self._heartbeat_sent >= HEARTBEAT_PERIOD - 1e-3 and self._link.send_heartbeat():
             self._heartbeat_sent = now
         reboots = self._link.telemetry.reboots
@@ -222,7 +223,7 @@ class Housekeeping:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
     def request_reasons(self) -> None:
-        """Ask what keeps the autopilot from doing what it has just refused."""
+        """Request the autopilot's reasons for its last refusal."""
         dialect = self._link.telemetry.dialect
         if dialect is not None and dialect.reports_checks:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
@@ -250,22 +251,22 @@ class Housekeeping:
     def too_slow(self, now: float) -> str:
         """Return that the estimate comes too seldom, or the link stalls, or ''."""
         if now - self._watched_since < RECENT + STREAM_REQUEST_PERIOD:
-            return ''  # what was asked for has not had the time to come
-        told = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
+            return ''  # the requested messages cannot have come yet
+        problems = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
                 for name, (rate, wanted) in self.rates(now).items() if 0.0 < rate < FEW * wanted]
         pause = self._link.telemetry.arrivals.longest_pause(now)
         if pause > PAUSE:
-            told.append(f'nothing came from the autopilot for {pause:.2f} s '
+            problems.append(f'nothing came from the autopilot for {pause:.2f} s '
                         f'in the last {RECENT:g} s')
-        return '; '.join(told)
+        return '; '.join(problems)
 
     def unreceived(self, now: float) -> str:
-        """Return why the autopilot, which is heard, does not hear us, or ''."""
-        if self._link.signs or not self._link.autopilot_signs or (
-                self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
+        """Return why the autopilot does not receive our messages, or ''."""
+        if self._link.signs or not self._link.autopilot_signs or (  # USB needs no signature
+                self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
             return ''
-        return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
-                'not set, it will not hear us')
+        return ('the autopilot signs its messages and answers none of ours: '
+                'set signing_key_file')
 
     def _request_streams(self, now: float) -> None:
         telemetry = self._link.telemetry
@@ -277,10 +278,10 @@ class Housekeeping:
         watched = {message_id: wanted[message_id] for message_id in (
             *ESTIMATE.values(), dialect.estimator_status)} | {
                 dialect.mode_message: dialect.least_mode_rate}
-        untold = telemetry.flying(now) is None and (
+        unreported = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
-                untold and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
+                unreported and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
             self._link.request_streams(wanted)
             self._streams_requested = now
             for message_id in watched:

@@ -64,7 +64,7 @@ class Framer:
         self.codec = codec
         self._waiting = bytearray()
         self.looks = 0
-        """How many starts the last piece had, true and false: what it cost."""
+        """Number of message starts in the last data, true and false: the cost of parsing."""
 
     def feed(self, data: bytes, most: int = 10_000) -> tuple[list[Any], Counter[str]]:
         """
@@ -236,8 +236,8 @@ class Link:
     A link over a transport to the autopilot ``target_system``, ``target_component``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
-    :param autopilot: its firmware, see ``dialects.dialect_of``.
-    :param signing: where given, everything is signed and nothing unsigned is heard.
+    :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
+    :param signing: if given, every message is signed and unsigned ones are dropped.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     """
 
@@ -258,7 +258,7 @@ class Link:
         self.foreign = ''
         #: HEARTBEATs of other autopilots, by system id.
         self.other_autopilots: Counter[int] = Counter()
-        #: What was received and not used, by reason.
+        #: Number of messages that were received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
         self.peer_changes = 0
@@ -267,7 +267,7 @@ class Link:
         self.bytes_received = 0
         self.bytes_sent = 0
         self._signing = signing
-        #: Whether what is sent carries a signature.
+        #: Whether sent messages are signed.
         self.signs = signing is not None
         self._parsers: dict[Any, Framer] = {}
         self._sender = self._codec()
@@ -302,7 +302,7 @@ class Link:
         return messages
 
     def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
-        """Return the messages in a piece of data, and what it cost."""
+        """Return the messages in a piece of data, and the cost of parsing."""
         # A parser for each sender, so that garbage from one cannot cut into another's messages.
         if peer not in self._parsers:
             if len(self._parsers) >= _MOST_PEERS:
@@ -349,7 +349,7 @@ class Link:
         return True
 
     def send(self, message: Any) -> bool:
-        """Send a message; return whether it went out (False while nobody has been heard)."""
+        """Send a message; return whether it was sent (False until a message was received)."""
         if self.transport.peer is None:
             return False
         data = message.pack(self._sender)
@@ -380,20 +380,20 @@ class Link:
             self.target_system, self.target_component, name.encode('ascii'), -1))
 
     def silence(self) -> str:
-        """Return, for people, what has been heard instead of the autopilot."""
+        """Return a text that names the messages received instead of the autopilot's."""
         ignored = self.ignored
         if self.foreign:
-            return f'heard {self.foreign}, which autopilot = {self.autopilot!r} does not speak'
+            return f'received {self.foreign}, which autopilot = {self.autopilot!r} does not send'
         if self.other_autopilots:
             ids = ', '.join(map(str, sorted(self.other_autopilots)))
-            return f'heard system id {ids}, not target_system {self.target_system}'
+            return f'received system id {ids}, not target_system {self.target_system}'
         for reason, text in _UNUSABLE.items():
             if ignored[reason]:
                 return text
         if ignored['other system'] or ignored['other component']:
-            return (f'heard MAVLink, but no autopilot with system id {self.target_system} '
+            return (f'received MAVLink, but no autopilot with system id {self.target_system} '
                     f'and component {self.target_component}')
-        return 'what comes is not MAVLink' if ignored[UNDECODABLE] else 'nothing arrives'
+        return 'received bytes are not MAVLink' if ignored[UNDECODABLE] else 'nothing arrives'
 
     def close(self) -> None:
         """Release the port."""

@@ -48,7 +48,7 @@ LONGEST_GAP: Final[float] = 0.1
 OLDEST: Final[float] = 0.3
 #: An attitude further than this from the predicted one has jumped (a loop closure, a restart).
 ATTITUDE_JUMP: Final[float] = 0.2  # rad
-#: Standard deviations taken where a covariance is missing or is none.
+#: Standard deviations used if a covariance is missing or invalid.
 POSITION_STD: Final[float] = 0.1  # m
 ATTITUDE_STD: Final[float] = 0.05  # rad
 VELOCITY_STD: Final[float] = 0.1  # m/s
@@ -62,7 +62,7 @@ class ForwardedOdometry(NamedTuple):
     """One odometry in ENU and FLU."""
 
     time: float
-    """Of its stamp, s on our monotonic clock."""
+    """Time of the stamp, s on our monotonic clock."""
     position: Array
     """(3,), m, ENU."""
     quaternion: Array
@@ -180,7 +180,7 @@ def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: 
 
 
 def _valid(covariance: Array, deviations: list[float]) -> Array:
-    """Return the covariance, or a diagonal of the deviations where it is none."""
+    """Return the covariance, or a diagonal of the deviations if it is invalid."""
     known = np.all(np.abs(covariance) < SANE) and np.all(np.diag(covariance) > 0.0)
     # The comparison refuses NaN, too.
     return covariance if known else np.diag(np.square(deviations))

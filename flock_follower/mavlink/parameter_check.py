@@ -40,7 +40,7 @@ RETRY_PERIOD: Final[float] = 1.0
 ATTEMPTS: Final[int] = 3
 #: Questions under way at a time: slow links have other things to carry.
 AT_ONCE: Final[int] = 2
-#: Entries after this comment matter only where odometry is forwarded.
+#: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: How the comment of an entry begins of which any other value but 0 will do.
 ANY_BUT_ZERO: Final[str] = 'Any but 0'
@@ -71,7 +71,7 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     Return the entries of a ``.params`` or ``.parm`` file.
 
     :param forwarding: whether those that matter only with forwarded odometry are wanted too.
-    :raises ValueError: naming the first line that is none of an entry, a comment, or empty.
+    :raises ValueError: naming the first line that is neither an entry, a comment, nor empty.
     """
     found: list[Recommendation] = []
     comments: list[str] = []
@@ -170,7 +170,7 @@ class ParameterCheck:
             self._unanswered = [other for other in self._unanswered if other != name]
 
     def result(self) -> CheckResult | None:
-        """Return what was found, None until every parameter was answered or given up."""
+        """Return the differences, None until every parameter was answered or given up."""
         values, unanswered = self.values.copy(), self._unanswered.copy()
         if self._waiting or self._asked or not self._names:
             return None
@@ -198,10 +198,10 @@ class Rule(NamedTuple):
 
     name: str
     forbidden: Callable[[float], bool]
-    words: str
+    advice: str
     """What follows NAME = VALUE: why, and what to set."""
     forwarding: bool = False
-    """Whether it matters only where odometry is forwarded."""
+    """Whether it matters only if odometry is forwarded."""
 
 
 _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if the bridge died; '
@@ -240,7 +240,7 @@ def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
     values = parameters.values
-    return next((f'{rule.name} = {values[rule.name]:g}{rule.words} (or {_ANYWAY})'
+    return next((f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'
                  for rule in rules(dialect, forwarding)
                  if rule.name in values and rule.forbidden(values[rule.name])), '')
 
@@ -252,5 +252,5 @@ def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> st
     for name in names:
         parameters.again(name)
     return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
-            f'bridge, or not fuse what is forwarded ({_ANYWAY} flies all the same)'
+            f'bridge, or not fuse forwarded odometry ({_ANYWAY} flies all the same)'
             if names else '')

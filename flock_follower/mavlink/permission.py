@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Are we flying now? What the bridge may send, as one state machine.
+State machine of the permission to fly: which setpoints the bridge may send.
 
 Only the service ``mavlink_bridge/offboard`` gives permission. The permission ends with its flight.
 
@@ -27,8 +27,8 @@ GIVING_BACK  what brakes the vehicle             READY
 TAKEN_OVER   nothing                             TAKEN_OVER
 ===========  ==================================  ================================================
 
-Whatever the phase, NO_AUTOPILOT is announced while no autopilot is heard; the phase stays as it
-is, because the vehicle may still be flying our setpoints. ``docs/fly.md`` draws it.
+Whatever the phase, NO_AUTOPILOT is announced while no autopilot is connected; the phase does not
+change, because the vehicle may still fly our setpoints. ``docs/fly.md`` has a diagram.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground'
 FELL_SILENT: Final[str] = 'fell silent'
-#: After a takeover offboard is refused for this long, s: somebody else's call must not undo it.
+#: After a takeover offboard is refused for this long, s: another program must not undo it.
 TAKEOVER_TIME: Final[float] = 10.0
 TWO_COMMAND: Final[str] = 'two nodes command'
-#: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
-#: the pilot may have taken over unseen.
-LONGEST_UNHEARD: Final[float] = 5.0
+#: If two messages with the mode (HEARTBEAT, CURRENT_MODE) are further apart than this, s, the
+#: pilot may have taken over in between.
+LONGEST_SILENCE: Final[float] = 5.0
 
 
 class Phase(enum.Enum):
@@ -68,11 +68,11 @@ class Permission:
 
     phase: Phase = Phase.INACTIVE
     reason: str = NOT_REQUESTED
-    """Why it is not ACTIVE, for people; '' where it is."""
+    """Why it is not ACTIVE, as text; '' if it is."""
     since: float = math.inf
-    """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
-    heard: float = math.inf
-    """When the newest message came that has told the mode since then, s, if any."""
+    """When offboard was last requested, s; earlier HEARTBEATs are ignored."""
+    received: float = math.inf
+    """When the newest message with the mode was received since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
 
@@ -88,13 +88,13 @@ class Permission:
 
     def taken_over(self, now: float) -> str:
         """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
-        if self.phase is not Phase.TAKEN_OVER or now - self.heard >= TAKEOVER_TIME:
+        if self.phase is not Phase.TAKEN_OVER or now - self.received >= TAKEOVER_TIME:
             return ''
-        return (f'the pilot took over {max(now - self.heard, 0.0):.0f} s ago: refused for '
+        return (f'the pilot took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
 
     def announced(self) -> str:
-        """Return what ``mavlink_bridge/state`` says while the autopilot is heard."""
+        """Return the text of ``mavlink_bridge/state`` while the autopilot is connected."""
         return ': '.join(filter(None, [self.phase.value, self.reason]))
 
 
@@ -129,7 +129,7 @@ class SecondCommander:
 
 @dataclass(frozen=True)
 class Blinded:
-    """No velocity could be believed for too long: only silence lets the autopilot fail over."""
+    """No valid velocity for too long: only silence starts the autopilot's failsafe."""
 
     why: str
 
@@ -148,10 +148,10 @@ class Restarted:
 
 @dataclass(frozen=True)
 class Seen:
-    """What HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
+    """What HEARTBEAT or CURRENT_MODE, which came at the time ``received``, s, shows."""
 
     status: VehicleStatus
-    heard: float
+    received: float
     airborne: bool | None
     """Whether it reports that it flies: on the ground setpoints could start a take-off. None: it
     does not report, which permits nothing."""
@@ -191,13 +191,13 @@ def next_permission(now: Permission, event: Event) -> Permission:
 
 
 def _seen(now: Permission, seen: Seen) -> Permission:
-    if not now.streams or seen.heard <= now.since:
+    if not now.streams or seen.received <= now.since:
         return now
-    status, unreceived = seen.status, seen.heard - now.heard
-    now = replace(now, heard=seen.heard)
-    if now.obeyed and status.offboard and status.armed and unreceived > LONGEST_UNHEARD:
+    status, silence = seen.status, seen.received - now.received
+    now = replace(now, received=seen.received)
+    if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
         return replace(now, phase=Phase.GIVING_BACK,
-                       reason=f'no HEARTBEAT for {unreceived:.0f} s, the pilot may have taken '
+                       reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
                               'over')
     if now.phase is Phase.GIVING_BACK:
         if status.offboard and status.armed:
@@ -207,7 +207,7 @@ def _seen(now: Permission, seen: Seen) -> Permission:
         return Permission(reason=ON_GROUND if status.armed else 'disarmed')
     if not status.offboard:
         return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
-                          heard=seen.heard) if now.obeyed else now
+                          received=seen.received) if now.obeyed else now
     if now.phase is Phase.ACTIVE:
         return now if status.armed else Permission(reason='disarmed')
     if seen.airborne is None:

@@ -136,7 +136,7 @@ class Requests:
 
     def step(self, streaming_for: float, now: float) -> None:
         """
-        Send what is due for the pending request, and pass its failure to the permission.
+        Send the next command of the pending request, and pass its failure to the permission.
 
         :param streaming_for: how long setpoints have been going out without a gap, s.
         """
@@ -204,7 +204,7 @@ class Requests:
         if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
             return 'already in the air'
         if telemetry.altitude(now) is None:
-            return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
+            return 'no LOCAL_POSITION_NED: the height reached would be unknown'
         if reason := self._minimum_takeoff(telemetry.dialect, height):
             return reason
         reached = height + (self._gate.heights.height(now) or 0.0)

@@ -143,7 +143,7 @@ class DisturbanceObserver:
         Take what has happened since the last step, until ``now``, s.
 
         :param sent: acceleration (3,), m/s^2, that was flown; None: none of ours, which forgets.
-        :param velocity: measured (3,), m/s; None where none is known, which waits.
+        :param velocity: measured (3,), m/s; None without one, which waits.
         """
         elapsed, self._time = now - self._time, now
         if sent is None:
@@ -204,13 +204,13 @@ class Setpoint(NamedTuple):
     acceleration: Array
     """(3,), m/s^2."""
     yaw: float | None
-    """rad; None where none is known."""
+    """rad; None without one."""
     limited: str
     """What limited it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
 
 
 class Held(NamedTuple):
-    """What is kept while there is no command; None where it is not known."""
+    """Yaw and height to keep without a command; None if unknown."""
 
     yaw: float | None = None
     """rad."""
@@ -227,14 +227,14 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
            held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
-    Return the setpoint that may be sent now, and the reason where it is not the command.
+    Return the setpoint that may be sent now, and the reason if it is not the command.
 
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
     acceleration is finite, at most ``a_max`` long, never leads to a speed above ``v_max``, and
     does not point upwards on the ground.
 
     :param full: the limits at start, for braking and separation; ``limits`` may be lower.
-    :param known: the vehicle's motion, as far as it is known, and what of it may be believed.
+    :param known: the vehicle's motion, as far as it is known and valid.
     :param command: the newest command; it should have applied ``command_age`` seconds ago.
     :param link_age: how long the autopilot has been missing, s.
     :param armed: whether it is armed; before, setpoints are level.
@@ -243,7 +243,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param place: where it is in its envelope.
     :param unplaced: why a height that was known is not any more, or ''.
-    :param held: what to keep where there is no command.
+    :param held: yaw and height to keep without a command.
     :param relative: whether a command may rest on the marker alone.
     :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
     :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
@@ -261,25 +261,25 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         command, velocity = admitted
         if velocity is None:
             return _relative(full, command, against, place, offset)
-        lift = np.array([0.0, 0.0, _bounded(command.lift)])
-        away = _direction(command.away)
-        safe = _limited(limits if away is None else full,
-                        np.asarray(command.acceleration) - lift, against + lift, velocity, place,
-                        away, offset)
+        bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
+        axis = _direction(command.separation_axis)
+        safe = _limited(limits if axis is None else full,
+                        np.asarray(command.acceleration) - bias, against + bias, velocity, place,
+                        axis, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
-    believed = known.braking_velocity(limits)
-    if believed is None:
+    estimated = known.braking_velocity(limits)
+    if estimated is None:
         kind = NONE if known.blind(limits) and not relative.begins else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
-    wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin)
+    nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         climb = HEIGHT_FREQUENCY * (
             HEIGHT_FREQUENCY * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
-            wanted[2] = climb
+            nominal[2] = climb
             against = against + np.array([0.0, 0.0, _bounded(offset)])
-    safe = _limited(full, wanted, against, believed, place, None, offset)
+    safe = _limited(full, nominal, against, estimated, place, None, offset)
     return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
 
 
@@ -300,8 +300,8 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
         velocity = judge.fresh_velocity(limits)
         if velocity is None:
             never = math.isinf(judge.velocity_age)
-            told = f'velocity from {known.source}'
-            return None, f'no {told}' if never else f'{told} stale'
+            source = f'velocity from {known.source}'
+            return None, f'no {source}' if never else f'{source} stale'
         if disagreement := known.contradiction(limits):
             return None, disagreement
     elif without_odometry:
@@ -357,26 +357,26 @@ def _bounded(offset: float) -> float:
     return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
 
 
-def _direction(away: ArrayLike | None) -> Array | None:
+def _direction(axis: ArrayLike | None) -> Array | None:
     """Return a vector (3,) if its length is 1, else None."""
-    vector = None if away is None else finite_vector(away)
+    vector = None if axis is None else finite_vector(axis)
     unit = vector is not None and abs(math.hypot(*vector.tolist()) - 1.0) < 1e-6
     return vector if unit else None
 
 
-def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity,
-             place: Location, away: Array | None, offset: float) -> LimitedCommand:
+def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Velocity,
+             place: Location, axis: Array | None, offset: float) -> LimitedCommand:
     """
-    Return the acceleration within limits and envelope that is nearest to ``wanted + against``.
+    Return the acceleration within limits and envelope that is nearest to ``nominal + against``.
 
-    ``against`` offsets a disturbance. The limits hold for ``wanted``, which is how the vehicle
+    ``against`` offsets a disturbance. The limits hold for ``nominal``, which is how the vehicle
     accelerates if the disturbance is as estimated, and for the sum, if there is none.
     """
     horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
-    safe = limit_command(wanted, v, limits.a_max, limits.v_max, horizon, away)
+    safe = limit_command(nominal, v, limits.a_max, limits.v_max, horizon, axis)
     if against.any():
         total = limit_command(safe.acceleration + against, v, limits.a_max, limits.v_max, horizon,
-                              away)
+                              axis)
         safe = total._replace(reason=safe.reason or total.reason)
     a = safe.acceleration
     least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
@@ -387,8 +387,8 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
     if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST_OWN or not (
             math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
         return safe
-    sides = [] if away is None else [
-        (complex(float(away[0]), float(away[1])), float(away[:2] @ a[:2]))]
+    sides = [] if axis is None else [
+        (complex(float(axis[0]), float(axis[1])), float(axis[:2] @ a[:2]))]
     point = limit_level(a, min(max(float(a[2]), least), most), sides + bounds, v,
                         limits.a_max, limits.v_max, horizon)
     return LimitedCommand(point, ', '.join(filter(None, [safe.reason, ENVELOPE])))

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The thread that keeps the setpoints flowing: listens to the autopilot, and runs the cycles.
+The setpoint thread: receives the autopilot's messages, and runs the cycles of the bridge.
 
-It runs on the monotonic clock and waits for neither a ROS executor nor ``/clock``. When it hangs
-all the same, the HEARTBEATs it sends stop too, so that the autopilot notices.
+The thread uses the monotonic clock and waits for neither a ROS executor nor ``/clock``. If the
+thread blocks, its HEARTBEATs stop, too, so that the autopilot detects it.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class SetpointThread:
             end.setblocking(False)
         self._last_cycle = -math.inf
         self.late = 0
-        """How many cycles began more than a period late."""
+        """Number of cycles that began more than a period late."""
 
     def start(self) -> None:
         """Start the thread."""
@@ -87,7 +87,7 @@ class SetpointThread:
         Callable from any thread, and never waits. What the action raises goes to ``on_error``.
 
         :param refuse: called instead of the action if the thread ends before its turn.
-        :return: False where it will not be run: too many wait, or the thread has ended.
+        :return: False if it will not be run: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False

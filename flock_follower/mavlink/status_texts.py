@@ -16,8 +16,8 @@
 Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
-refuses a mode. It reports its arming checks by EVENTs on every link: one for each check that
-fails, with the modes that it concerns, between two summaries; on a change, and on
+refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
+with the modes concerned, between two summaries. PX4 sends them after a change, and after
 MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
 here. Measured on 1.16.
 """
@@ -48,7 +48,7 @@ _STICKS: Final[str] = 'check_modes_manual_control'
 #: The worst level of a check that is only a remark.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
-#: What it does in a failsafe, by the number in the EVENT.
+#: Actions of PX4's failsafe, by the number in the EVENT.
 _FAILSAFES: Final[tuple[str, ...]] = (
     'nothing', 'a warning', 'Position', 'Altitude', 'Stabilized', 'Hold', 'Return', 'Land',
     'Descend', 'disarming', 'termination')
@@ -60,8 +60,8 @@ _PARTS: Final[Mapping[int, str]] = MappingProxyType({
     16: 'attitude estimate', 17: 'position estimate', 18: 'mission', 19: 'avoidance',
     20: 'system', 21: 'camera', 22: 'gimbal', 23: 'payload', 24: 'global position',
     25: 'storage', 26: 'parachute', 27: 'compass', 28: 'accelerometer', 29: 'gyroscope'})
-#: The words of what matters here.
-_WORDS: Final[Mapping[str, str]] = MappingProxyType({
+#: Texts of the events that are reported.
+_MEANINGS: Final[Mapping[str, str]] = MappingProxyType({
     'check_modes_angular_velocity': 'no angular velocity',
     'check_modes_attitude': 'no attitude estimate',
     'check_modes_local_pos': 'no valid position estimate',
@@ -126,7 +126,7 @@ def event_number(name: str) -> int:
 
 _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
     {event_number(name): name for name in (
-        *_WORDS, *_ENTERS, _BEGIN, _END, *(f'check_{words}' for words in _MORE.split()))})
+        *_MEANINGS, *_ENTERS, _BEGIN, _END, *(f'check_{text}' for text in _MORE.split()))})
 
 
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
@@ -156,24 +156,24 @@ mavlink.mavlink_map.setdefault(MESSAGE_ID, EventMessage)
 class Failure(NamedTuple):
     """A check that fails."""
 
-    words: str
+    text: str
     modes: int
-    """Whom it concerns, by the bits of modes."""
+    """The modes that it applies to, one bit each."""
     level: int
     """MAV_SEVERITY."""
 
 
 class ArmingChecks:
-    """The newest report of what PX4 would refuse, and why."""
+    """The newest report of the arming checks of PX4."""
 
     def __init__(self) -> None:
         self.time = -math.inf
-        """When it was complete, s."""
+        """Time of completion, s."""
         self._failures: tuple[Failure, ...] = ()
         self._coming: list[Failure] | None = None
 
     def take(self, message: Any, now: float) -> str:
-        """Take an EVENT received at ``now``, s; return what it says in words by itself, or ''."""
+        """Take an EVENT received at ``now``, s; return its text if it has one by itself, or ''."""
         name = _BY_NUMBER.get(message.number % 2**24, '')
         level, arguments = message.log_levels & 0xF, bytes(message.arguments)
         if name == _BEGIN:
@@ -187,27 +187,27 @@ class ArmingChecks:
             return 'failsafe: ' + (_FAILSAFES[action] if action < len(_FAILSAFES)
                                    else f'action {action}')
         elif name.startswith('commander_'):
-            return _WORDS[name]
+            return _MEANINGS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
             modes, part = struct.unpack_from('<IB', arguments)
-            self._coming.append(Failure(_in_words(name, message.number, part), modes, level))
+            self._coming.append(Failure(_meaning(name, message.number, part), modes, level))
         return ''
 
     def against(self, mode: str) -> list[str]:
-        """Return what speaks against a mode, named as in ``dialects.PX4``, or arming in it."""
+        """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
         if mode not in _MODES:
             return []
-        return [failure.words for failure in self._failures
+        return [failure.text for failure in self._failures
                 if failure.modes >> _MODES[mode] & 1
                 # For every mode come remarks, too, that keep it from nothing,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which keeps it from the pilot's.
-                     or (failure.words == _WORDS[_STICKS] and mode in _PILOT_MODES))]
+                     or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
 
 
-def _in_words(name: str, number: int, part: int) -> str:
-    if name in _WORDS:
-        return _WORDS[name]
+def _meaning(name: str, number: int, part: int) -> str:
+    if name in _MEANINGS:
+        return _MEANINGS[name]
     if name:
         return name.removeprefix('check_').replace('_', ' ')
     return f'{_PARTS.get(part, f"part {part}")}: event {number % 2**24}'
@@ -223,7 +223,7 @@ MOST_UNFINISHED: Final[int] = 5
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
-#: Stands for what was lost.
+#: Replaces a lost chunk.
 GAP: Final[str] = '...'
 
 
@@ -231,7 +231,7 @@ class AutopilotText(NamedTuple):
     """One whole text."""
 
     time: float
-    """When it was complete, s."""
+    """Time of completion, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str
@@ -239,7 +239,7 @@ class AutopilotText(NamedTuple):
 
 class _Unfinished(NamedTuple):
     time: float
-    """When the newest of its chunks came, s."""
+    """Time of its newest chunk, s."""
     severity: int
     text: str
     next_chunk: int
@@ -255,14 +255,14 @@ class StatusTexts:
 
     def __init__(self) -> None:
         self.checks = ArmingChecks()
-        self._said = False
+        self._has_texts = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
         self._unfinished: dict[int, _Unfinished] = {}
 
     def add(self, message: Any, now: float) -> None:
         """Take a STATUSTEXT."""
-        self._said = True
+        self._has_texts = True
         self._expire(now)
         severity, text, number = message.severity, str(message.text), message.id
         if not number:
@@ -283,20 +283,20 @@ class StatusTexts:
             self._give_up(next(iter(self._unfinished)), now)
 
     def add_event(self, message: Any, now: float) -> None:
-        """Take an EVENT; its words count where no STATUSTEXT says the same."""
-        words = self.checks.take(message, now)
-        if words and not self._said:
-            self._finish(message.log_levels & 0xF, words, now)
+        """Take an EVENT; its text is used only if no STATUSTEXTs come."""
+        text = self.checks.take(message, now)
+        if text and not self._has_texts:
+            self._finish(message.log_levels & 0xF, text, now)
 
     def why(self, time: float, mode: str) -> list[str]:
-        """Return what was said from ``time`` on, and what was last reported against a mode."""
+        """Return the texts since ``time``, and the newest failed checks for a mode."""
         return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
 
     def unready(self, now: float, mode: str) -> str:
-        """Return what was said of late, or last reported, against arming in a mode, or ''."""
-        said = [text.text.partition(PREARM)[2] for text in list(self._texts)
+        """Return recent texts and the newest failed checks against arming in a mode, or ''."""
+        reported = [text.text.partition(PREARM)[2] for text in list(self._texts)
                 if PREARM in text.text and now - text.time <= PREARM_PERIOD]
-        return '; '.join(dict.fromkeys([*said, *self.checks.against(mode)]))
+        return '; '.join(dict.fromkeys([*reported, *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""

@@ -49,15 +49,15 @@ from flock_follower.mavlink.estimator_health import (
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
-#: An estimate older than this is no longer that of now, s.
+#: An estimate older than this, s, is not used.
 ESTIMATE_TIMEOUT: Final[float] = 1.0
-#: Whether it has landed is told at 5 Hz; what is older than this is the past, s.
+#: EXTENDED_SYS_STATE comes at 5 Hz; a landed state older than this, s, is not used.
 LANDED_OLDEST: Final[float] = 3.0
-#: An altitude above sea level older than this is not that of now, s.
+#: An altitude above sea level older than this, s, is not used.
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: How often barometer and rangefinder are asked for, Hz.
 HEIGHT_RATE: Final[float] = 20.0
-#: It has rebooted where two messages of a kind in a row are stamped by more than this earlier, ms.
+#: The autopilot has rebooted if stamps of two consecutive messages go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
 _UNKNOWN_TEMPERATURE = 32767  # 0.01 degC
@@ -101,7 +101,7 @@ class Attitude(NamedTuple):
 
 
 class Battery(NamedTuple):
-    """BATTERY_STATUS or SYS_STATUS; NaN where unknown."""
+    """BATTERY_STATUS or SYS_STATUS; NaN if unknown."""
 
     time: float
     voltage: float
@@ -113,7 +113,7 @@ class Battery(NamedTuple):
     temperature: float
     """Degrees Celsius"""
     cell_voltages: tuple[float, ...]
-    """V, empty where the autopilot knows only the total."""
+    """V, empty if the autopilot knows only the total."""
 
 
 class Telemetry:
@@ -127,7 +127,7 @@ class Telemetry:
         self.dialect: Dialect | None = None
         self.status: VehicleStatus | None = None
         self.landed: int | None = None
-        """MAV_LANDED_STATE, None where the autopilot does not tell."""
+        """MAV_LANDED_STATE, None if the autopilot does not report it."""
         self.landed_time = -math.inf
         self._sea_level = -math.inf, math.nan  # time, s, and altitude, m
         self.sensor_altitude: SensorAltitude | None = None
@@ -138,7 +138,7 @@ class Telemetry:
         self.reboots = 0
         self.heartbeat_time = -math.inf
         self.mode_time = -math.inf
-        """When the mode was told last, by HEARTBEAT or by CURRENT_MODE."""
+        """When the mode was last reported, by HEARTBEAT or CURRENT_MODE."""
         self.message_time = -math.inf
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
@@ -193,9 +193,9 @@ class Telemetry:
 
     def shown(self, message: Any) -> VehicleStatus | None:
         """
-        Return the vehicle's status as a message shows it, None where it does not.
+        Return the vehicle's status from a message, None if the message has none.
 
-        CURRENT_MODE tells the mode alone: the rest is that of the newest HEARTBEAT.
+        CURRENT_MODE has only the mode; the rest comes from the newest HEARTBEAT.
         """
         kind = message.get_type()
         if self.dialect is None:
@@ -209,12 +209,12 @@ class Telemetry:
 
     def shown_time(self, command: int) -> float:
         """Return when the vehicle last showed whether a command was obeyed, s."""
-        arming = command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM  # CURRENT_MODE does not tell
+        arming = command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM  # not in CURRENT_MODE
         return self.heartbeat_time if arming else self.mode_time
 
     def silence(self, now: float) -> float:
         """
-        Return for how long the autopilot has been missing, s; 0 while it talks as it should.
+        Return for how long messages of the autopilot have been overdue, s; 0 if none is.
 
         Once it streams telemetry, every second without any message counts. A HEARTBEAT comes at
         1 Hz, so it is missing from one second after the last on.
@@ -228,14 +228,14 @@ class Telemetry:
         return self.silence(now) <= link_timeout
 
     def flying(self, now: float) -> bool | None:
-        """Return whether the vehicle says it is in the air; None where it does not tell."""
+        """Return whether the vehicle reports that it is in the air; None if it reports neither."""
         if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
                 now - self.landed_time > LANDED_OLDEST):
             return None
         return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
 
     def altitude(self, now: float) -> float | None:
-        """Return the height above the origin of the local frame, m; None where not fresh."""
+        """Return the height above the origin of the local frame, m; None if not fresh."""
         known = self.local_position
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
@@ -341,7 +341,7 @@ class AutopilotEstimate(NamedTuple):
     """Odometry: position and attitude in ENU, twist in FLU."""
 
     time: float
-    """When it was valid, s on our monotonic clock."""
+    """Time of validity, s on our monotonic clock."""
     position: Array
     """(3,), m, ENU."""
     quaternion: Array
@@ -354,12 +354,12 @@ class AutopilotEstimate(NamedTuple):
 
 def estimate(position: LocalPosition, attitude: Attitude, age: float) -> AutopilotEstimate | None:
     """
-    Return the odometry at the time of a position, None where no attitude belongs to it.
+    Return the odometry at the time of a position, None if no attitude belongs to it.
 
     The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
     turned on by its rates to the time of the position, where the autopilot has stamped both.
 
-    :param age: of the position when it came, s; 0 where it is not known.
+    :param age: of the position when it came, s; 0 if it is not known.
     """
     if abs(position.time - attitude.time) > ATTITUDE_TIMEOUT:
         return None

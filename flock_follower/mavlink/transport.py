@@ -39,14 +39,14 @@ from typing import Any, Final
 
 from flock_follower.ranges import Range
 
-#: Time between two tries to open again what was lost, s.
+#: Time between two attempts to reopen a lost port, s.
 RETRY_PERIOD: Final[float] = 0.5
-#: A line is congested where what waits to be sent takes longer than this, s.
+#: A line is congested if what waits to be sent takes longer than this, s.
 LONGEST_BACKLOG: Final[float] = 0.02
-#: A TCP connection that carries nothing for so long is closed, ms; what it buffers, bytes.
+#: A TCP connection without traffic for this long, ms, is closed; size of its buffer, bytes.
 LONGEST_TCP_DELAY: Final[int] = 1000
 TCP_BUFFER: Final[int] = 16384
-#: It is congested where more than this is not acknowledged, bytes.
+#: It is congested if more than this is not acknowledged, bytes.
 TCP_BACKLOG: Final[int] = 1000
 #: Bytes read at once.
 MOST_READ: Final[int] = 2048
@@ -120,7 +120,7 @@ class _Line:
         self._fd, self._waiting = -1, b''
 
     def _flush(self) -> bool:
-        """Send what is left of the message before; return whether nothing is."""
+        """Send the rest of the last message; return whether all of it is sent."""
         if self._waiting and self._fd >= 0:
             try:
                 self._waiting = self._waiting[os.write(self._fd, self._waiting):]
@@ -157,7 +157,7 @@ class SerialTransport(_Line):
         self.reopen(-math.inf)
 
     def reopen(self, now: float) -> None:
-        """Try to open again what was lost, at most every RETRY_PERIOD."""
+        """Try to reopen a lost port, at most every RETRY_PERIOD."""
         if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
             return
         self._tried = now
@@ -230,7 +230,7 @@ class TcpTransport(_Line):
             self._connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             self._connection.setblocking(False)
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # Drop what is not delivered by then: a late setpoint is worse than none.
+            # Drop data that is not delivered by then: a late setpoint is worse than none.
             self._connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
             self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
@@ -350,8 +350,8 @@ def open_transport(url: str) -> Transport:
 
     A serial device that is not there, and a TCP port where nobody listens, are waited for.
 
-    :raises ValueError: where the URL is not one of the known forms.
-    :raises OSError: where a UDP port cannot be opened; the message names the URL.
+    :raises ValueError: if the URL is not one of the known forms.
+    :raises OSError: if a UDP port cannot be opened; the message names the URL.
     """
     network = re.fullmatch(r'(udpin|udpout|tcp):([^:\s]+):(\d{1,5})', url)
     if network:

@@ -42,8 +42,8 @@ from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
 from flock_follower.planner.limits import limit_norm
 
-#: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
-#: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
+#: The stream stops this long, s, after a velocity that still arrives became invalid. If none
+#: arrives at all, the whole computer may have stalled: then ``blind_timeout`` applies.
 LOSS_TIMEOUT: Final[float] = 0.6
 #: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
 USUAL_AGE: Final[float] = 0.05
@@ -61,11 +61,11 @@ class Velocity(NamedTuple):
     vector: Array
     """(3,), m/s."""
     margin: float
-    """By how much its age prolongs time constants, s."""
+    """Increase of time constants by the age of the velocity, s."""
 
 
 class Motion(NamedTuple):
-    """What one source says of the vehicle's motion; an age is infinite where it never said."""
+    """The vehicle's motion by one source; an age is infinite before its first message."""
 
     velocity: ArrayLike = (0.0, 0.0, 0.0)
     """(3,), m/s."""
@@ -77,7 +77,7 @@ class Motion(NamedTuple):
     """s."""
 
     def fresh_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity; None where it is not fresh, or not three finite numbers."""
+        """Return the velocity; None if it is not fresh, or not three finite numbers."""
         if not fresh(self.velocity_age, limits.odom_timeout):
             return None
         vector = finite_vector(self.velocity)
@@ -85,25 +85,25 @@ class Motion(NamedTuple):
         return None if vector is None else Velocity(vector, margin)
 
     def fresh_yaw(self, limits: GateLimits) -> float | None:
-        """Return the yaw, rad; None where it is not fresh, or not finite."""
+        """Return the yaw, rad; None if it is not fresh, or not finite."""
         usable = fresh(self.yaw_age, limits.odom_timeout) and math.isfinite(self.yaw)
         return self.yaw if usable else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownMotion:
-    """What both sources say of the vehicle's motion, and since when not to believe them."""
+    """The vehicle's motion by both sources, and for how long each has been invalid."""
 
     odom: Motion
-    """By the odometry."""
+    """Motion by the odometry."""
     autopilot: Motion
-    """By the autopilot's own estimate."""
+    """Motion by the autopilot's own estimate."""
     source: str
-    """'odom' or 'autopilot': whose velocity judges a command and has to be fresh."""
+    """'odom' or 'autopilot': source of the velocity that is required for commands."""
     disagreeing_for: float = -math.inf
     """How long ago the velocities began to disagree, s; negative: they agree."""
     distrusted_for: float = -math.inf
-    """For how long the autopilot has told a velocity that nothing carries, s."""
+    """For how long the autopilot has sent a velocity without a valid sensor behind it, s."""
 
     @property
     def source_first(self) -> tuple[Motion, Motion]:
@@ -113,7 +113,7 @@ class KnownMotion:
         return self.autopilot, self.odom
 
     def braking_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity to brake with; None where none is fresh, or two disagree."""
+        """Return the velocity to brake with; None if none is fresh, or if two disagree."""
         first, second = self.source_first
         if self.yaws_disagree(limits):
             # The autopilot's own frame is the one in which it obeys.
@@ -124,7 +124,7 @@ class KnownMotion:
         return second.fresh_velocity(limits) if velocity is None else velocity
 
     def blind(self, limits: GateLimits) -> bool:
-        """Return whether there was no velocity to believe for too long, after there was one."""
+        """Return whether no valid velocity has come for too long, after one had come."""
         if self.braking_velocity(limits) is not None:
             return False
         if self.disagreeing_for > LOSS_TIMEOUT or self.distrusted_for > LOSS_TIMEOUT:
@@ -146,7 +146,7 @@ class KnownMotion:
         return turned is not None and abs(turned) > limits.yaw_disagreement
 
     def yaw_difference(self, limits: GateLimits) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
         mine, own = self.odom.fresh_yaw(limits), self.autopilot.fresh_yaw(limits)
         return None if mine is None or own is None else wrap_angle(mine - own)
 
@@ -174,7 +174,7 @@ def refusal(age: float, timeout: float) -> str:
 
 
 def finite_vector(value: ArrayLike) -> Array | None:
-    """Return a copy as an array (3,), None where it is not three finite numbers."""
+    """Return a copy as an array (3,), None if it is not three finite numbers."""
     try:
         vector = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -187,7 +187,7 @@ def finite_vector(value: ArrayLike) -> Array | None:
 AVERAGING_TIME: Final[float] = 0.3
 #: Samples further apart than this, s, weigh no more than this.
 LONGEST_STEP: Final[float] = 0.1
-#: A difference counts up to this many times what is tolerated.
+#: A difference is clipped to this many times the tolerance.
 LARGEST: Final[float] = 3.0
 #: What disagreed for this long, s, does so until it flies anew: a wrong frame shows only at speed.
 #: With 0.3 s a sound PX4 was landed twice, after 24 and 26 minutes.
@@ -206,7 +206,7 @@ class VelocityComparison:
         """
         Take what one is faster than the other at ``now``, s, as a vector (3,), m/s.
 
-        :param difference: None where one of them is not fresh.
+        :param difference: None if one of them is not fresh.
         :param tolerance: largest average difference, m/s.
         :param flying: whether the vehicle flies by them; else nothing is remembered.
         """
@@ -230,7 +230,7 @@ class VelocityComparison:
         return float(np.linalg.norm(self._average))
 
     def disagreeing_for(self, now: float) -> float:
-        """Return how long ago they began to disagree, s; minus infinity where they agree."""
+        """Return how long ago they began to disagree, s; minus infinity if they agree."""
         return now - self._since
 
 
@@ -265,7 +265,7 @@ class Path:
         """
         Take a position, m.
 
-        :param velocity: (3,), m/s, by the same source; None tells no jump.
+        :param velocity: (3,), m/s, by the same source; None: jumps are not detected.
         """
         elapsed = now - self._time
         if elapsed <= 0.0:

@@ -89,8 +89,8 @@ def _runs_as_a_program() -> bool:
 def _report_missing_package(kind: type[BaseException], error: BaseException,
                             trace: TracebackType | None) -> None:
     if isinstance(error, ModuleNotFoundError):
-        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
-              'package that package.xml names?', file=sys.stderr)
+        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+              'package in package.xml', file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)
 

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The black box: records the topics that ``evaluate`` needs, on a disk of limited room.
+The black box: records the topics that ``evaluate`` needs, within a limit of disk space.
 
-It publishes only its diagnostics, and no node waits for it: it receives best effort (latched
-topics reliably), twenty times per second, without decoding any but the images that it compresses,
-and yields the processor to all others. A thread of its own writes to the disk within a second, see
+The node publishes only its diagnostics, and no node waits for it. It receives best effort (latched
+topics reliably), twenty times per second, decodes only the images that it compresses, and runs at
+low priority. A thread of its own writes to the disk within a second, see
 ``bags.recording``. Topics are recorded by our names, without namespace and remaps, so that
 ``evaluate``, ``check`` and ``replay`` take a recording as it is.
 """
@@ -73,7 +73,7 @@ NICENESS = 10
 JPEG_QUALITY = 90  # of images compressed here
 PARAMETER_EVENTS = '/parameter_events'
 LATCHED = ('planner/state', 'mavlink_bridge/state', 'mavlink_bridge/armed_at', '/rosout')
-#: What is recorded besides the images and their calibration.
+#: Topics that are recorded besides the images and their calibration.
 RECORDED: Final = {
     **{name: TYPES[name] for name in (
         'odom', 'ranges', 'neighbors', 'neighbors/frames', 'command/trajectory', 'planner/state',
@@ -146,8 +146,8 @@ class BlackBox(FlockNode):
         self.get_logger().info(f'recording to {self._folder}')
         if shares_memory():
             self.get_logger().warning(
-                'receives through shared memory: if it is started in flight, who publishes may '
-                f'wait for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} ends that')
+                'receives through shared memory: if it is started in flight, publishers may block '
+                f'for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} prevents that')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""
@@ -187,10 +187,10 @@ class BlackBox(FlockNode):
 
     def _take_on(self) -> None:
         """
-        Take messages until the end.
+        Receive messages until shutdown.
 
-        Not in the executor: if another process was killed, Fast DDS can hold up a publisher, as
-        that of this node's diagnostics, for a second.
+        This method has a thread of its own, because Fast DDS can block a publisher in the executor
+        for a second after another process was killed.
         """
         while not self._ending.wait(TAKE_PERIOD):
             try:

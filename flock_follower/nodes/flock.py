@@ -47,13 +47,13 @@ RECEIVED_TOPIC = 'neighbors/heard'
 SHARED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-HEARD_QOS = QoSProfile(depth=10)
+RECEIVED_QOS = QoSProfile(depth=10)
 PERIOD = 0.1  # s
 
 SPECS = [
     Spec('vehicle_name', '',
-         'name of this vehicle, unique in the flock, as others know it in their neighbors_file; '
-         'empty: the namespace'),
+         'name of this vehicle, unique in the flock, as in the neighbors_file of others; empty: '
+         'the namespace'),
     *specs_of(SourceParams(), 'odom_'),
 ]
 
@@ -68,8 +68,8 @@ class SharingNode(FlockNode):
             SPECS, lambda values: checked_name(values['vehicle_name'] or namespace))
         self._sharing = Sharing(parameters.current)
         self._own = OwnOdometry(self, parameters.values)
-        self._words = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
-        self._heard = self.create_publisher(Odometry, RECEIVED_TOPIC, HEARD_QOS)
+        self._sent = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
+        self._received = self.create_publisher(Odometry, RECEIVED_TOPIC, RECEIVED_QOS)
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
         self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
@@ -93,17 +93,17 @@ class SharingNode(FlockNode):
 
     def _take_message(self, message: Odometry) -> None:
         self._poll_odom()
-        self._sharing.take_word(from_odometry(message), self._now())
+        self._sharing.take_message(from_odometry(message), self._now())
 
     def _tick(self) -> None:
         self._poll_odom()
         now = self._now()
         for state in self._sharing.neighbors(now):
-            self._heard.publish(from_state(make, state))
+            self._received.publish(from_state(make, state))
             self.diagnostics.rate('heard').tick(time.monotonic())
-        for state in self._sharing.words(now):
-            self._words.publish(from_state(make, state))
-        for event in self._sharing.told():
+        for state in self._sharing.messages(now):
+            self._sent.publish(from_state(make, state))
+        for event in self._sharing.new_events():
             self.diagnostics.reject(*event)
 
     def _silence_problem(self, now: float) -> Problem | None:

@@ -21,7 +21,7 @@ Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's 
 ``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
 ``offboard``, ``takeoff`` and ``land``.
-What is sent is decided in ``flock_follower.mavlink``.
+``flock_follower.mavlink`` decides which setpoints are sent.
 
 Odometry is taken ODOM_RATE times a second, all that has come since: to wake for each message of a
 fast source would cost more than all else that the bridge does.
@@ -85,7 +85,7 @@ from flock_follower.parameters.spec import filled
 from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 
 # Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
-# newest: in what it replaces, a second node that commands would not show.
+# newest: a second commanding node would otherwise stay undetected.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -146,8 +146,8 @@ class MavlinkBridge(FlockNode):
                                f'{values["connection"]}')
         if shares_memory():
             self.get_logger().warning(
-                'Fast DDS shares memory with other processes here: to begin to talk to one can '
-                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+                'Fast DDS shares memory with other processes here: connecting to one can '
+                'stop the setpoints for up to 1 s; config/fastdds_udp.xml prevents that')
 
     def _connect(self, values: Mapping[str, Any]) -> None:
         """Create the subscriptions, timers and services."""
@@ -313,7 +313,7 @@ class MavlinkBridge(FlockNode):
         self._outputs.on_cycle(now)
 
     def _give_answers(self) -> None:
-        """Have finished requests answered; told again each cycle until it is done."""
+        """Send the results of finished requests; repeated each cycle until all are sent."""
         self._answered += [(answer, request.outcome) for request, answer in self._pending
                            if request.outcome is not None]
         self._pending = [entry for entry in self._pending if entry[0].outcome is None]

@@ -15,7 +15,7 @@
 """
 Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-It publishes nothing and sets nothing; it requests the parameters of our nodes.
+The observer publishes nothing and sets nothing; it requests the parameters of our nodes.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
-DISCOVERY = 2.0  # s in which the others are found
-POLL_PERIOD = 0.25  # s between looks for topics that are new
+DISCOVERY = 2.0  # s for the discovery of other nodes
+POLL_PERIOD = 0.25  # s between two searches for new topics
 PROCESSORS = Path('/proc/stat')
-ANSWER = 2.0  # s that nodes have to tell their parameters after all else
+ANSWER = 2.0  # s for the nodes to send their parameters at the end
 # Best effort and volatile takes what any publisher sends.
-HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-#: What is decoded; of the others it is only counted how often they come.
+OBSERVED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom', 'mavlink/odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory')
 #: By which type of what relative_pose subscribes to our names are known.
@@ -135,7 +135,7 @@ class Observer(Node):
         return self.seen
 
     def _until(self, executor: SingleThreadedExecutor, seconds: float) -> None:
-        """Spin for some seconds, and look for what is new from time to time."""
+        """Spin for some seconds, and search for new topics from time to time."""
         end, look = time.monotonic() + seconds, 0.0
         while rclpy.ok() and (now := time.monotonic()) < end:
             if now >= look:
@@ -196,11 +196,11 @@ class Observer(Node):
             if topic not in self._subscribed and TYPES[name] in published.get(topic, ()):
                 self._subscribed.add(topic)
                 kind = message_class(TYPES[name])
-                self.create_subscription(kind, topic, partial(self._take, name, topic), HEARD_QOS,
-                                         raw=kind in READERS or name in COUNTED)
+                self.create_subscription(kind, topic, partial(self._take, name, topic),
+                                         OBSERVED_QOS, raw=kind in READERS or name in COUNTED)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
-            self.create_subscription(Clock, '/clock', self._take_clock, HEARD_QOS)
+            self.create_subscription(Clock, '/clock', self._take_clock, OBSERVED_QOS)
 
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
@@ -236,24 +236,24 @@ class Observer(Node):
             for info in infos if info.node_name != self.get_name()]
 
     def _compare_with_files(self) -> None:
-        """Note what files set for our nodes, and whom of them they miss."""
+        """Note the parameters that files set for our nodes, and the nodes that they miss."""
         own = {node: full for node in OURS
                if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
         problems = self.seen.file_problems
         for node, path in files_of_processes():
-            if node in own and (told := misses(path, own[node])) and told not in problems:
-                problems.append(told)
+            if node in own and (problem := misses(path, own[node])) and problem not in problems:
+                problems.append(problem)
         if self._config is None:
             return
-        told = ''
+        problem = ''
         for node, full in own.items():
-            if told := misses(str(self._config), full):
-                problems += [told] if 'but none for' in told else []
+            if problem := misses(str(self._config), full):
+                problems += [problem] if 'but none for' in problem else []
             elif values := {
                     **shared([self._config], full), **given(self._config, full)}:
                 self.seen.file_parameters[node] = values
-        if told and not self.seen.file_parameters and not problems:
-            problems.append(told)
+        if problem and not self.seen.file_parameters and not problems:
+            problems.append(problem)
 
 
 def _machine(idle: float | None) -> Machine:

@@ -133,7 +133,7 @@ class Pilot(Node):
             raise KeyboardInterrupt
 
     def _real_vehicle(self) -> str:
-        """Return why the autopilot may be a real one by the bridge's ``connection``, or ''."""
+        """Return the reason if the bridge's ``connection`` may lead to a real autopilot, or ''."""
         bridge, asked = RemoteParameters(self, 'mavlink_bridge'), False
         end = time.monotonic() + DISCOVERY
         while bridge.values is None:

@@ -15,15 +15,15 @@
 """
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
-Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
-``neighbors/acceleration``, ``neighbors/heard`` (what other vehicles tell of their neighbours, and
-of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
+Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if published ``camera_info``,
+``neighbors/acceleration``, ``neighbors/heard`` (neighbour states received from other vehicles)
+and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
 steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
 disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
-``planner/engage`` is called again. What it decides, and why, is in
+``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """
 
@@ -79,13 +79,13 @@ from flock_follower.planner.step import Decision
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+RECEIVED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DISTANCE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
+BRIDGE_QOS = STATE_QOS  # latched: received at once by a planner that starts later
 
 Dated = TypeVar('Dated', OdometryState, AccelerationState)
 #: ns between the stamps of a neighbour's state and of its acceleration, two messages.
@@ -103,8 +103,8 @@ class Planner(FlockNode):
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
-        told = cameras(self._settings.values)
-        self._rpy = {camera.name: camera.rpy for camera in told}
+        configured = cameras(self._settings.values)
+        self._rpy = {camera.name: camera.rpy for camera in configured}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._decision: Decision | None = None
         self._given_up = False
@@ -123,10 +123,11 @@ class Planner(FlockNode):
             self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
                       self._take_acceleration, NEIGHBORS_QOS, required=False),
             self.poll(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
-            self.poll(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False),
+            self.poll(Odometry, 'neighbors/heard', self._take_received, RECEIVED_QOS,
+                      required=False),
             *(self.poll(CameraInfo, camera.camera_info,
                         partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
-                        required=False) for camera in told)]
+                        required=False) for camera in configured)]
         self._poll_frames = self.poll(
             Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         inputs = self.diagnostics.inputs
@@ -202,11 +203,11 @@ class Planner(FlockNode):
                 self._dated(from_odometry(message), arrival), arrival - self._watch.shift)
 
     def _take_bridge(self, message: String) -> None:
-        said = self._loop.take_bridge_state(message.data, self._bridge_age())
+        reported = self._loop.take_bridge_state(message.data, self._bridge_age())
         self._bridge_received = time.monotonic()
-        if said != self._bridge:
-            self._bridge = said
-            self.get_logger().info(f'the bridge: {said}')
+        if reported != self._bridge:
+            self._bridge = reported
+            self.get_logger().info(f'the bridge: {reported}')
 
     def _bridge_age(self) -> float:
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
@@ -220,9 +221,9 @@ class Planner(FlockNode):
                 state = with_acceleration(state, reported)
             self._loop.take_neighbor(state)
 
-    def _take_heard(self, message: Odometry, arrival: int) -> None:
+    def _take_received(self, message: Odometry, arrival: int) -> None:
         if self._fresh('neighbors/heard', message.header.stamp):
-            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), heard=True)
+            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), received=True)
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
         if self._fresh('neighbors/acceleration', message.header.stamp):
@@ -276,7 +277,7 @@ class Planner(FlockNode):
         return response
 
     def _missing(self) -> list[str]:
-        """Return what is missing before it follows."""
+        """Return the missing condition before it follows."""
         fault = self._loop.odometry_fault(self._now(), self._settings.current)
         missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
         missing += filter(None, [self._loop.waiting(self._bridge_age())])
@@ -302,9 +303,9 @@ class Planner(FlockNode):
             stamp = nanoseconds_to_stamp(nanoseconds + self._watch.shift)
             self._distances.publish(Range(
                 header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
-        self._tell(decision, self._loop.seconds(nanoseconds))
+        self._publish_state(decision, self._loop.seconds(nanoseconds))
 
-    def _tell(self, decision: Decision, now: float) -> None:
+    def _publish_state(self, decision: Decision, now: float) -> None:
         """Publish the state where it changed, and keep what /diagnostics shows of the tick."""
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
@@ -321,7 +322,7 @@ class Planner(FlockNode):
         for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
             del values[key]
         values.update({'state': decision.state.value, 'reason': decision.reason,
-                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
+                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
                        'guarded_commands': self._guarded, 'limits': decision.limits,
                        'warnings': '; '.join(decision.warnings),
@@ -337,7 +338,7 @@ class Planner(FlockNode):
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
         for each in decision.known:
             values[f'{each.name}_is'] = ', '.join([
-                each.who.role, 'heard' if each.heard else 'seen',
+                each.member.role, 'heard' if each.received else 'seen',
                 *(['edge'] if each.name in decision.edges else [])])
 
     def _tick_problem(self, now: float) -> Problem | None:

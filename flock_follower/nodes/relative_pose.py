@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The perception node: images and one's own odometry in, the neighbours' states out.
+The perception node: images and own odometry in, the neighbours' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
@@ -75,25 +75,25 @@ UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, th
 
 
 class _Camera:
-    """One camera of the node: its topics, and what is amiss with its images."""
+    """One camera of the node: its topics, and the faults of its images."""
 
-    def __init__(self, node: RelativePose, told: CameraValues, transport: str) -> None:
-        self.name = told.name
-        self.of = f' of camera {told.name}' if told.name else ''
+    def __init__(self, node: RelativePose, values: CameraValues, transport: str) -> None:
+        self.name = values.name
+        self.of = f' of camera {values.name}' if values.name else ''
         self.dropping_since: float | None = None
         self.last_rejection = ''
         self._node = node
         compressed = transport == 'compressed'
-        topic = told.images(transport)
+        topic = values.images(transport)
         self._other_transport = 'raw' if compressed else 'compressed'
-        self._other_topic = told.images(self._other_transport)
+        self._other_topic = values.images(self._other_transport)
         node.subscribe(CompressedImage if compressed else Image, topic,
                        partial(node.take_image, self), IMAGE_QOS, of=self.of, largest=None)
-        node.subscribe(CameraInfo, told.camera_info, partial(node.take_camera_info, self),
+        node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
                        IMAGE_QOS, of=self.of)
         self._images = node.diagnostics.rates[f'{topic}_hz']
         self.debug_images = node.create_publisher(
-            Image, f'~/debug_image/{told.name}' if told.name else '~/debug_image', IMAGE_QOS)
+            Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image', IMAGE_QOS)
         node.diagnostics.checks += [self._transport_problem, self._processing_problem]
 
     def reject(self, reason: str, detail: str = '') -> None:
@@ -117,7 +117,7 @@ class _Camera:
 
 
 class RelativePose(FlockNode):
-    """Feeds the perceiver from topics, publishes its estimates, and reports what is dropped."""
+    """Feeds the perceiver from topics, publishes its estimates, and reports dropped messages."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
@@ -130,8 +130,8 @@ class RelativePose(FlockNode):
         self._other_ids: dict[int, float] = {}
         self._duplicates: dict[str, tuple[float, Estimate]] = {}
 
-        self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
-                         for told in cameras(self._values)}
+        self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
+                         for camera in cameras(self._values)}
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
                                     awaited=self._awaited)
         self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
@@ -262,7 +262,7 @@ class RelativePose(FlockNode):
         self._neighbors.publish(state)
 
     def _show_learnt(self, now: float) -> Problem | None:
-        """Show what was learnt of clocks, noise and ranges; it is no problem."""
+        """Show the estimates of clock offsets, noise and range errors."""
         values = self.diagnostics.values
         for name, camera in self._tracker.cameras.items():
             noise = camera.noise

@@ -64,17 +64,18 @@ COMMANDS = '/command/trajectory'
 SPECS = [
     Spec('bag', '', 'bag to play: .bag, .mcap, .db3 or a ROS 2 bag folder'),
     Spec('rate', 1.0, 'speed of playback', Range(0.1, 100.0), live=True),
-    Spec('start', 0.0, 'where in the bag to begin', Range(0.0, 1e9, 's')),
-    Spec('duration', 0.0, 'how much of the bag to play; 0: to its end', Range(0.0, 1e9, 's')),
-    Spec('loop', False, 'begin again at the end', live=True),
+    Spec('start', 0.0, 'start of the playback, from the start of the bag', Range(0.0, 1e9, 's')),
+    Spec('duration', 0.0, 'duration of the playback; 0: to the end of '
+                          'the bag', Range(0.0, 1e9, 's')),
+    Spec('loop', False, 'repeat the bag', live=True),
     Spec('paused', False, 'start paused, until the service replay/pause resumes'),
     Spec('clock', True, 'publish /clock'),
-    Spec('topics', [''], 'topics of the bag to play; none named: all'),
+    Spec('topics', [''], 'topics of the bag to play; empty: all'),
     Spec('remap', [''], 'from:=to for topics of the bag, besides remaps of ROS'),
     # Discovery takes DDS up to 2.5 s; a later subscriber misses the first messages.
     Spec('wait_for_subscribers', 3.0,
-         'how long to wait, at most, for a subscriber of each topic', Range(0.0, 3600.0, 's')),
-    Spec('wait_for', [''], 'topics of the bag that wait_for_subscribers means; none named: all'),
+         'longest time to wait for a subscriber of each topic', Range(0.0, 3600.0, 's')),
+    Spec('wait_for', [''], 'topics of the bag to which wait_for_subscribers applies; empty: all'),
 ]
 
 
@@ -306,7 +307,7 @@ class Replay(FlockNode):
 
 def bag_argument(args: list[str]) -> str:
     """
-    Return the bag given as a plain argument, '' if there is none.
+    Return the bag given as a plain argument, or ''.
 
     :raises ValueError: if there is more than one plain argument.
     """

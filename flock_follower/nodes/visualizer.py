@@ -87,7 +87,8 @@ ODOMETRY = ('odom_child_position', 'odom_child_rpy')
 PLANNER = ('d0', 'd1', 'radius')
 
 SPECS = [
-    Spec('rate', 10.0, 'of markers and transforms, while someone looks', Range(1.0, 50.0, 'Hz')),
+    Spec('rate', 10.0, 'rate of markers and transforms, while a '
+                       'viewer subscribes', Range(1.0, 50.0, 'Hz')),
     Spec('odom_tf', AUTO,
          'whether to broadcast odom -> base_link: auto, while no other node publishes on /tf (an '
          'odometry normally does); always; never', ODOM_TF),
@@ -149,10 +150,11 @@ class Visualizer(FlockNode):
         planner = f'{self.get_namespace().strip("/")}/planner'.lstrip('/')
         for status in message.status:
             if status.name == planner:
-                said = {pair.key: pair.value for pair in status.values}
+                reported = {pair.key: pair.value for pair in status.values}
                 self._report = PlannerReport(
-                    said.get('state', ''), said.get('reason', ''), said.get('limits', ''),
-                    tuple(filter(None, said.get('edges', '').split(', '))))
+                    reported.get('state', ''), reported.get('reason', ''),
+                    reported.get('limits', ''),
+                    tuple(filter(None, reported.get('edges', '').split(', '))))
 
     def _take_perception(self, values: dict[str, Any]) -> None:
         """Take the parameters of relative_pose; subscribe to the calibration of each camera."""
@@ -262,7 +264,8 @@ class Visualizer(FlockNode):
         for name, camera in self._cameras.items():
             frame = self._frames[name]
             if not self._transforms.fix(known.now, BASE, frame, camera.T_body_optical):
-                self.diagnostics.values[f'frame {frame}'] = 'told on /tf_static by another node'
+                self.diagnostics.values[f'frame {frame}'] = (
+                    'published on /tf_static by another node')
 
     def _message(self, known: Snapshot) -> MarkerArray:
         stamp = nanoseconds_to_stamp(known.now)

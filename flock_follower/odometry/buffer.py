@@ -223,7 +223,7 @@ class OdometryBuffer:
 
     def at(self, stamp: float, extrapolate: bool = True) -> OdometrySample | Missing:
         """
-        Return the state at a stamp, s, or why there is none.
+        Return the state at a stamp, s, or the reason why it is missing.
 
         Between two samples velocities are linear, and position and attitude go along with them;
         past the newest, its velocities carry on for at most ``MAX_EXTRAPOLATION``.

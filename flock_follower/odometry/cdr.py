@@ -107,11 +107,11 @@ def read_odometry(data: bytes) -> PlainOdometry:
     """
     Return an Odometry message from its bytes; the covariances (36,) are views of them.
 
-    :raises ValueError: if the bytes are none.
+    :raises ValueError: if the bytes are no Odometry message.
     """
     form = _FORMATS.get(bytes(data[:2]))
     if form is None:
-        raise ValueError('not an Odometry message: it does not begin as CDR does')
+        raise ValueError('not an Odometry message: it has no valid CDR header')
     try:
         seconds, nanoseconds, length = form.header.unpack_from(data, _BEGIN)
         at = _BEGIN + form.header.size

@@ -17,7 +17,7 @@ Velocities derived from positions, and angular velocities from attitudes.
 
 The same Kalman filter serves both: value, rate and acceleration along each axis, driven by white
 jerk (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-section 6.2). The noise of what is measured is learnt from the innovations.
+section 6.2). The measurement noise is learnt from the innovations.
 
 Frame of a source's velocity, found by a comparison with the motion of its positions.
 
@@ -25,8 +25,8 @@ REP-105 says the child frame. Some sources use the header's frame, others send n
 wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
 the displacement. The evidence for one reading adds up, window by window, if the readings differ
 (with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING`` windows in a row, at
-first or later, the velocity is dropped. It is used again once it agrees at speed in as many
-windows, or at rest in ``EXPIRES`` windows.
+first or later, the velocity is dropped. The velocity is used again once it agrees in as
+many windows in motion, or in ``EXPIRES`` windows at rest.
 
 Before the frame is found, REP-105's child frame is used while both readings are the same, and the
 likelier reading once the evidence favours one. Otherwise the velocity is derived from the
@@ -72,7 +72,7 @@ class _WhiteJerk:
         self._jerk, self._initial = jerk, (rate**2, 0.0, acceleration**2)
         self.stamp: float | None = None
         self.variance, self._least, self._most = (std**2 for std in noise)
-        """Of a measurement along an axis, and its limits."""
+        """Variance of a measurement along an axis, and its limits."""
         # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
         # plain numbers: at hundreds of messages per second matrices so small cost more.
         self._covariance = (0.0,) * 6
@@ -118,7 +118,7 @@ class DerivedVelocity(_WhiteJerk):
     ``stamp``, s, in the frame of the positions.
     """
 
-    #: Positions closer together than this, s, tell nothing new: errors of a filter are not white.
+    #: Positions closer together than this, s, add no information: filter errors are not white.
     SHORTEST = 0.018
     #: So often they are: measured errors of the velocity, squared, are several times the filter's.
     CORRELATED = 4.0
@@ -231,13 +231,13 @@ WINDOW: Final[float] = 0.5
 #: in single pieces (0.29 m in a real flight), a velocity read wrongly is wrong in all.
 PIECE: Final[float] = 0.095
 FEWEST: Final[int] = 3
-#: Windows in a row in which no reading agrees, after which none is believed.
+#: Windows in a row in which no frame of the twist fits, after which the twist is not used.
 AGREEING: Final[int] = 2
-#: Windows in a row that agree, at whatever speed, after which a reading that was found once is
-#: believed again: 4 s.
+#: Windows in a row that fit, at any speed, after which a frame that was found before is used
+#: again: 4 s.
 EXPIRES: Final[int] = 8
-#: Log of the likelihood ratio from which on one reading is believed: readings that differ by three
-#: deviations give 4.5. One window counts for less, so that one alone decides nothing.
+#: Log of the likelihood ratio that decides for one frame: frames that differ by three deviations
+#: give 4.5. One window counts for less, so that a single window decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
 #: Log of the likelihood ratio from which on a reading is used before one is found: 3 to 1.
@@ -266,8 +266,8 @@ class TwistFrame:
         self.found = ''
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
-        """By how much, m/s, the reading in use was off in the window that last contradicted it."""
-        self._before = ''  # what was found before the velocity was dropped
+        """Error of the frame in use, m/s, in the window that last contradicted it."""
+        self._before = ''  # the frame found before the velocity was dropped
         self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
         self._evidence = 0.0  # for 'child', against 'odom'
@@ -297,12 +297,12 @@ class TwistFrame:
 
     @property
     def describe(self) -> str:
-        """Return what is known, in words."""
+        """Return the result as text."""
         if self.wanted == NONE:
             return 'none: the velocity comes from the positions'
         if self.wanted != AUTO:
             doubt = {'': '', self.wanted: ' (the positions agree)'}.get(
-                self.found, f' as told, but the positions say {self.found}')
+                self.found, f' as configured, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
             return ('auto: not known yet, read as REP-105 says (child) where it does not matter, '
@@ -371,14 +371,14 @@ class TwistFrame:
             self.found, self.contradiction = NONE, float(off[used])
             return
         if float(np.linalg.norm(mean[0] - mean[1])) < DEVIATION:
-            return  # errors alone would tell
+            return  # errors would decide
         likelier = float(means[1]**2 - means[0]**2) / (2.0 * DEVIATION**2)
         self._evidence += min(max(likelier, -MOST_OF_ONE), MOST_OF_ONE)
         if not self.found and abs(self._evidence) >= SURE and fits:
             self.found = CHILD if self._evidence > 0.0 else ODOM
 
     def _recover(self, fitting: list[str], moving: bool) -> None:
-        """Believe a velocity that was dropped again, once it has agreed for long enough."""
+        """Use a dropped velocity again, once it has agreed for long enough."""
         self._agreeing = self._agreeing + 1 if fitting else 0
         self._moving = self._moving + moving if fitting else 0
         known = self._before in fitting

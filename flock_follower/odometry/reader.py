@@ -84,14 +84,14 @@ class UpAxis:
 
     @property
     def axis(self) -> str:
-        """Return the axis that points up, 'x', '-x', 'y', ..., or '' where none does."""
+        """Return the axis that points up, 'x', '-x', 'y', ..., or '' if none does."""
         k = max(range(3), key=lambda axis: abs(self._up[axis]))
         upward = self._up[k]
         return '' if abs(upward) < UPWARD else ('-' if upward < 0.0 else '') + 'xyz'[k]
 
     @property
     def fault(self) -> str:
-        """Return what is wrong where another axis than z points up, else ''."""
+        """Return the fault if another axis than z points up, else ''."""
         if self.axis in ('', 'z'):
             return ''
         return (f'base_link has {self.axis} up instead of z: set odom_child_rpy to how the child '
@@ -100,18 +100,18 @@ class UpAxis:
 
 #: Where the way to read the velocity changes, the step is faded out in this time constant, s.
 FADING = 0.5
-#: Messages over which latency and rate are told.
+#: Messages over which latency and rate are reported.
 REMEMBERED = 50
-#: So many attitudes are remembered, to derive rates from where they cease to come.
+#: Number of attitudes kept, to derive angular rates if the messages have none.
 ATTITUDES = 100
-#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+#: A velocity of this variance, (m/s)^2, is invalid: rtabmap sends zeros with 9999 without one.
 NO_VELOCITY = 1e3
 
 
 @dataclass(frozen=True)
 class SourceParams(Checked):
     """
-    How the odometry is to be read.
+    Parameters of the odometry source.
 
     ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of its child frame on
     base_link (FLU); ``twist_frame`` is the frame of its velocity, or 'auto'. ``std`` (4) are the
@@ -121,19 +121,19 @@ class SourceParams(Checked):
 
     child_position: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0), Range(-10.0, 10.0, 'm'),
-        'place of the child frame of odom on base_link, FLU: of the IMU, where that is what the '
-        'source reports', live=False)
+        'place of the child frame of odom on base_link, FLU: that of the IMU if the source '
+        'reports the pose of the IMU', live=False)
     child_rpy: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0), Range(-2.0 * math.pi, 2.0 * math.pi, 'rad'),
         'roll, pitch, yaw of the child frame of odom on base_link', live=False)
     twist_frame: str = parameter(
         AUTO, CHOICES,
-        'frame of the velocity in odom: child as in REP-105, or odom; none: derive it from the '
-        'positions; auto: find out', live=False)
+        'frame of the velocity in odom: child as in REP-105, or odom; none: derive the velocity '
+        'from the positions; auto: detect the frame', live=False)
     std: tuple[float, ...] = parameter(
         (0.1, 0.05, 0.1, 0.05), Range(0.0, 100.0, above=True),
         'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
-        'rad/s, where odom has no covariances', live=False)
+        'rad/s, if odom has no covariances', live=False)
 
 
 _NO_LEVER: Array = np.zeros(3)
@@ -143,8 +143,8 @@ class OdometrySource:
     """
     The own odometry, message by message.
 
-    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
-    are (reason, detail) of what was dropped or survived since :meth:`told`.
+    ``twist`` describes the frame of the velocity, ``up`` which axis of base_link points up.
+    ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:
@@ -196,8 +196,8 @@ class OdometrySource:
         """Return the longest time of late between two stamps, s; 0 before the second."""
         return max(self._gaps, default=0.0)
 
-    def told(self) -> list[tuple[str, str]]:
-        """Return the events since this was asked last."""
+    def new_events(self) -> list[tuple[str, str]]:
+        """Return the events since the last call."""
         events, self.events = self.events, []
         return events
 
@@ -219,7 +219,7 @@ class OdometrySource:
         time = (stamp - self._epoch) / NANOSECONDS
         self._latencies.append((now - stamp) / NANOSECONDS)
 
-        # Turns and levers that are none are left out: for every message, that is a third of it.
+        # Identity turns and zero levers are skipped: that saves a third of the time.
         R_odom_child = rotation = unit_quaternion_to_matrix(attitude)
         if not self._is_base:
             attitude = quaternion_multiply(attitude, self._q_child_base)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the black box: what it records, and how much of the disk it may take."""
+"""The parameters of the black box: recorded topics, and its share of the disk."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from flock_follower.ranges import Range
 
 SPECS = [
     Spec('record_folder', '',
-         'where recordings go, each in a folder of its own; empty: flock_follower/black_box in '
-         '$ROS_HOME (~/.ros), and there in that of the namespace'),
+         'folder of the recordings, each in its own subfolder; empty: flock_follower/black_box in '
+         '$ROS_HOME (~/.ros), with a subfolder for the namespace'),
     Spec('record_images', 'compressed',
-         'compressed: as JPEG, grey as perception sees them, where the camera does not compress '
-         'them itself; none: no images, so nothing for evaluate', ('compressed', 'none')),
-    Spec('image_transport', 'raw', 'as that of relative_pose', ('raw', 'compressed')),
+         'compressed: grey JPEG images, or those of the camera if it compresses itself; none: no '
+         'images, so evaluate cannot use the recording', ('compressed', 'none')),
+    Spec('image_transport', 'raw', 'the same as for relative_pose', ('raw', 'compressed')),
     Spec('disk_used', 8000.0,
-         'what all recordings in the folder may take; beyond it the oldest files are deleted',
+         'largest size of all recordings in the folder; beyond it the oldest files are deleted',
          Range(10.0, 1e8, 'MB')),
     Spec('disk_free', 1000.0,
-         'what stays free on the disk: with less the oldest files are deleted, and without any '
-         'nothing is recorded', Range(10.0, 1e8, 'MB')),
+         'space kept free on the disk: with less, the oldest files are deleted; if that is not '
+         'enough, recording stops', Range(10.0, 1e8, 'MB')),
     *CAMERA_SPECS,
 ]
 
@@ -45,7 +45,7 @@ def build(values: dict[str, Any]) -> dict[str, Any]:
     """
     Return the values.
 
-    :raises ValueError: where two cameras cannot be two.
+    :raises ValueError: if two cameras cannot be two.
     """
     cameras(values)
     return values

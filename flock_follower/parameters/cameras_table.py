@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The parameters of the cameras, and what they say: of one, or of several by their names.
+The parameters of one camera, or of several by their names.
 
 One camera needs no name. Several are listed in ``cameras``, and each has parameters of its own
 below ``camera.NAME``; planner and relative_pose take the same ones.
@@ -36,20 +36,21 @@ AHEAD: Final = (0.0, 0.0, 0.0)
 
 CAMERA_SPECS = [
     Spec(NAMES, [''],
-         'names of several cameras, each with parameters camera.NAME...; empty: one camera, that '
-         'of camera_rpy'),
+         'names of several cameras, each with parameters camera.NAME...; empty: a single camera, '
+         'with camera_rpy'),
     Spec('camera.NAME.image', 'NAME/image_raw',
-         'topic of its images; of compressed ones without /compressed'),
-    Spec('camera.NAME.camera_info', 'NAME/camera_info', 'topic of their calibration'),
+         "topic of the camera's images; of compressed images without /compressed"),
+    Spec('camera.NAME.camera_info', 'NAME/camera_info', "topic of the camera's calibration"),
     Spec('camera.NAME.position', list(POSITION),
-         'its place on the body, FLU', Range(unit='m'), fixed_length=True),
+         'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
     Spec('camera.NAME.rpy', list(AHEAD),
-         'its roll, pitch, yaw on the body; zeros look ahead, [0, 0, 1.5708] to the left',
+         'roll, pitch, yaw of the camera on the body; zeros look ahead, [0, 0, 1.5708] to the '
+         'left',
          Range(unit='rad'), fixed_length=True),
-    Spec('camera.NAME.rectified', False, 'its images are undistorted already'),
-    Spec('camera.NAME.time_offset', 0.0, 'as time_offset of one camera',
+    Spec('camera.NAME.rectified', False, 'whether the images are undistorted already'),
+    Spec('camera.NAME.time_offset', 0.0, 'time_offset of this camera',
          Range(-MOST_OFFSET, MOST_OFFSET, 's')),
-    Spec('camera.NAME.readout_time', 0.0, 'as readout_time of one camera',
+    Spec('camera.NAME.readout_time', 0.0, 'readout_time of this camera',
          Range(0.0, LONGEST_READOUT, 's')),
 ]
 #: The parameters of one camera that has no name: their key below camera.NAME, and the default.
@@ -60,11 +61,11 @@ ALONE: Final[Mapping[str, tuple[str, Any]]] = {
 
 
 class CameraValues(NamedTuple):
-    """What the parameters say of one camera; its name is '' where there is no other."""
+    """The parameters of one camera; its name is '' if there is no other."""
 
     name: str
     image: str = 'image_raw'
-    """Topic of the images as they are told; see :meth:`images`."""
+    """Base topic of the images; see :meth:`images`."""
     camera_info: str = 'camera_info'
     position: Sequence[float] = POSITION
     rpy: Sequence[float] = AHEAD
@@ -79,9 +80,10 @@ class CameraValues(NamedTuple):
 
 def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     """
-    Return the cameras that the checked values of a node's parameters tell of.
+    Return the cameras in the checked values of a node's parameters.
 
-    :raises ValueError: where two of them cannot be two, or what is for one stands beside several.
+    :raises ValueError: if two cameras share a name or a topic, or if a parameter of a single
+        camera is set beside several cameras.
     """
     names = [name for name in values[NAMES] if name]
     if not names:
@@ -101,14 +103,14 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
 
 def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
     """
-    Return one of several cameras, or the first, and the values as if it were the only one.
+    Return a camera by name, or the first one, and the values for a system of only this camera.
 
-    :raises ValueError: where none of them has that name.
+    :raises ValueError: if none of them has that name.
     """
-    told = cameras(values)
-    found = next((camera for camera in told if name in ('', camera.name)), None)
+    configured = cameras(values)
+    found = next((camera for camera in configured if name in ('', camera.name)), None)
     if found is None:
-        names = ', '.join(camera.name for camera in told if camera.name)
+        names = ', '.join(camera.name for camera in configured if camera.name)
         raise ValueError(f'camera {name}: must be {f"one of {names}" if names else "left out"}')
     return found, {**values, **{single: getattr(found, key) for single, (key, _) in ALONE.items()
                                 if single in values}}

@@ -102,7 +102,7 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     """
     Return the checked values of a parsed parameter file, see :func:`read_parameters`.
 
-    :raises ValueError: naming what is wrong.
+    :raises ValueError: naming the fault.
     """
     if not isinstance(document, Mapping):
         raise ValueError('must map names of nodes to ros__parameters')
@@ -154,7 +154,7 @@ def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
     Return the values of the sections ``follower`` beside a node; the last file wins.
 
     :param node: the node's full name, as '/drone1/planner'.
-    :raises ValueError: naming the file, and what is wrong with it.
+    :raises ValueError: naming the file and its fault.
     :raises OSError: if a file cannot be read.
     """
     follower = f'{node.rpartition("/")[0]}/{SHARED}'
@@ -241,7 +241,7 @@ def _contents(prefix: str, document: Any) -> Iterator[tuple[str, Mapping[str, An
 
 
 def _means(section: str, node: str) -> bool:
-    """Return whether ROS gives a node what is under a section: * is one name, ** any number."""
+    """Return whether a section applies to a node in ROS: * is one name, ** any number."""
     wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
     pattern = ''.join(wildcards.get(token, '/' + re.escape(token))
                       for token in section.strip('/').split('/'))

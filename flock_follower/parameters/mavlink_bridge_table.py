@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the MAVLink bridge, and what is built from them."""
+"""The parameters of the MAVLink bridge, and the objects built from them."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.
           'height': Range(-10_000.0, 10_000.0, 'm')}
 SPECS = [
     Spec('connection', 'udpin:127.0.0.1:14540',
-         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
+         'connection to the autopilot: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
          '/dev/DEVICE[,BAUD]'),
-    Spec('autopilot', 'auto', 'its firmware; auto: as its HEARTBEAT says', AUTOPILOTS),
+    Spec('autopilot', 'auto', 'firmware of the autopilot; auto: by its HEARTBEAT', AUTOPILOTS),
     Spec('target_system', 1,
-         'MAVLink system id of the autopilot, the only one listened to', IDS),
+         'MAVLink system id of the autopilot; others are ignored', IDS),
     Spec('source_system', 1, 'own MAVLink system id', IDS),
     Spec('announce_as_gcs', False,
-         'send the HEARTBEAT of a ground station, so that PX4 tells its STATUSTEXTs on this '
-         'link, too. While the bridge runs PX4 then takes the ground station for connected: the '
-         'failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) does not act, and '
-         'acts when the bridge ends. ArduPilot goes by the system id, and talks anyway'),
+         'send the HEARTBEAT of a ground station, so that PX4 sends its STATUSTEXTs on this '
+         'link, too. While the bridge runs, PX4 then counts a ground station as connected: the '
+         'failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) acts only when the '
+         'bridge ends. ArduPilot checks the system id, and sends them anyway'),
     Spec('report_to_gcs', True,
          "send the planner's state as STATUSTEXT, at most one per 2 s, and the distance as "
          'NAMED_VALUE_FLOAT flock_dist, 1 Hz; PX4 forwards them with MAV_n_FORWARD 1'),
@@ -51,33 +51,33 @@ SPECS = [
     Spec('stream_rate', 20.0,
          'rate of setpoints between new commands', Range(5.0, 100.0, 'Hz')),
     Spec('telemetry_rate', 50.0,
-         "wanted rate of the autopilot's position and attitude; 20 for 57600 baud",
+         "requested rate of the autopilot's position and attitude; 20 for 57600 baud",
          Range(5.0, 200.0, 'Hz')),
     Spec('forward_odometry', False,
          'send odom to the autopilot as ODOMETRY, for flight without GPS'),
     Spec('odometry_rate', 30.0,
-         'most ODOMETRY messages per second, of 247 bytes each; 10 for 57600 baud',
+         'largest rate of ODOMETRY messages, of 247 bytes each; 10 for 57600 baud',
          Range(10.0, 100.0, 'Hz')),
     Spec('global_origin', [0.0, 0.0, 0.0],
-         'latitude, longitude (deg) and height (m) told to an estimator that has no origin, as '
-         'it has none without GPS; PX4 is told no height. Zeros: not set; PX4 is then told one '
-         'near Zurich where odometry is forwarded and GPS off', fixed_length=True),
+         'latitude, longitude (deg) and height (m) sent to an estimator without an origin (no '
+         'GPS); PX4 receives no height. Zeros: not set; PX4 then receives one near Zurich if '
+         'odometry is forwarded and GPS off', fixed_length=True),
     Spec('require_failsafe', True,
          'refuse offboard while the autopilot would fly the last setpoint for over 1 s if the '
          'bridge died (COM_OF_LOSS_T, GUID_TIMEOUT), or stop its motors (COM_OBL_RC_ACT), or '
          'does not fuse the odometry that is forwarded to it (EKF2_EV_CTRL; VISO_TYPE, '
-         'EK3_SRC1_POSXY, EK3_SRC1_VELXY), or tells not'),
+         'EK3_SRC1_POSXY, EK3_SRC1_VELXY), or does not answer'),
     Spec('takeoff_height', 2.5,
-         'height the takeoff service climbs by', Range(0.5, 30.0, 'm'), live=True),
+         'climb of the takeoff service', Range(0.5, 30.0, 'm'), live=True),
     Spec('velocity_source', 'auto',
-         'velocity for v_max and braking; auto: odom once heard', VELOCITY_SOURCES),
+         'velocity for v_max and braking; auto: odom once received', VELOCITY_SOURCES),
     Spec('blind_action', 'land',
-         'what follows after 2 s without any velocity, when the stream stops: a landing is '
-         'requested; or silence only, on which PX4 fails over and ArduPilot stays in GUIDED',
+         'action after 2 s without any velocity, when the stream stops: land requests a landing; '
+         'silence requests nothing: PX4 starts its failsafe, ArduPilot stays in GUIDED',
          BLIND_ACTIONS),
     Spec('wind_compensation', 'auto',
-         'offset the steady acceleration by the wind, up to 1 m/s^2; auto: for PX4, which does '
-         'not do so itself', WIND_COMPENSATIONS),
+         'offset the steady acceleration of the wind, up to 1 m/s^2; auto: only for PX4, which '
+         'has no such correction', WIND_COMPENSATIONS),
     *specs_of(GateLimits()),
     *specs_of(EndParams()),
     *specs_of(SourceParams(), 'odom_'),
@@ -88,7 +88,7 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     """
     Return latitude and longitude, deg, and height, m, or None for zeros.
 
-    :raises ValueError: where they are no place on Earth.
+    :raises ValueError: if they are no place on Earth.
     """
     if not any(values):
         return None

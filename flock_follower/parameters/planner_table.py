@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the planner, with the core's own defaults and ranges, and what they suit."""
+"""The parameters of the planner, with the defaults and ranges of the planner's classes."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from flock_follower.ranges import Range
 
 SPECS = [
     Spec('require_bridge', True,
-         'command only while mavlink_bridge/state says ACTIVE; false where somebody else flies '
-         'the commands, such as MAVROS'),
+         'command only while mavlink_bridge/state is ACTIVE; false if another program flies the '
+         'commands, such as MAVROS'),
     *specs_of(PlannerParams()),
     Spec('neighbors_file', '',
-         'YAML file of the neighbors, as relative_pose has it: their roles and radii; empty: '
-         'everyone seen is a leader of no size'),
+         'YAML file of the neighbors, the same as for relative_pose: roles and radii; empty: '
+         'every vehicle seen is a leader of radius 0'),
     Spec('camera_rpy', [0.0, 0.0, 0.0],
-         'as relative_pose has it: roll, pitch, yaw of the camera on the body',
+         'roll, pitch, yaw of the camera on the body, the same as for relative_pose',
          Range(unit='rad'), fixed_length=True),
     *CAMERA_SPECS,
     *specs_of(SourceParams(), 'odom_'),
@@ -47,9 +47,9 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     """
     Return the parameters of the core.
 
-    :param name: one's own, as others know it: it may stand in the neighbours' file, too.
-    :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
-    :raises OSError: where it cannot be read.
+    :param name: of this vehicle; the neighbours' file may contain it, too.
+    :raises ValueError: if they do not fit together, or the neighbours' file is wrong.
+    :raises OSError: if it cannot be read.
     """
     cameras(values)
     return filled(PlannerParams(), values, vehicles={

@@ -46,14 +46,14 @@ SPECS = [
          'an image of stamp t was exposed at t + time_offset on the clock of odom (as '
          'timeshift_cam_imu of Kalibr)', Range(-MOST, MOST, 's')),
     Spec('time_offset_mode', 'auto',
-         'auto: time_offset is where to begin, the true one is estimated, and applied once sure; '
-         'fixed: time_offset is right', ('auto', 'fixed')),
+         'auto: time_offset is the initial value, the true offset is estimated, and applied once '
+         'certain; fixed: time_offset is exact', ('auto', 'fixed')),
     Spec('readout_time', 0.0,
-         'of a rolling shutter, from the first row of an image, exposed at its stamp, to the '
-         'last; 0: a global shutter', Range(0.0, 0.2, 's')),
+         'rolling shutter: time from the exposure of the first row, at the stamp, to that of the '
+         'last row; 0: global shutter', Range(0.0, 0.2, 's')),
     Spec('max_wait', 0.35,
-         'how long an image waits for odometry of its stamp at most; less where odometry is seen '
-         'to come sooner', Range(0.0, 1.0, 's')),
+         'longest time for which an image waits for odometry of its stamp; less if odometry '
+         'usually comes sooner', Range(0.0, 1.0, 's')),
     *specs_of(FilterParams()),
     *specs_of(RangingParams()),
     *specs_of(SourceParams(), 'odom_'),

@@ -118,7 +118,7 @@ class Spec:
         """
         Return the value in the parameter's type.
 
-        :raises ValueError: naming the parameter, the value and what is valid.
+        :raises ValueError: naming the parameter, the value and the valid range.
         """
         checked = self._convert(value)
         if checked is None:

@@ -27,8 +27,9 @@ With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (
 - equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
   (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
 
-They are written out here, not taken from cv2, because its undistortion stops early, its accuracy
-option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians otherwise.
+The models are written out here, not taken from cv2, because its undistortion stops early, its
+accuracy option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians
+otherwise.
 """
 
 from __future__ import annotations
@@ -58,12 +59,12 @@ class CameraModel:
     The intrinsic calibration of one camera.
 
     :param matrix: K, shape (3, 3), px.
-    :param distortion: D; shorter is filled up with zeros where the model allows it (none at all,
+    :param distortion: D; shorter is filled up with zeros if the model allows it (none at all,
         or plumb_bob's first four), surplus zeros at the end are ignored.
-    :param model: a key of ``DISTORTION_MODELS``; empty is taken for plumb_bob.
+    :param model: a key of ``DISTORTION_MODELS``; empty means plumb_bob.
     :param width: image width, px.
     :param height: image height, px.
-    :raises ValueError: naming what is wrong with the calibration.
+    :raises ValueError: naming the fault of the calibration.
     """
 
     matrix: Array
@@ -76,7 +77,7 @@ class CameraModel:
     #: K[:2, :2].T and K[:2, 2].
     _transposed: Array = field(init=False, repr=False)
     _middle: Array = field(init=False, repr=False)
-    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None where both are 0.
+    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None if both are 0.
     _aside: Array | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -120,7 +121,7 @@ class CameraModel:
         the left (3, 3) of P, (3, 4) or flat (12,), without distortion, and poses are then in
         the rectified frame.
 
-        :raises ValueError: naming what is wrong with the calibration.
+        :raises ValueError: naming the fault of the calibration.
         """
         if not rectified:
             return cls(_reshaped('K', K, (3, 3)), np.asarray(D, float), distortion_model,
@@ -136,7 +137,7 @@ class CameraModel:
 
         :param x_offset: first column of the region, full-resolution px; y_offset likewise.
         :param width: width of the region before binning, px; height likewise.
-        :raises ValueError: where the region is not inside the image.
+        :raises ValueError: if the region is not inside the image.
         """
         if (x_offset < 0 or y_offset < 0 or min(binning_x, binning_y) < 1
                 or not 0 < width <= self.width - x_offset
@@ -166,7 +167,7 @@ class CameraModel:
         """
         Return the pixels (N, 2) of points (N, 3) in the optical frame, m.
 
-        NaN where a point is behind the camera or so far aside that the distortion folds back.
+        NaN if a point is behind the camera or so far aside that the distortion folds back.
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         return self.distort(self._normalized(p)[0])
@@ -175,7 +176,7 @@ class CameraModel:
         """
         Return the pixels (N, 2) of normalised coordinates (N, 2) = (X/Z, Y/Z).
 
-        NaN where the distortion folds back.
+        NaN if the distortion folds back.
         """
         squares = xy * xy
         r2 = squares[:, 0] + squares[:, 1]
@@ -228,7 +229,7 @@ class CameraModel:
         """
         Return the normalised coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
 
-        Newton's method on the exact distortion, to 1e-12; NaN where no point projects there.
+        Newton's method on the exact distortion, to 1e-12; NaN if no point projects there.
         """
         offset = np.asarray(pixels, dtype=float).reshape(-1, 2) - self.matrix[:2, 2]
         target = offset @ np.linalg.inv(self.matrix[:2, :2]).T
@@ -250,7 +251,7 @@ class CameraModel:
         return xy
 
     def _normalized(self, points: Array) -> tuple[Array, Array]:
-        """Return (X/Z, Y/Z) (N, 2), NaN where it is not projected, and depths (N, 1), m."""
+        """Return (X/Z, Y/Z) (N, 2), NaN if it is not projected, and depths (N, 1), m."""
         depth = points[:, 2:]
         if not depth.min(initial=1.0) > 1e-9:
             depth = np.where(depth > 1e-9, depth, np.nan)

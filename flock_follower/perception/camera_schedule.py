@@ -56,7 +56,7 @@ class View(NamedTuple):
 
     own: OdometrySample
     rotation: Array
-    """Of the body, to odom, (3, 3)."""
+    """Rotation of the body, to odom, (3, 3)."""
     T_smooth_camera: Transform
     delay: float = 0.0
 
@@ -68,17 +68,17 @@ class View(NamedTuple):
 
     @property
     def turning(self) -> Array:
-        """Return one's own angular velocity (3,), rad/s, in odom."""
+        """Return the own angular velocity (3,), rad/s, in odom."""
         turning: Array = self.rotation.dot(self.own.angular_velocity)
         return turning
 
     def prior(self, estimate: Estimate | None) -> PosePrior:
-        """Return what is expected of a neighbour's pose, given its state, if that is known."""
+        """Return the expected pose of a neighbour, given its estimate or None."""
         pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
         return PosePrior(pose, self.T_smooth_camera.rotation[2])
 
     def moving(self, sight: Array) -> Array:
-        """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
+        """Return the change of the measured state, (15,), per s of offset, for a sight (3,), m."""
         (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
         a, b, c = self.own.velocity.tolist()
         # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
@@ -90,7 +90,7 @@ class View(NamedTuple):
         """
         Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
 
-        :param reference: the point (3,) on the body; :param estimate: its state, where known: else
+        :param reference: the point (3,) on the body; :param estimate: its state, if known: else
             it is taken to fly along.
         """
         to_camera = self.T_smooth_camera.rotation.T
@@ -155,34 +155,34 @@ class Sought(NamedTuple):
     near: Sequence[str]
     anywhere: Sequence[str]
     number: int
-    """How many they are."""
+    """Number of neighbours to search for."""
 
 
 class Look(NamedTuple):
-    """An image of a camera before it is looked at: what is expected in it, whom to look for."""
+    """An image of a camera before detection: the expected neighbours, and those to search for."""
 
     stamp: float
     camera: MountedCamera
     model: CameraModel
     views: dict[float, View]
-    """By how long after the stamp, s."""
+    """Delay of the exposure after the stamp, s."""
     expected: dict[str, PosePrior]
     sought: Sought
 
 
 class CameraSchedule:
     """
-    Shares out who is looked for where.
+    Assigns the neighbours to the cameras that search for them.
 
-    Every neighbour's filter has a clock: that of the camera that saw it first. Other cameras'
-    stamps are off it by what is applied of their time offsets.
+    Every neighbour's filter uses the clock of the camera that saw it first. Stamps of other
+    cameras differ from it by the applied time offsets.
     """
 
     def __init__(self, neighbors: Sequence[MarkedNeighbor],
                  cameras: Sequence[MountedCamera]) -> None:
         self._cameras = cameras
         self.shared = len(cameras) > 1
-        """Whether there is anything to share out."""
+        """Whether there are several cameras."""
         names = tuple(n.name for n in neighbors)
         self.everybody = Sought(names, names, len(names))
         """All are looked for everywhere."""
@@ -193,16 +193,16 @@ class CameraSchedule:
         self.restart()
 
     def restart(self) -> None:
-        """Forget who saw whom."""
+        """Forget which camera saw which neighbour."""
         self._seen: dict[str, tuple[MountedCamera, float]] = {}
         self._bases: dict[str, float] = {}
 
-    def time(self, name: str, camera: MountedCamera, moment: float) -> float:
-        """Return a moment, s, by a camera's clock as that of a neighbour's filter."""
+    def time(self, name: str, camera: MountedCamera, stamp: float) -> float:
+        """Return the time of a neighbour's filter, s, for a stamp of a camera, s."""
         if not self.shared:
-            return moment
+            return stamp
         base = self._bases.get(name)
-        time = moment if base is None else moment + (camera.time_offset.applied - base)
+        time = stamp if base is None else stamp + (camera.time_offset.applied - base)
         last, seen = self._seen.get(name, (camera, time))
         if last is not camera and abs(time - seen) < TOGETHER:
             return seen + STEP  # taken at once: one after the other for the filter
@@ -223,7 +223,7 @@ class CameraSchedule:
         camera.measured[name] = time
 
     def changed(self, camera: MountedCamera) -> None:
-        """Take that a camera's time offset has just changed: what it saw stays in its clock."""
+        """Note a change of a camera's time offset: its earlier stamps keep their times."""
         offset = camera.time_offset
         for name, (last, _) in self._seen.items():
             if last is camera:
@@ -233,10 +233,10 @@ class CameraSchedule:
                times: Mapping[str, float],
                place: Callable[[str], Transform | None]) -> Sought:
         """
-        Return whom to look for in an image of a stamp, s.
+        Return the neighbours to search for in an image of a stamp, s.
 
         :param times: of the image by the clocks of the filters, s.
-        :param place: says, when asked, about where one is, ``T_camera_body``, or None.
+        :param place: returns the approximate ``T_camera_body`` of a neighbour, or None.
         """
         near, anywhere = [], []
         for name, time in times.items():
@@ -269,7 +269,7 @@ class CameraSchedule:
         return False
 
     def search_due(self, camera: MountedCamera, stamp: float) -> bool:
-        """Return whether to search the whole image of a stamp, s, for somebody who is missing."""
+        """Return whether to search the whole image of a stamp, s, for a missing neighbour."""
         camera.wanting = stamp
         others = [c for c in self._cameras if c is not camera and c.wanting is not None
                   and abs(stamp - c.wanting) < SILENT]
@@ -290,7 +290,7 @@ class CameraSchedule:
 
 
 def _waited(searched: float | None, stamp: float) -> float:
-    """Return since when images were not searched, s; infinite where never."""
+    """Return since when images were not searched, s; infinite if never."""
     return math.inf if searched is None or stamp < searched else stamp - searched
 
 

@@ -45,14 +45,14 @@ from flock_follower.perception.print_model import EdgeModel, median
 #: An edge is in place where the fit explains it to within this, px.
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
-_FLOOR = 0.03  # px: no edge's place is believed to be better known
+_FLOOR = 0.03  # px: least standard deviation of an edge's place
 #: What a step leaves out goes with its square, and against the marker's size: where the square is
 #: more than this times the narrowest cell, px, edges are looked for again;
 _AGAIN = 0.2
 _ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
-_LONGEST_TURN = 1.0  # rad: after a longer step the edges it was told from are others
+_LONGEST_TURN = 1.0  # rad: after a longer step the edges must be found again
 _SETTLED = 2.0  # times as far as a step may go that nothing is looked for again after
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
@@ -86,13 +86,13 @@ class EdgeFit(NamedTuple):
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
     weights: Array
-    """(n,), 1/px^2: 0 where an edge was not found."""
+    """(n,), 1/px^2: 0 if an edge was not found."""
 
 
 def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
         spacing: tuple[float, float] | None = None) -> EdgeFit | None:
     """
-    Return the pose near ``start``, ``T_camera_body``, or None where there are no such edges.
+    Return the pose near ``start``, ``T_camera_body``, or None if its edges are not found.
 
     ``start`` may be off by half a cell of the marker in the image.
 
@@ -135,7 +135,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
             smear = max(map(truediv, blur, lines.narrowest))
             return _fitted(pose, lines, found, step, suited, smear)
         now = suited
-        # What was fitted to a part of the edges must not keep the others out.
+        # A fit to a part of the edges must not exclude the others.
         last = step if clear else None
         if farthest > _ANEW or turned:
             fresh = edges.project(camera, model, pose)
@@ -147,9 +147,9 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 def refit(camera: CameraModel, fitted: EdgeFit,
           start: Transform) -> tuple[Transform, float] | None:
     """
-    Return another pose near ``start`` that suits the edges found already, and its chi^2.
+    Return another pose near ``start`` that fits the edges found already, and its chi^2.
 
-    That is the weighted sum of their squares. None where there is no pose to be had.
+    chi^2 is the weighted sum of their squared residuals. None if no pose fits.
     """
     pose = start
     at = fitted.lines.pixels + fitted.residual[:, None] * fitted.lines.normals
@@ -173,7 +173,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], smear: float) -> EdgeFit | None:
-    """Return the fit that ends with a step, None where that leaves a direction open."""
+    """Return the fit that ends with a step, None if that leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
     covariance = normal_covariance(last.information)
@@ -191,9 +191,9 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
 
 class _Step(NamedTuple):
     """
-    A least-squares step (8,), what it moves edges by and leaves unexplained, (n,), px, px^2.
+    A least-squares step (8,), the motion of the edges, (n,), px, and their residuals, px^2.
 
-    ``weights`` (n,): how much each edge counts, 0..1, 0 where it was not found; ``variance``
+    ``weights`` (n,): how much each edge counts, 0..1, 0 if it was not found; ``variance``
     (2,): of where an edge of either axis is, px^2. ``information`` (8, 8) of the step.
     """
 
@@ -210,7 +210,7 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
     """
     Return the step that explains where edges were found, starting from the last weights.
 
-    None where no step can be told from the edges: the normal equations are not definite.
+    None if the edges determine no step: the normal equations are not definite.
     """
     axis, design, offsets = lines.model.axis, lines.design, found.offsets
     groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0

@@ -19,7 +19,7 @@ Brightness profiles are taken across the known edges between black and white. Th
 profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
 between black and white, the peak hardly moves if blur dims a narrow cell.
 
-``solve_normal`` and ``normal_covariance`` serve every fit. They solve normal equations of least
+``solve_normal`` and ``normal_covariance`` serve every fit. Both solve normal equations of least
 squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
 answers equations that only rounding keeps from being singular, and their inverse is no covariance.
 
@@ -48,9 +48,9 @@ _CHOLESKY = cv2.DECOMP_CHOLESKY
 
 def solve_normal(information: Array, moment: Array) -> Array | None:
     """
-    Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None where that is not definite.
+    Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None without a definite matrix.
 
-    What is not a number in either is not in x.
+    NaN in either gives NaN in x.
     """
     solved, x = cv2.solve(information, moment[:, None], flags=_CHOLESKY)
     return x[:, 0] if solved else None
@@ -60,7 +60,7 @@ def normal_covariance(information: Array) -> Array | None:
     """
     Return the inverse (n, n), symmetric and positive definite, of a symmetric matrix (n, n).
 
-    None where that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
+    None if that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
     """
     solved, inverse = cv2.invert(information, flags=_CHOLESKY)
     # In units in which each unknown alone has variance 1, the trace of the inverse bounds the
@@ -80,7 +80,7 @@ _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
 _LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
-_MIN_SLOPE = 1.0  # grey levels per px: a weaker edge is none
+_MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
 _MIN_SHARE = 0.5  # of the edges must be found
 _WIDE = 0.5  # px between samples, for sharp images of large markers
 _FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
@@ -88,8 +88,8 @@ _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
 _LEAST_VARIANCE = 1e-9  # px^2: to divide by
-_FARTHEST = 1e4  # m: a pose beyond, or NaN, is none
-#: A peak at the rim of the range is none, and its neighbours are out of it: looked at one inside.
+_FARTHEST = 1e4  # m: a pose beyond, or NaN, is invalid
+#: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
 _ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
 _DIFFERENCE = np.array([1.0, -1.0])
@@ -149,8 +149,8 @@ def facing(model: EdgeModel, pose: Transform) -> Any:
     if not within_reason(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
-    away = (sight * model.facings).dot(_SUM)
-    return -away > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
+    along = (sight * model.facings).dot(_SUM)
+    return -along > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
 
 
 def within_reason(pose: Transform) -> bool:
@@ -160,7 +160,7 @@ def within_reason(pose: Transform) -> bool:
 
 def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:
     """
-    Return the edges as a pose, ``T_camera_body``, has them; None where the lens does not see all.
+    Return the edges as a pose, ``T_camera_body``, has them; None if the lens does not see all.
 
     All markers of the model must face the camera.
     """
@@ -224,7 +224,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
     """
     Return where brightness rises most steeply along each line's normal.
 
-    None where too few edges, or too faint ones, are there. ``spacing``, px, between samples
+    None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
     across edges of either axis.
     """
     model = lines.model
@@ -255,7 +255,7 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
     """
     Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
 
-    The image's edge repeats outside. None where hardly anything is inside. ``widest`` is the
+    The image's edge repeats outside. None if hardly anything is inside. ``widest`` is the
     longest step, px.
     """
     # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
@@ -320,7 +320,7 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
 
 
 def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
-    """Return the median variance of the known edges of either axis, px^2; 0 where none is."""
+    """Return the median variance of the known edges of either axis, px^2; 0 without one."""
     first, second = known
     return (median(variance[first]) if len(first) else 0.0,
             median(variance[second]) if len(second) else 0.0)

@@ -13,20 +13,20 @@
 # limitations under the License.
 
 """
-Data association: which of those who carry a neighbour's marker the neighbour is.
+Data association: selects the neighbour's track among all markers with its id.
 
-An id may be there twice: on the neighbour, and on a print on a wall. One track is believed to be
-the neighbour. Every other candidate gets a track of its own, and that one changes places with the
-believed one only where it can be the neighbour:
+An id may appear twice: on the neighbour, and on a print on a wall. The primary track is used as
+the neighbour. Every other candidate has a track of its own, which replaces the primary track only
+if it can be the neighbour:
 
 ===============================  ================================================================
-the believed one is              the candidate takes its place
+the primary track is             the candidate takes its place
 ===============================  ================================================================
-in view, and has never moved     once it has moved: a print does not; or at once, if the believed
-                                 one began anew, farther from where it was lost
+in view, and has never moved     once it has moved: a print does not; or at once, if the primary
+                                 track restarted farther from where it was lost
 not seen since the candidate     after ``max_rejections`` measurements, if from the newest place
-is, nor ever beside it           believed no more than ``leader_speed_max`` leads to where it was
-                                 first seen, or if it has moved, or after PATIENCE
+is, nor ever beside it           of the primary track ``leader_speed_max`` reaches the candidate's
+                                 first place, or if it has moved, or after PATIENCE
 out of view                      after PATIENCE, if it has moved; never, if it stands still
 ===============================  ================================================================
 
@@ -43,23 +43,23 @@ from flock_follower.messages import duplicate_name, MAX_JUMP
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import FilterParams
 
-#: A measurement nearer than this to where a candidate is expected is of that candidate, m.
+#: A measurement nearer than this to a candidate's expected place is of that candidate, m.
 SAME = 0.3
-#: By how much a restart may be farther than the speed allows, m: errors of both places.
+#: Tolerance of the distance of a restart, m: errors of both places.
 SLACK = 0.3
-#: A candidate that is so far from where it was less than WINDOW, s, before has moved, m.
+#: A candidate has moved if it covers this distance, m, within WINDOW, s.
 MOVED = 0.5
 WINDOW = 5.0
-#: So many measurements make a candidate more than a false detection.
+#: A candidate with fewer measurements may be a false detection.
 CONFIRMED = 3
-#: The believed one is unseen for so long, s, before a candidate that it may be is taken for it.
+#: The primary track must be unseen for this long, s, before a candidate can replace it.
 PATIENCE = 10.0
-#: A candidate that stands still is remembered for so long, s, after it was seen.
+#: A candidate at rest is kept for this long, s, after its last measurement.
 MEMORY = 30.0
-#: Candidates beside the believed one.
+#: Largest number of candidates.
 MOST = 3
-#: Not measured for longer than this, s, the believed one takes no surprise for itself: whoever is
-#: outside its gate becomes a candidate.
+#: If the primary track was not measured for longer than this, s, every measurement outside its
+#: gate becomes a candidate.
 GAP = 0.5
 #: Images not farther apart than this, s, were taken at once.
 TOGETHER = 1e-3
@@ -81,7 +81,7 @@ class _Motion:
 
 
 class Candidate:
-    """A track that is not believed to be the neighbour's; candidates are numbered from 1 on."""
+    """A track other than the primary one; candidates are numbered from 1 on."""
 
     def __init__(self, number: int, track: NeighborFilter, reachable: bool) -> None:
         self.number, self.track, self.reachable = number, track, reachable
@@ -89,9 +89,9 @@ class Candidate:
         self.measured = 0
         """Measurements taken in."""
         self.alone = 0
-        """Those of them since the believed one was measured last."""
+        """Measurements since the last one of the primary track."""
         self.beside = False
-        """Whether the believed one was ever measured in the same image."""
+        """Whether the primary track was ever measured in the same image."""
 
     @property
     def confirmed(self) -> bool:
@@ -130,39 +130,39 @@ class Candidate:
 
 
 class Taken(NamedTuple):
-    """What became of a measurement: ``candidate`` None where it is of the believed one."""
+    """The outcome of a measurement: ``candidate`` is None if it is of the primary track."""
 
     outcome: UpdateOutcome
     candidate: Candidate | None = None
 
 
 class Hypotheses:
-    """The track believed to be one neighbour, and the candidates that carry its marker."""
+    """The primary track of one neighbour, and the candidates with the same marker."""
 
     def __init__(self, params: FilterParams) -> None:
         self.params = params
-        self.believed = NeighborFilter(params)
+        self.primary = NeighborFilter(params)
         self.reset()
 
     def reset(self) -> None:
         """Forget all of them."""
-        self.believed.reset()
+        self.primary.reset()
         self._motion = _Motion()
         self._lost: Array | None = None
-        """Where the believed one was before it began anew (3,), m; None where it did not."""
+        """Where the primary track was before it restarted (3,), m; None if it did not."""
         self.candidates: list[Candidate] = []
 
     @property
     def tracks(self) -> list[NeighborFilter]:
         """Return the filters of all of them."""
-        return [self.believed, *(each.track for each in self.candidates)]
+        return [self.primary, *(each.track for each in self.candidates)]
 
-    def whose(self, time: float, place: Array) -> Candidate | None:
-        """Return of which candidate a measurement at a place (3,), m, is; None: of none."""
+    def candidate_at(self, time: float, place: Array) -> Candidate | None:
+        """Return the candidate that a measurement at a place (3,), m, belongs to, or None."""
         if not self.candidates:
             return None
         nearest = min(self.candidates, key=lambda each: each.distance(time, place))
-        expected = self.believed.place(time)
+        expected = self.primary.place(time)
         least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
         return nearest if nearest.distance(time, place) < least else None
 
@@ -171,23 +171,23 @@ class Hypotheses:
         """
         Take in a body's pose; see ``NeighborFilter.update``.
 
-        :param another: whether the believed one is elsewhere in the same image.
+        :param another: whether the primary track is elsewhere in the same image.
         """
-        newest = self.believed.newest
+        newest = self.primary.newest
         if newest is not None and time < newest.stamp - MAX_JUMP:
             self.reset()
         self._forget(time)
-        candidate = self.whose(time, measured.translation)
+        candidate = self.candidate_at(time, measured.translation)
         arguments = time, measured, reference, covariance
         if candidate is None:
-            outcome = UpdateOutcome.OUTLIER if another else self._believe(*arguments)
+            outcome = UpdateOutcome.OUTLIER if another else self._update_primary(*arguments)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
             candidate = self._add(time, measured.translation)
         if time <= candidate.seen:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
-        last = self.believed.newest
+        last = self.primary.newest
         if another or (last is not None and abs(time - last.stamp) < TOGETHER):
             candidate.beside, candidate.alone = True, 0
         if self._is_neighbor(candidate, time):
@@ -195,15 +195,15 @@ class Hypotheses:
             return Taken(UpdateOutcome.STARTED)
         return Taken(UpdateOutcome.OUTLIER, candidate)
 
-    def _believe(self, time: float, measured: Transform, reference: Array,
+    def _update_primary(self, time: float, measured: Transform, reference: Array,
                  covariance: Array) -> UpdateOutcome:
-        """Take in a measurement of the believed one, if it can be that."""
-        last, reach = self.believed.newest, self._reach(time)
-        if last is not None and time > last.stamp and self.believed.place(time) is None and (
+        """Update the primary track with a measurement, if it can be of it."""
+        last, reach = self.primary.newest, self._reach(time)
+        if last is not None and time > last.stamp and self.primary.place(time) is None and (
                 math.dist(measured.translation, last.position) > reach):
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
-        outcome = self.believed.update(time, measured, reference, covariance,
+        outcome = self.primary.update(time, measured, reference, covariance,
                                        reach if surprised else 0.0)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
@@ -214,14 +214,14 @@ class Hypotheses:
         return outcome
 
     def _reach(self, time: float) -> float:
-        """Return how far from its newest place the believed one can be, m."""
-        last = self.believed.newest
+        """Return how far from its newest place the primary track can be, m."""
+        last = self.primary.newest
         return SLACK if last is None else (
             SLACK + self.params.leader_speed_max * max(time - last.stamp, 0.0))
 
     def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
-        """Return whether a candidate is to be believed from now on; see the module."""
-        moved, last = candidate.motion.moved, self.believed.newest
+        """Return whether a candidate replaces the primary track; see the module."""
+        moved, last = candidate.motion.moved, self.primary.newest
         if candidate.measured < self.params.max_rejections:
             return False
         if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
@@ -234,18 +234,18 @@ class Hypotheses:
         return candidate.reachable or moved or patient
 
     def _nearer_to_loss(self, candidate: Candidate) -> bool:
-        """Return whether a candidate is nearer to where the believed one was lost than that is."""
-        now, other = self.believed.newest, candidate.track.newest
+        """Return whether a candidate is nearer than the primary track to the place of its loss."""
+        now, other = self.primary.newest, candidate.track.newest
         return self._lost is not None and now is not None and other is not None and (
             math.dist(other.position, self._lost) < math.dist(now.position, self._lost))
 
     def _exchange(self, candidate: Candidate) -> None:
-        """Believe a candidate; the one believed so far stays one where both were seen at once."""
-        last = self.believed.newest
+        """Make a candidate primary; the old primary track stays if both were seen at once."""
+        last = self.primary.newest
         self._lost = None if candidate.beside or last is None else last.position
-        before = self.believed.continued(self.params.max_gap)
-        self.believed.reset()
-        self.believed.newest = candidate.track.newest
+        before = self.primary.continued(self.params.max_gap)
+        self.primary.reset()
+        self.primary.newest = candidate.track.newest
         self._motion, candidate.motion = candidate.motion, self._motion
         candidate.track, candidate.alone = before, 0
         if not candidate.beside:
@@ -256,10 +256,10 @@ class Hypotheses:
         if len(self.candidates) == MOST:
             self.candidates.remove(min(self.candidates, key=lambda c: (c.confirmed, c.seen)))
         number = min({*range(1, MOST + 1)} - {each.number for each in self.candidates})
-        last = self.believed.newest
+        last = self.primary.newest
         candidate = Candidate(number, NeighborFilter(self.params), (
             last is not None and math.dist(place, last.position) <= self._reach(time)))
-        candidate.track.walk = self.believed.walk
+        candidate.track.walk = self.primary.walk
         self.candidates.append(candidate)
         return candidate
 

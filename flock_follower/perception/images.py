@@ -49,7 +49,7 @@ def file_size(data: bytes) -> tuple[int, int]:
     """
     Return width and height, px, of a JPEG or PNG file.
 
-    :raises ValueError: where it is neither, is larger than ``MAX_PIXELS``, its structure does not
+    :raises ValueError: if it is neither, is larger than ``MAX_PIXELS``, its structure does not
         fit into its length, or its end is missing.
     """
     if data.startswith(_PNG):
@@ -135,7 +135,7 @@ def decode_image(message: Any) -> GrayImage:
     """
     Return the pixels of an Image or CompressedImage message, (H, W) uint8.
 
-    :raises ValueError: where they cannot be decoded.
+    :raises ValueError: if they cannot be decoded.
     """
     if hasattr(message, 'format'):
         return decode_compressed(message.data)
@@ -182,7 +182,7 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: where OpenCV cannot decode it, or should not, see ``image_files``.
+    :raises ValueError: if OpenCV cannot decode it, or should not, see ``image_files``.
     """
     payload = np.frombuffer(data, dtype=np.uint8)
     file_size(payload.tobytes())
@@ -213,7 +213,7 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
     """
     Return a (height, width) uint8 image as a JPEG file of a quality from 0 to 100.
 
-    :raises ValueError: where OpenCV cannot encode it.
+    :raises ValueError: if OpenCV cannot encode it.
     """
     done, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:

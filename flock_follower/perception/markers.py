@@ -38,13 +38,13 @@ A neighbour that carries several has, instead of the last four keys, a list of t
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
-Either may say what it is for the planner::
+Each neighbour may have keys for the planner::
 
         role: follower           # leader (the default), follower, or avoid: kept clear of only
         radius: 0.3              # m, of its hull: distances are kept between hulls; 0
 
-``tag_position: [x, y, z]``, m, on its body, says where the antenna is that ranges are measured to;
-without it they are to the body's origin.
+``tag_position: [x, y, z]``, m, on its body, is the antenna that ranges are measured to;
+without it ranges are measured to the body's origin.
 
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
@@ -168,7 +168,7 @@ def draw_marker(dictionary: str, marker_id: int, side_px: int, border_bits: int 
 @lru_cache(maxsize=64)
 def marker_code(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     """
-    Return a marker's cells (n, n), the border included, first row on top, True where white.
+    Return a marker's cells (n, n), the border included, first row on top, True for white ones.
 
     :raises ValueError: for an unknown dictionary or id.
     """
@@ -178,7 +178,7 @@ def marker_code(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
 @lru_cache(maxsize=16)
 def dictionary_words(dictionary: str) -> NDArray[np.bool_]:
     """
-    Return the inner cells of all markers, (size, b, b), True where white.
+    Return the inner cells of all markers, (size, b, b), True for white ones.
 
     :raises ValueError: for an unknown dictionary.
     """
@@ -260,7 +260,7 @@ class MarkedNeighbor:
     role: str = 'leader'
     """One of ``ROLES``."""
     radius: float = 0.0
-    """Of its hull, m."""
+    """Radius of its hull, m."""
     tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 
@@ -289,8 +289,8 @@ def load(path: str | Path) -> NeighborConfig:
     """
     Read a neighbours file.
 
-    :raises ValueError: naming the file, the key, its value and what is valid.
-    :raises OSError: where the file cannot be read.
+    :raises ValueError: naming the file, the key, its value and the valid range.
+    :raises OSError: if the file cannot be read.
     """
     text = Path(path).read_text(encoding='utf-8')
     try:
@@ -305,7 +305,7 @@ def parse(document: Any) -> NeighborConfig:
     """
     Return the configuration of a parsed YAML document.
 
-    :raises ValueError: naming the key, its value and what is valid.
+    :raises ValueError: naming the key, its value and the valid range.
     """
     _check_keys('', document, {'dictionary', 'neighbors'})
     dictionary = document['dictionary']

@@ -45,7 +45,7 @@ SAME = 0.02
 
 class PosePrior(NamedTuple):
     """
-    What is known before the image.
+    The prediction before an image.
 
     ``pose``: the expected ``T_camera_body``, or None; ``up``: unit vector opposite to gravity in
     the camera's optical frame, (3,), or None.
@@ -56,7 +56,7 @@ class PosePrior(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A pose, the chi^2 of its residuals, and the fit that it is the result of, if any."""
+    """A pose, the chi^2 of its residuals, and its fit, if any."""
 
     pose: Transform
     chi2: float
@@ -72,7 +72,7 @@ class Choice(NamedTuple):
 
 
 def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
-    """Return the likeliest of one or two poses, given their residuals and what is expected."""
+    """Return the likeliest of one or two poses, given their residuals and the prediction."""
     if len(poses) == 2 and angle(poses[0].pose, poses[1].pose) < SAME:
         poses = [min(poses, key=lambda p: p.chi2)]
     if len(poses) == 1:
@@ -115,11 +115,11 @@ class Measurement(NamedTuple):
     ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
     position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
     R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges, or corners,
-    are from where the pose has them, px, of a smeared marker what its image differs by from the
-    pose's, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
-    ``spacing``, px, of brightness profiles suited the image, None where there were none.
-    ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 where both are
-    one, infinite where several markers leave no doubt, None where that was not looked at.
+    are from their projections, px; of a smeared marker the difference of its image from the
+    rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
+    ``spacing``, px, of the brightness profiles, None without profiles.
+    ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
+    equal, infinite if several markers decide it, None if it was not checked.
     """
 
     name: str
@@ -153,7 +153,7 @@ def widened(measurement: Measurement, best: Choice) -> Measurement:
 
 
 def likeliest(several: Sequence[Measurement], expected: Transform | None) -> Measurement:
-    """Return which measurement of one neighbour to believe: prints and reflections happen."""
+    """Return the likeliest measurement of one neighbour: prints and reflections happen."""
     # A print on the wall behind is farther away.
     place = np.zeros(3) if expected is None else expected.translation
     return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))
@@ -171,7 +171,7 @@ SIGMA_OUTLINE = 0.8
 def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
                  starts: list[Transform], expected: PosePrior) -> Measurement | None:
     """
-    Return the neighbour ``name`` by four corners of its marker, or None where no pose suits them.
+    Return the neighbour ``name`` by four corners of its marker, or None if no pose suits them.
 
     :param corners: (4, 2), px, from top-left on, clockwise.
     :param starts: poses ``T_camera_body`` to start from, at least one.

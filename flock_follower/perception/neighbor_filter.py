@@ -60,21 +60,21 @@ from flock_follower.perception.neighbor_motion import (
 
 #: chi^2 with 1 degree of freedom at a probability of 0.99: detours are frequent, ranges too.
 RANGE_GATE = 6.63
-#: One that is too short is refused, too, where its chi^2 is so many times the gate's.
+#: A distance that is too short is refused, too, if its chi^2 is this many times the gate's.
 RANGE_WILD = 10.0
-#: Of how many distances the share that is refused is told.
+#: Number of distances over which the refused share is reported.
 COUNTED = 200
 
 
 class Verdict(NamedTuple):
-    """What to do with measured distances, (n,) each."""
+    """The treatment of measured distances, (n,) each."""
 
     used: Any
     """Whether to use it."""
     prior: Array
-    """By what to multiply the variances of what was predicted."""
+    """Factor on the predicted variances."""
     spread: Array
-    """By what to multiply, after that, the variance of the innovation: the noise is larger."""
+    """Factor on the variance of the innovation after that: the noise is larger."""
 
 
 class RangeGate:
@@ -121,16 +121,16 @@ class RangeGate:
 
 
 _IDENTITY = np.eye(SIZE)
-#: What of the error state is measured where the attitude is not believed.
+#: Rows of the error state that are measured if the attitude is not used.
 _PLACE = _IDENTITY[POSITION]
-#: What the wandering of one's own position adds to, (15, 15).
+#: States to which the drift of the own position adds noise, (15, 15).
 _WANDERING = _PLACE.T.dot(_PLACE)
 #: Of the error state: what moves, and what turns.
 _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
 _TURNING = np.r_[ATTITUDE, RATE]
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
 GATE = 16.27
-#: A measurement is refused where its chi^2 is so many times the gate's: 13 standard deviations.
+#: A measurement is refused if its chi^2 is so many times the gate's: 13 standard deviations.
 WILD = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
@@ -153,12 +153,12 @@ class UpdateOutcome(Enum):
 
 class Step(NamedTuple):
     """
-    How a measurement was taken in, for those who learn from it.
+    The update by a measurement, for the estimators of noise and time offset.
 
     The state went through ``transition`` (15, 15) to its stamp; there ``gain`` (15, n) times
-    ``innovation`` (n,), of covariance ``spread`` (n, n), was added. ``jacobian`` (n, 15) is what
-    was measured of the error state: n is 6, or 3 where only the position was used. ``expected``
-    (3, 3) is the covariance that the position's innovation, the first three, was expected to have.
+    ``innovation`` (n,), of covariance ``spread`` (n, n), was added. ``jacobian`` (n, 15) is that
+    of the measurement to the error state; n is 6, or 3 if only the position was used.
+    ``expected`` (3, 3) is the expected covariance of the position's innovation.
     """
 
     transition: Array
@@ -173,34 +173,34 @@ class NeighborFilter:
     """
     The filter of one neighbour.
 
-    A measurement outside the gate is neither believed as it is nor refused. The first gets the
-    weight that puts it on the gate: it may be wrong. Where the next one is off to the same side,
-    the track is wrong, and what is predicted is taken for less certain. What is ``WILD``, or
-    outside the gate and out of reach, is refused: ``hypotheses`` tracks it apart.
+    A measurement outside the gate is used with less weight. The first gets the weight that puts it
+    on the gate: it may be wrong. If the next one is off to the same side, the track is wrong, and
+    the covariance of the prediction grows. A measurement that is ``WILD``, or outside the gate and
+    out of reach, is refused: ``hypotheses`` tracks it separately.
     """
 
     def __init__(self, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
         self.walk = 0.0
-        """Of one's own position, m/sqrt(s)."""
+        """Drift of the own position, m/sqrt(s)."""
         self._steps: dict[float, tuple[Array, Array, Array]] = {}
         self.reset()
 
     def reset(self) -> None:
         """Forget the neighbour."""
         self.step: Step | None = None
-        """How the newest measurement was taken in; None where it was not, or began the track."""
+        """How the newest measurement was used; None if it was not, or if it began the track."""
         self.newest: Estimate | None = None
         """The state at the newest measurement; None if there is no track."""
-        self._predicted: Estimate | None = None  # from that, to where it was last asked for
-        self._turned = 0  # measurements in a row whose attitude was not believed
+        self._predicted: Estimate | None = None  # from that, to the time last requested
+        self._turned = 0  # measurements in a row whose attitude was not used
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
         self._line = _CENTRE  # on which the last distance was measured
 
     def predict(self, stamp: float) -> Estimate | None:
         """
-        Return the state expected at a stamp, s, or None where no track reaches there.
+        Return the state expected at a stamp, s, or None if no track reaches there.
 
         The filter itself is not altered. A stamp before the newest measurement gives None.
         """
@@ -307,9 +307,9 @@ class NeighborFilter:
         """
         Compare a measurement with the expected state, the attitude first.
 
-        Return the expected covariance (15, 15), whether the attitude is plausible, and what was
-        measured: its Jacobian (n, 15), noise (n, n) and innovation (n,); n is 6, or 3 where the
-        attitude is not plausible and only the position counts.
+        Return the expected covariance (15, 15), whether the attitude is plausible, and the
+        measurement's Jacobian (n, 15), noise (n, n) and innovation (n,); n is 6, or 3 if the
+        attitude is not plausible and only the position is used.
         """
         prior = expected.covariance
         turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
@@ -337,11 +337,11 @@ class NeighborFilter:
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
                      reference: Array = _CENTRE) -> UpdateOutcome:
         """
-        Take in the distance, m, of ``reference`` (3,), a point on the body, m, from one's own.
+        Update with the own distance, m, to ``reference`` (3,), a point on the body, m.
 
-        It corrects what is along the line between the two and nothing else: where the direction
-        is not known well, it would seem to tell of what is across, too. See ``range_gate`` for
-        what becomes of outliers. No track begins with a distance.
+        The update corrects the state only along the line between the two: an uncertain direction
+        would otherwise change the state across it, too. ``range_gate`` handles outliers. No track
+        begins with a distance.
 
         :param own_position: where it was measured (3,), m, in odom.
         :param variance: of the distance, m^2.
@@ -433,6 +433,6 @@ def _to_body(lever: Array) -> Array:
 
 
 def _distance(innovation: Array, spread: Array) -> float:
-    """Return the squared Mahalanobis distance; infinity where the spread (n, n) is singular."""
+    """Return the squared Mahalanobis distance; infinity if the spread (n, n) is singular."""
     solved, solution = cv2.solve(spread, innovation[:, None])
     return float(innovation.dot(solution[:, 0])) if solved else math.inf

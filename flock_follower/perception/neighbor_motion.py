@@ -49,10 +49,10 @@ from flock_follower.geometry import (
 )
 from flock_follower.ranges import Checked, parameter, Range
 
-#: Where in the error state what is.
+#: Slices of the error state.
 POSITION, VELOCITY, ATTITUDE, RATE, ACCELERATION = (slice(k, k + 3) for k in range(0, 15, 3))
 SIZE = 15
-#: What of the error state a pose is, (6, 15).
+#: Rows of the error state that form a pose, (6, 15).
 POSE = np.concatenate([np.eye(SIZE)[POSITION], np.eye(SIZE)[ATTITUDE]])
 
 
@@ -141,7 +141,7 @@ class Estimate(NamedTuple):
 
 
 _EYE = np.eye(3)
-#: How the own position wanders, m/sqrt(s), where no velocity is measured.
+#: Random walk of the own position without a measured velocity, m/sqrt(s).
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbour's angular velocity before any motion was seen, rad/s.
 INITIAL_RATE = 0.5
@@ -150,16 +150,15 @@ INITIAL_RATE = 0.5
 @dataclass(frozen=True)
 class FilterParams(Checked):
     """
-    How neighbours move, and when to doubt a measurement.
+    Motion model of neighbours, and limits for measurements.
 
     ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
     ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
-    ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
-    m/s^2/sqrt(Hz).
+    ``odometry_noise`` is the random walk of the error of the own velocity, m/s^2/sqrt(Hz).
     ``initial_speed``, m/s, is the deviation before any motion has been seen.
-    ``attitude_noise``, rad, is how much one's own attitude errs differently from one image to the
-    next; at a distance it moves a neighbour sideways.
+    ``attitude_noise``, rad, is the noise of the own attitude from one image to the next; it moves
+    a distant neighbour sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
     above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
     ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
@@ -167,9 +166,9 @@ class FilterParams(Checked):
 
     acceleration: float = parameter(
         0.5, Range(0.01, 100.0, 'm/s^2'),
-        'how much a neighbour accelerates, standard deviation per axis', live=False)
+        "standard deviation of a neighbour's acceleration per axis", live=False)
     acceleration_time: float = parameter(
-        1.0, Range(0.01, 100.0, 's'), 'in which time its acceleration changes', live=False)
+        1.0, Range(0.01, 100.0, 's'), "correlation time of a neighbour's acceleration", live=False)
     angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
     odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
     initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
@@ -178,7 +177,8 @@ class FilterParams(Checked):
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
-        'a track begins anew only where a neighbour at this speed can be, as the planner has it',
+        "a track restarts only at a place that a neighbour at this speed can reach; the planner's "
+        'leader_speed_max must be the same',
         live=False)
 
 
@@ -230,9 +230,9 @@ def turned_along(covariances: Array, before: Array, now: Array) -> Array:
     """
     Return covariances (n, k, k), of position, velocity and more, turned from one line to another.
 
-    Of whom no more than the distance is known may be anywhere on a sphere: where the line to the
-    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), what is known along it
-    turns along. ``before`` of zeros turns nothing.
+    A neighbour of which only the distance is known may be anywhere on a sphere. If the line to its
+    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), the covariance turns
+    with it. ``before`` of zeros turns nothing.
     """
     w = np.cross(before, now)
     cross = np.zeros((len(w), 3, 3))
@@ -249,11 +249,11 @@ def turned_along(covariances: Array, before: Array, now: Array) -> Array:
 
 def bounded_across(covariances: Array, along: Array, distance: Array, speed: float) -> Array:
     """
-    Return covariances (n, k, k), of position, velocity and more, with what is absurd taken off.
+    Return covariances (n, k, k), of position, velocity and more, with bounded deviations.
 
-    Seen from where the distances (n,), m, were measured, along (n, 3), a neighbour is no farther
-    to the side than it is away, and no faster there than ``speed``, m/s. Were it more, turning
-    the line a little would make the distance uncertain, too.
+    Across the line (n, 3) along which the distances (n,), m, were measured, the deviation of the
+    position is at most the distance, and that of the velocity at most ``speed``, m/s. Larger ones
+    would make the distance uncertain after a small turn of the line.
     """
     scale = np.tile(np.eye(covariances.shape[-1]), (len(covariances), 1, 1))
     line = along[:, :, None] * along[:, None, :]
@@ -265,21 +265,21 @@ def bounded_across(covariances: Array, along: Array, distance: Array, speed: flo
     return scale @ covariances @ scale.transpose(0, 2, 1)
 
 
-#: Innovations over which the noise is learnt; at first over as many as there were, and these.
+#: Number of innovations over which the noise is learnt; initial count of innovations.
 LEARNT = 120
 FIRST = 15
-#: An innovation counts at most with so many times its variance: one far out is a slip.
+#: The square of an innovation is limited to this many times its variance.
 LIMIT = 16.0
-#: The most that is believed, rad, and as share of the distance.
+#: Largest value that is used, rad, and as share of the distance.
 MOST = 0.05
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
 class LearntNoise:
     """
-    The noise of one's own attitude, rad, about each axis, and of the distance, a share of it.
+    The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
 
-    :param least: what that of the attitude is at least, and at first; that of the distance is 0.
+    :param least: lower limit and initial value for the attitude, rad; the distance starts at 0.
     """
 
     def __init__(self, least: float) -> None:
@@ -287,13 +287,13 @@ class LearntNoise:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was learnt."""
+        """Reset the estimates."""
         self._across, self._along = self._least, 0.0
         self._count = FIRST
 
     @property
     def attitude(self) -> float:
-        """Return the noise of one's own attitude, one standard deviation, rad."""
+        """Return the noise of the own attitude, one standard deviation, rad."""
         return math.sqrt(self._across)
 
     @property
@@ -302,9 +302,9 @@ class LearntNoise:
         return math.sqrt(self._along)
 
     def covariance(self, sight: Array) -> Array:
-        """Return what it adds to a pose measured so far away (3,), m: (6, 6)."""
-        # An attitude error e turns what is seen about oneself: it moves a marker at r by e x r,
-        # and tilts it by e.
+        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
+        # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
+        # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()
         leverage[:3] = skew(-sight)
         covariance: Array = leverage.dot(self._across * leverage.T)

@@ -41,7 +41,7 @@ WHITE: Color = (255, 255, 255)
 HALO: Color = (0, 0, 0)  # under every line, so that it shows on bright and on dark alike
 
 STEPS = 16  # pieces of a straight line, which a lens bends
-FAR = 16384.0  # px; what is farther out than any image reaches is left out
+FAR = 16384.0  # px; points farther outside than any image are not drawn
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
@@ -53,7 +53,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
     Of each neighbour: the outlines of its markers that face the camera, in the colour of the
     stage, a dot at their top left corners; its body's axes, x red, y green, z blue, as long as
     half the first marker's side; the ellipse of two deviations of its position; name, stage,
-    distance and its deviation. The top left corner says what is missing or odd.
+    distance and its deviation. The top left corner lists the rejections.
     """
     canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
     lines = [f'{reason}: {detail}' if detail else reason
@@ -88,10 +88,10 @@ def body_covariance(measurement: Measurement) -> Array:
 def ellipse(camera: CameraModel, position: Array, covariance: Array,
             deviations: float = 2.0) -> Array:
     """
-    Return the pixels (49, 2) of the ellipse that a position's covariance is in the image.
+    Return the pixels (49, 2) of the error ellipse of a position in the image.
 
-    To first order, J P J^T with the projection's Jacobian J at the position (3,), m; P (3, 3),
-    m^2. NaN where the position is not in view.
+    The covariance in the image is J P J^T to first order, with the Jacobian J of the projection
+    at the position (3,), m, and P (3, 3), m^2. NaN if the position is not in view.
     """
     pixels, jacobians = camera.linearize(position)
     spread = jacobians[0] @ covariance @ jacobians[0].T

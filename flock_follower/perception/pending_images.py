@@ -15,8 +15,8 @@
 """
 Perception from messages to messages: calibrations, odometry, and the queue of images.
 
-An image is processed as soon as odometry has reached its stamp. It waits for that as long as
-images of late had to, a little longer, and never longer than ``max_wait``.
+An image is processed as soon as odometry has reached its stamp. It waits a little longer
+than recent images had to, and never longer than ``max_wait``.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Perceiver:
         """
         Take a CameraInfo; return whether it holds another calibration than the one before.
 
-        :raises ValueError: where it is unusable; no image is processed until a usable one comes.
+        :raises ValueError: if it is unusable; no image is processed until a usable one comes.
         """
         roi = message.roi
         window = (roi.x_offset, roi.y_offset, roi.width or message.width,
@@ -161,14 +161,14 @@ class Perceiver:
 
     def take_odometry(self, state: OdometryState) -> bool:
         """
-        Take one's own state; return whether time jumped back and everything restarted.
+        Take the own state; return whether time jumped back and everything restarted.
 
         Images that were waiting are then forgotten.
         """
         if not self._choice.takes(state):
             return False
         if self.frame not in ('', state.frame):
-            self.tracker.restart()  # what is known is in the frame before
+            self.tracker.restart()  # its estimates are in the old frame
         self.frame = state.frame
         jumped = self.tracker.feed_odometry(OdometrySample(
             self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
@@ -190,7 +190,7 @@ class Perceiver:
         return self._pending.pop(0) if len(self._pending) > most else None
 
     def due(self, now: float) -> PendingImage | None:
-        """Return the next image to process now, and forget it; None where it has to wait."""
+        """Return the next image to process now, and forget it; None if it has to wait."""
         for k, image in enumerate(self._pending):
             camera = self._cameras[image.camera]
             awaited = camera.model is None or self.tracker.missing(

@@ -48,19 +48,19 @@ from flock_follower.perception.measurement import (
 from flock_follower.perception.print_model import edge_model, EdgeModel, shift_to_code, shows_code
 from flock_follower.perception.smear_fit import fit_smeared, smear_model, SmearFit, SmearModel
 
-#: Edges that err by less than this, px, do not tell which of two attitudes is right.
+#: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
 #: Where cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
-#: A pose is accepted where more than this share of the edges agrees, to within this RMS, px.
+#: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
 MIN_INLIERS = 0.5
 MAX_RMS = 0.4
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
 #: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
 SMEARED = 0.26
-#: As many independent samples does a smeared print have to tell two attitudes by.
+#: Number of independent samples of a smeared print, to decide between two attitudes.
 SMEAR_DEGREES = 200.0
 #: Share of the distance: a smeared print is fitted twice as well, and takes six times as long.
 UNCERTAIN = 0.0075
@@ -85,7 +85,7 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return a neighbour close to where it is expected, or None where its markers are not there.
+    Return a neighbour close to where it is expected, or None if its markers are not there.
 
     :param spacing: that of its last measurement.
     :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
@@ -112,14 +112,14 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
 
 def _uncertainty(measurement: Measurement) -> float:
     """Return the deviation of the place, as a share of the distance."""
-    away = measurement.T_camera_body.translation
-    return math.sqrt(measurement.covariance[:3, :3].trace() / away.dot(away))
+    offset = measurement.T_camera_body.translation
+    return math.sqrt(measurement.covariance[:3, :3].trace() / offset.dot(offset))
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
               expected: PosePrior, spacing: tuple[float, float] | None,
               check_mirrored: bool) -> Measurement:
-    """Return what a fit to edges tells, if need be of the mirrored attitude as well."""
+    """Return the measurement of a fit to edges, also of the mirrored attitude if necessary."""
     if not check_mirrored:
         return _measurement(sought, found, None)
     chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
@@ -135,7 +135,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
            expected: PosePrior) -> Measurement | None:
     """
-    Return a neighbour one of whose markers was detected, or None where no pose suits it.
+    Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.

@@ -49,8 +49,8 @@ from flock_follower.perception.markers import (
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
 _MIN_APART = 4.0  # grey levels between black and white, both in the shade
-#: Where black or white spread more than this, as a variance against half of what they are apart,
-#: squared, they are not what they should be, and tell nothing.
+#: Black or white cells are not used if their variance exceeds this share of the squared half of
+#: their contrast.
 _MAX_SPREAD = 0.35
 
 
@@ -59,7 +59,7 @@ class Windows(NamedTuple):
     Windows on the c cells of a marker.
 
     ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
-    than k; ``white`` and ``black`` (w, k) are 1 where a cell should have that colour, else 0, and
+    than k; ``white`` and ``black`` (w, k) are 1 if a cell should have that colour, else 0, and
     0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
     where it is in fewer than p.
     """
@@ -96,7 +96,7 @@ def read(brightness: Array, seen: Windows) -> Array:
     """
     Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
 
-    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells.
+    -1: like the black cells around it, 1: like the white ones, 0: no cells to compare with.
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
@@ -109,11 +109,11 @@ def read(brightness: Array, seen: Windows) -> Array:
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
     shown = (values - 0.5 * (light + dark)) / half
-    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
+    readable = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
     # Best is a window that is even, and in which the cell is as any black or white one.
     odd = spread + (np.abs(shown) - 1.0)**2
     odd, shown = (part.reshape(len(values), -1) for part in (
-        np.where(told, odd, np.inf), np.where(told, shown, 0.0)))
+        np.where(readable, odd, np.inf), np.where(readable, shown, 0.0)))
     best = odd[:, seen.places].argmin(axis=2)
     chosen = seen.places[np.arange(seen.places.shape[0]), best]
     colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
@@ -135,14 +135,13 @@ _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where l
 @dataclass(frozen=True, eq=False)
 class CellCode:
     """
-    What a marker's cells should show.
+    The code of a marker: the colours of its cells.
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
-    rows. ``bits`` (b,): +1 white, -1 black;
-    ``errors`` of them may be misread.
-    ``others`` (w, b): every other word of the dictionary, and each in its turns. ``windows``:
-    which cells are compared where light is uneven.
+    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors``
+    of them may be misread. ``others`` (w, b): all other codewords of the dictionary, in all
+    rotations. ``windows``: cells that are compared with one another under uneven light.
     """
 
     centers: Array
@@ -230,7 +229,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     Return by how many cells, to the right and down, a marker is off where it is expected.
 
     Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
-    None where nothing resembles it.
+    None if nothing resembles it.
     """
     pattern = np.concatenate([code.bits, -np.ones(code.border),
                               np.ones(len(pixels) - code.bits.size - code.border)])
@@ -367,7 +366,7 @@ def _edges(code: Any) -> list[_Edge]:
     """
     Return places and tangents in the marker's frame, room, and axis; lengths in cells.
 
-    ``code`` (c, c) is True where white, its first row on top.
+    ``code`` (c, c) is True for white cells, its first row on top.
     """
     cells = len(code)
     edges: list[_Edge] = []

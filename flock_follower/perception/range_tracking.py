@@ -16,10 +16,10 @@
 Tracks a neighbour that is out of sight by distances that a radio measures.
 
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
-is learnt. Out of sight, a second filter continues from the state of the first. It is separate: a
-later sighting is taken in as if there had been no ranges. Ranges bound the state along the line of
-sight. Across it, the uncertainty grows with the neighbour's possible motion; once it exceeds the
-distance, the direction is unknown.
+is learnt. Out of sight, a second filter continues from the state of the first. The second filter
+is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
+line of sight. Across it, the uncertainty grows with the neighbour's possible motion; once it
+exceeds the distance, the direction is unknown.
 
 ``RangeBias`` learns the constant error of ranges (mostly antenna delays), a slow random walk,
 while the marker gives the true distance. Its arrays are (n,).
@@ -82,17 +82,17 @@ class RangeBias:
         used, widened, careful = self._gate.judge(innovation, prior + noise, given)
         prior = prior * widened
         gain = prior / (careful * (prior + noise))
-        # Where the noise is taken for larger, the gain is less, and less is learnt.
+        # A larger assumed noise means a smaller gain: the bias is learnt more slowly.
         self.value = np.where(used, self.value + gain * innovation, self.value)
         self._variance = np.where(used, (1.0 - gain) * prior, self._variance)
         self._stamp = np.where(used, stamp, self._stamp)
 
 
-#: Not seen for so long, s, a neighbour's state is told from its ranges ...
+#: If a neighbour is unseen for this long, s, its state is estimated from its ranges ...
 UNSEEN = 0.5
 #: ... and for so long at most.
 LONGEST = 60.0
-#: A range tells of the bias where the neighbour is seen at most so much later, s.
+#: A range is used to estimate the bias if the neighbour is seen within this time after it, s.
 LEARNT = 0.1
 #: A stamp so far ahead of the newest odometry, s, waits for it; beyond, clocks differ.
 AHEAD = 0.3
@@ -112,14 +112,14 @@ Rejection = tuple[str, str]
 
 @dataclass(frozen=True)
 class RangingParams(Checked):
-    """Where the own antenna is on the body, FLU, m, and the noise of ranges that say none, m."""
+    """Place of the own antenna on the body, FLU, m; noise of ranges without a variance, m."""
 
     tag_position: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0), Range(-5.0, 5.0, 'm'),
-        'place of the own antenna, which ranges are measured from, on the body, FLU', live=False)
+        'place of the own antenna, from which ranges are measured, on the body, FLU', live=False)
     range_noise: float = parameter(
         0.1, Range(0.001, 10.0, 'm'),
-        'standard deviation of ranges that tell no variance', live=False)
+        'standard deviation of ranges without a variance', live=False)
 
 
 class Ranged(NamedTuple):
@@ -141,9 +141,9 @@ class PlacedRange(NamedTuple):
 
 class Ranging:
     """
-    Takes the ranges of all neighbours, and tells the states of those out of sight.
+    Takes the ranges of all neighbours, and estimates the states of those out of sight.
 
-    :param filters: of what is seen, by neighbour's name: never altered here.
+    :param filters: of the neighbours seen, by name: never altered here.
     :param odometry: the own one.
     """
 
@@ -164,7 +164,7 @@ class Ranging:
 
     @property
     def biases(self) -> dict[str, RangeBias]:
-        """Return what is known of the errors of those neighbours that ranges have come of."""
+        """Return the biases of the ranges to each neighbour that has sent ranges."""
         return {name: series.bias for name, series in self._series.items() if series.began}
 
     @property
@@ -228,7 +228,7 @@ class Ranging:
 
 
 class RangeSeries:
-    """The ranges to an antenna, at ``tag`` (3,) on the body of whom a filter follows by sight."""
+    """The ranges to an antenna at ``tag`` (3,), m, on a neighbour tracked by camera."""
 
     def __init__(self, seen: NeighborFilter, tag: Array) -> None:
         self._seen, self._tag = seen, tag
@@ -264,7 +264,7 @@ class RangeSeries:
         now = self._apart.newest
         if now is None or outcome not in (UpdateOutcome.USED, UpdateOutcome.SURPRISING):
             return None
-        return self._told(now, own)
+        return self._reported(now, own)
 
     def _learn(self, measured: PlacedRange, seen: Estimate) -> None:
         then = self._seen.near(measured.stamp)
@@ -282,8 +282,8 @@ class RangeSeries:
             measured.stamp, measured.distance - float(self.bias.value[0]), measured.antenna,
             measured.variance + float(self.bias.variance(measured.stamp)[0]), self._tag)
 
-    def _told(self, now: Estimate, own: OdometrySample) -> Estimate:
-        """Return a state in odom; what is not known of the bias is not known of the distance."""
+    def _reported(self, now: Estimate, own: OdometrySample) -> Estimate:
+        """Return a state in odom; the variance of the bias adds to that of the distance."""
         sight = now.position - own.travel
         along = sight / max(math.hypot(*sight.tolist()), 1e-6)
         covariance = now.covariance.copy()

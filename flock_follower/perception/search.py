@@ -115,7 +115,7 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
 
 def _in_uneven_light(image: GrayImage, found: Detections, dictionary: str,
                      markers: Sequence[Marker]) -> Detections:
-    """Return what was found, and markers whose code a shadow or a reflex hides from OpenCV."""
+    """Return the markers found, also those whose code a shadow or a reflex hides from OpenCV."""
     ids, corners = found.ids.tolist(), [*found.corners]
     cells = marker_cells(dictionary)
     square = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], dtype=np.float32)

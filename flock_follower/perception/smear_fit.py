@@ -50,7 +50,7 @@ from flock_follower.perception.markers import (
 #: up to which it is looked for.
 PER_CELL = 3
 MARGIN = 1
-AWAY = 8
+REACH = 8
 #: Of the exposure, which lasts for 1.
 INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
 _TEXELS = 12  # of the print, per cell
@@ -93,7 +93,7 @@ class SmearModel:
 
 @lru_cache(maxsize=64)
 def smear_model(marker: Marker, dictionary: str) -> SmearModel:
-    """Return what it takes to smear a marker."""
+    """Return the model of a smeared marker."""
     code = marker_code(dictionary, marker.marker_id)
     n = len(code)
     cell = marker.side_length / n
@@ -115,7 +115,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     smeared = np.array([smear_print(printed[lens], places, smear)[0]
                         for lens, smear in zip(lenses, smears)])
     return SmearModel(
-        origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + AWAY),
+        origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + REACH),
         printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
         turned[order].reshape(4 * len(words), -1).astype(float),
         max(correctable_cells(dictionary), 1), n)
@@ -157,7 +157,7 @@ _LONGEST_TURN = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
 _LONGEST_STEP = 0.5  # and so does one by this share of the distance
 _MIN_INSIDE = 0.8  # share of the samples that must be in the image
 _BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
-_FLOOR = 1.0  # grey levels: no sample is believed to be better
+_FLOOR = 1.0  # grey levels: least standard deviation of a sample
 _ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
 #: Of the pose (6), the response (3) and the smear (2), which a smear of 0 leaves open.
 _PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
@@ -181,7 +181,7 @@ class SmearFit(NamedTuple):
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
                 start: Transform) -> SmearFit | None:
     """
-    Return the pose of a marker near ``start``, ``T_camera_body``, or None where it is not there.
+    Return the pose of a marker near ``start``, ``T_camera_body``, or None if it is not there.
 
     ``start`` may be off by two cells and a half, and a little in all else.
     """
@@ -205,9 +205,9 @@ def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
     which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     if not likeness[which, row, column] > _LIKENESS:
         return None
-    shift = (np.array([column, row]) - AWAY) / PER_CELL
-    away = start.rotation @ (shift @ model.axes)
-    pose = Transform(start.rotation, start.translation + away)
+    shift = (np.array([column, row]) - REACH) / PER_CELL
+    offset = start.rotation @ (shift @ model.axes)
+    pose = Transform(start.rotation, start.translation + offset)
     return pose, model.smears[which], model.lenses[which]
 
 
@@ -228,9 +228,9 @@ def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, 
 
 class _Descent(NamedTuple):
     """
-    What is left, (s,), grey levels, after a step, and what the step rests on.
+    Residuals, (s,), grey levels, after a step, and the inputs of the step.
 
-    ``light``: what black and white are apart.
+    ``light``: difference between white and black.
     """
 
     residual: Array
@@ -282,14 +282,14 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         if step is None:
             return None
         light, _, curve = step[6:9].tolist()
-        turn, away = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
+        turn, offset = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
         smear = smear + step[9:]
         if (not max(turn, float(np.abs(step[9:]).max())) < _LONGEST_TURN or light <= 0.0
-                or away > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
+                or offset > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
             return None
         pose = moved(pose, center, step)
         residual = brightness - design.dot(step)
-        if count > 2 and away < 10.0 * _SMALL * cell and turn < _SMALL:
+        if count > 2 and offset < 10.0 * _SMALL * cell and turn < _SMALL:
             break
         squares = residual * residual
         variance = max((1.4826 * float(np.median(np.abs(residual))))**2, _FLOOR**2)
@@ -317,7 +317,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
-    """Return a fit, None where it does not show the marker's code."""
+    """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))

@@ -41,32 +41,32 @@ from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Step
 from flock_follower.perception.neighbor_motion import FilterParams, LearntNoise, SIZE
 
-#: What offsets are before anything is known, s, one standard deviation; and at most.
+#: Initial standard deviation of an offset, s; largest offset that is applied, s.
 PRIOR: Final[float] = 0.03
 MOST: Final[float] = 0.2
-#: Deviations are widened: what own motion and the neighbour have in common is no noise.
+#: Factor on the deviation: own and neighbour's motion are correlated, and not white noise.
 WIDENING: Final[float] = 2.0
-#: An estimate is sure where its deviation is below this, s.
+#: An estimate is certain if its deviation is below this, s.
 SURE: Final[float] = 0.003
-#: It is applied from when it is off what is applied by so many deviations, and so much, s.
+#: It is applied once it differs from the applied offset by this many deviations, and this much, s.
 SIGNIFICANT: Final[float] = 4.0
 LEAST: Final[float] = 0.001
-#: Innovations that are remembered: clocks drift.
+#: Number of innovations that are used: clocks drift.
 REMEMBERED: Final[float] = 3000.0
-#: Of several cameras the offsets are found anew at every so many innovations.
+#: With several cameras the offsets are estimated again after this many innovations.
 EVERY: Final[int] = 8
-#: Innovations over which it is watched how well their covariances suit them.
+#: Number of innovations over which their misfit is averaged.
 WATCHED: Final[int] = 100
 
 
 class TimeOffset:
     """
-    The offset of the camera's stamps, s: what is ``applied`` and what the innovations say.
+    The offset of the camera's stamps, s: the ``applied`` one and the estimate of the innovations.
 
-    ``before`` is what was applied until the newest change.
+    ``before`` is the offset that was applied until the newest change.
 
-    :param offset: what is known of it, applied from the start.
-    :param fixed: whether to stay with that.
+    :param offset: initial value, applied from the start.
+    :param fixed: whether to keep the initial value.
     """
 
     def __init__(self, offset: float = 0.0, fixed: bool = False) -> None:
@@ -74,7 +74,7 @@ class TimeOffset:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was found out."""
+        """Reset the estimate."""
         self.applied = self.before = self._first
         self._information = 1.0 / PRIOR**2
         self._weighted = self._first / PRIOR**2
@@ -95,9 +95,9 @@ class TimeOffset:
 
     @property
     def describe(self) -> str:
-        """Return what is known and what is done with it, in words."""
+        """Return the estimate and how it is used, as text."""
         if self.fixed:
-            return f'{1e3 * self.applied:.1f} ms, as told'
+            return f'{1e3 * self.applied:.1f} ms, as configured'
         known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
         if self._found:
             return f'{known}, applied'
@@ -112,16 +112,16 @@ class TimeOffset:
         self._following[name] = moving
 
     def forget(self, name: str) -> None:
-        """Take that a neighbour's track began with a measurement of another camera."""
+        """Note that a neighbour's track began with a measurement of another camera."""
         self._following.pop(name, None)
 
     def take(self, name: str, step: Step, moving: Array) -> float:
         """
-        Learn from how a measurement was taken in; return by how much the applied offset changed.
+        Update the estimate with a filter step; return the change of the applied offset, s.
 
-        All states are then to be moved by that times :meth:`following`.
+        The caller then moves all states by that change times :meth:`following`.
         """
-        # Of state and innovation per offset not applied: what is measured lacks ``moving``.
+        # Error of state and innovation per offset not applied: measurements lack ``moving``.
         seen = self.follow(name, step, moving)
         both = np.array([seen, step.innovation])
         # (2, 2): products of the two, weighted.
@@ -135,9 +135,9 @@ class TimeOffset:
 
     def follow(self, name: str, step: Step, moving: Array | None = None) -> Array:
         """
-        Take how a neighbour's state is off after a measurement; return what is seen of that.
+        Update the bias of a neighbour's state after a step; return its part in the innovation.
 
-        Both are per offset not applied; :param moving: None where another camera measured.
+        Both are per unit of offset not applied; :param moving: None if another camera measured.
         """
         ahead = step.transition.dot(self.following(name))
         seen: Array = step.jacobian.dot(ahead if moving is None else ahead - moving)
@@ -145,20 +145,20 @@ class TimeOffset:
         return seen
 
     def watch(self, misfit: float) -> None:
-        """Take the chi^2, per dimension, that an innovation leaves over."""
+        """Update the misfit with the chi^2 per dimension of an innovation."""
         self._count = min(self._count + 1, WATCHED)
         self._misfit += (min(misfit, 10.0) - self._misfit) / (self._count + 1)
 
     def know(self, estimate: float, information: float) -> None:
-        """Take what innovations of several cameras say together; information in 1/s^2."""
+        """Set the joint estimate of several cameras, s, and its information, 1/s^2."""
         self._information, self._weighted = information, estimate * information
 
     def following(self, name: str) -> Array:
-        """Return by how much a neighbour's state is off, (15,), per offset not applied."""
+        """Return the bias of a neighbour's state, (15,), per unit of offset not applied."""
         return self._following.get(name, np.zeros(SIZE))
 
     def apply(self) -> float:
-        """Apply the estimate where it is sure; return by how much what is applied changed, s."""
+        """Apply the estimate if it is certain; return the change of the applied offset, s."""
         if self.fixed:
             return 0.0
         off = abs(self.estimate - self.applied)
@@ -172,10 +172,10 @@ class TimeOffset:
 
 class JointOffsets:
     """
-    The offsets of several cameras, found together.
+    The offsets of several cameras, estimated jointly.
 
-    Each camera's offset is also in what the others' measurements are compared with: one by one
-    they would take one another's for their own.
+    Each camera's offset also biases the predictions for the others: separate estimates would
+    confuse the offsets of two cameras.
     """
 
     def __init__(self, offsets: Sequence[TimeOffset]) -> None:
@@ -183,7 +183,7 @@ class JointOffsets:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was found out."""
+        """Reset the estimate."""
         for offset in self._offsets:
             offset.restart()
         self._count = 0
@@ -203,14 +203,14 @@ class JointOffsets:
         both = np.array([*(offset.follow(name, step, moving if offset is camera else None)
                            for offset in self._offsets), step.innovation])
         products = both.dot(cv2.solve(step.spread, both.T)[1])
-        seen, said = products[:-1, :-1], products[:-1, -1]
+        seen, right_side = products[:-1, :-1], products[:-1, -1]
         applied = np.array([offset.applied for offset in self._offsets])
         off = np.array([offset.estimate for offset in self._offsets]) - applied
-        camera.watch(float(products[-1, -1] - 2.0 * off.dot(said) + off.dot(seen).dot(off))
+        camera.watch(float(products[-1, -1] - 2.0 * off.dot(right_side) + off.dot(seen).dot(off))
                      / len(step.innovation))
         keep = 1.0 - 1.0 / REMEMBERED
         self._information = keep * self._information + seen
-        self._weighted = keep * self._weighted + seen.dot(applied) + said
+        self._weighted = keep * self._weighted + seen.dot(applied) + right_side
         self._count += 1
         if self._count % EVERY:
             return [0.0] * len(self._offsets)
@@ -239,9 +239,9 @@ def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
 
 class MountedCamera:
     """
-    A camera mounted at ``T_body_camera`` (optical), with what lasts from image to image.
+    A camera mounted at ``T_body_camera`` (optical), and its state from image to image.
 
-    :param time_offset: finds out by how much its images' stamps are off.
+    :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
     :param attitude_noise: of the own attitude as its images show it, at least, rad.
     :param rectified: whether its images are undistorted already.
@@ -259,25 +259,25 @@ class MountedCamera:
         self.restart(())
 
     def restart(self, names: Iterable[str]) -> None:
-        """Forget what was learnt and done, and begin anew with neighbours of these names."""
+        """Reset all estimates and searches, for neighbours of these names."""
         self.noise.restart()
         self.searched: float | None = None
-        """Stamp of the newest image that was searched as a whole, s."""
+        """Stamp of the newest whole image searched, s."""
         self.swept: float | None = None
-        """Stamp of the newest one, or the first, searched although nobody was missing, s."""
+        """Stamp of the newest whole image searched although no neighbour was missing, s."""
         self.wanting: float | None = None
-        """Stamp of the newest image that somebody was missing in, s."""
+        """Stamp of the newest image in which a neighbour was missing, s."""
         self.thorough = False
-        """How a whole image is searched the next time."""
+        """Whether the next search of a whole image is thorough."""
         self.unchecked = dict.fromkeys(names, 0)
-        """Images for which a neighbour's mirrored attitude need not be looked at."""
+        """Number of images for which a neighbour's mirrored attitude need not be checked."""
         self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
         self.delays = dict.fromkeys(names, 0.5 * self.readout_time)
         """How long after an image's stamp a neighbour is exposed, s."""
         self.measured: dict[str, float] = {}
-        """When it saw a neighbour last, by the clock of that one's filter, s."""
+        """When it last saw a neighbour, by the clock of that neighbour's filter, s."""
         self.vain: dict[str, float] = {}
-        """Stamp of the image in which one whom another camera sees was not found, s."""
+        """Stamp of the newest image without a neighbour that another camera sees, s."""
 
     def exposed(self, model: CameraModel, measurement: Measurement) -> float:
         """Return how long after the image's stamp a neighbour was exposed, s, and remember it."""

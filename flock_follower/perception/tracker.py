@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-From images and one's own odometry to the neighbours' states: the whole of perception.
+Perception: from images and own odometry to the neighbours' states.
 
-Each image is looked at in up to three stages, the cheapest first:
+Detection in each image has up to three stages, the cheapest first:
 
 =======  ==========================================================================
 track    edges are fitted where the filter expects each neighbour's markers
@@ -23,7 +23,7 @@ roi      a neighbour not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, at a limited rate
 =======  ==========================================================================
 
-Once a second the whole image is searched although nobody is missing: see ``hypotheses``.
+Once a second the whole image is searched even if no neighbour is missing: see ``hypotheses``.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Sighting:
     not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
     for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
     by names made of the neighbours', are the states of candidates measured in this image that
-    carry a neighbour's marker and are not believed to be it.
+    carry a neighbour's marker and are not its primary track.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -114,8 +114,8 @@ class Tracker:
     """
     The neighbours of one drone, seen by one camera or several.
 
-    Feed it odometry as it comes, and each image once :meth:`missing` says None for its stamp.
-    Cameras are called by their names; the only one by ''.
+    The tracker needs every odometry message, and each image once :meth:`missing` returns None for
+    its stamp. Cameras have names; a single camera has the name ''.
 
     :param cameras: of one its place on the body (optical), of several each by its name.
     :param time_offset: of one: finds out by how much the images' stamps are off.
@@ -136,7 +136,7 @@ class Tracker:
         self._odometry = OdometryBuffer()
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
-        self._filters = {name: each.believed for name, each in self._hypotheses.items()}
+        self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
         self._schedule = CameraSchedule(config.neighbors, list(self.cameras.values()))
         self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
@@ -184,7 +184,7 @@ class Tracker:
         """
         Return whether to process the image of a stamp, s: else it need not even be decoded.
 
-        With one camera always; with several, if a neighbour may be in it.
+        With one camera always; with several cameras, only if a neighbour may be in the image.
         """
         if len(self.cameras) == 1:
             return True
@@ -198,7 +198,7 @@ class Tracker:
         """
         Return the estimates of the neighbours from an image (H, W) uint8 of a stamp, s.
 
-        :raises ValueError: where the image is not of the camera's size, or not grey.
+        :raises ValueError: if the image is not of the camera's size, or not grey.
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
@@ -315,12 +315,12 @@ class Tracker:
         return found, others
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
-        """Return whether a measurement is of a candidate that is not believed."""
+        """Return whether a measurement is of a candidate, not of the primary track."""
         name, camera = measurement.name, look.camera
         if not self._hypotheses[name].candidates:
             return False
         place = look.views[camera.delays[name]].T_smooth_camera @ measurement.T_camera_body
-        return self._hypotheses[name].whose(
+        return self._hypotheses[name].candidate_at(
             self._schedule.time(name, camera, look.stamp + camera.delays[name]),
             place.translation) is not None
 
@@ -407,7 +407,7 @@ class Tracker:
         """
         Update a neighbour's track with a measurement, and add the estimate to the sighting.
 
-        :param other: whether it is of a candidate that was not believed to be the neighbour.
+        :param other: whether it is of a candidate, not of the primary track.
         """
         name, camera = measurement.name, look.camera
         delay = camera.exposed(look.model, measurement)
@@ -463,5 +463,5 @@ class Tracker:
 
 def _of(name: str, measured: Mapping[str, Measurement],
         others: Iterable[Measurement]) -> list[Measurement]:
-    """Return what was measured of a neighbour in this image, and of its candidates."""
+    """Return the measurements of a neighbour and of its candidates in this image."""
     return [each for each in (measured.get(name), *others) if each and each.name == name]

@@ -94,7 +94,7 @@ class Edges(NamedTuple):
     near: float
     far: float = math.inf
     margin: float = 0.0
-    """Of each edge, m."""
+    """Margin to each edge, m."""
     spread: float = 0.0
     """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
@@ -109,11 +109,11 @@ class Edges(NamedTuple):
 
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
-                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
+                  neighbor_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
-    Without a direction, or if something is not finite, there are none.
+    Without a direction, or with a value that is not finite, the list is empty.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
@@ -121,7 +121,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     """
     p = np.asarray(offset, dtype=float)
     w = np.asarray(relative_velocity, dtype=float).tolist()
-    a = np.asarray(its_acceleration, dtype=float).tolist()
+    a = np.asarray(neighbor_acceleration, dtype=float).tolist()
     distance = math.hypot(*p.tolist())
     if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
         return []  # as for NaN, which fails every comparison
@@ -129,7 +129,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     unit = n.tolist()
     rate = scalar_product(unit, w)
     common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
-    # Whoever may be anywhere in a sphere that grows comes nearer by that.
+    # The growing sphere of possible places comes nearer at its growth rate.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)
@@ -183,8 +183,8 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
     """
-    its = np.zeros(3) if n.acceleration is None else n.acceleration
-    it = expected(n, its, me.stamp - n.stamp, params)
+    acceleration = np.zeros(3) if n.acceleration is None else n.acceleration
+    it = expected(n, acceleration, me.stamp - n.stamp, params)
     sight = it.position - me.position
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
     if not level > 1e-6:
@@ -193,16 +193,16 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
     if known is not None:
         x, y, _ = (known.position - me.position).tolist()
-        away = math.hypot(x, y)
-        if away > 1e-6:
-            towards = np.array([x, y, 0.0]) / away
-            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
+        apart = math.hypot(x, y)
+        if apart > 1e-6:
+            towards = np.array([x, y, 0.0]) / apart
+            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(apart, distance)
     variance = float(along @ n.position_covariance @ along)
     # As measured; until the command acts only the own motion on the line backwards changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)
     band = inner._replace(
-        near=inner.near + params.radius + n.who.radius, far=math.inf, spreading=it.spreading,
+        near=inner.near + params.radius + n.member.radius, far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
     return [each._replace(seen=sure) for each in radial_bounds(
         -distance * towards, -rate * towards, band, params.guarding,

@@ -103,8 +103,8 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     rest = math.inf
     for n in neighbors:
-        hull = params.radius + n.who.radius
-        near = edges.near + hull
+        radii_sum = params.radius + n.member.radius
+        near = edges.near + radii_sum
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
         if level < DOWNWASH * near:
@@ -114,13 +114,13 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+        approach, leaving = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
                           for v in (n.velocity, me.velocity))
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
-        away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
-        if math.hypot(level, z) < CLOSE + hull and away > APPROACH_NOISE:
-            rest = min(rest, math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0)))
+        leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
+        if math.hypot(level, z) < CLOSE + radii_sum and leaving > APPROACH_NOISE:
+            rest = min(rest, math.sqrt(max(params.fastest ** 2 - leaving ** 2, 0.0)))
     # The height between has priority over the rest of v_max.
     return max(least, min(-rest, most)), min(most, max(rest, least))
 
@@ -134,11 +134,11 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
                                Edges(-math.inf, params.range_max), params.guarding)
         bounds += [each._replace(reason=FENCE) for each in inside if each.reason == COHESION]
     if lost is not None:
-        away = LEVEL * (position - lost.origin)
-        distance = math.hypot(*away.tolist())
+        offset = LEVEL * (position - lost.origin)
+        distance = math.hypot(*offset.tolist())
         if distance > 1e-6:
             left = retreat(lost, params) - distance
-            bounds.append(stop(away / distance, left, velocity, params))
+            bounds.append(stop(offset / distance, left, velocity, params))
         left = lost.free - params.guarding.m - float(lost.towards @ position)
         bounds.append(stop(lost.towards, left, velocity, params))
     return bounds
@@ -175,7 +175,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     """
     Return the least height, m, at which to let a closing neighbor pass that is out of sight.
 
-    Without an explicit ceiling, or with a ``retreat_max`` of 0, there is none: -inf. The default
+    Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
     of ``altitude_max`` is no ceiling.
 
     :param held: altitude to hold, m.
@@ -221,7 +221,7 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
             near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
-        if here or not (name in memory.ranged or (blinded and not n.heard)):
+        if here or not (name in memory.ranged or (blinded and not n.received)):
             near += _neighbor_bounds(n, memory, me, velocity, neighbors, here, params)
     bounds = ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
                      _sight_bounds(memory, me, velocity, neighbors, view, params))
@@ -236,41 +236,41 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
     if not allowed.reason:
         return command
     reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
-    return LimitedCommand(allowed.acceleration, reasons, allowed.away)
+    return LimitedCommand(allowed.acceleration, reasons, allowed.separation_axis)
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
                      neighbors: Neighborhood, here: bool,
                      params: PlannerParams) -> list[Bound]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
-    age, hull = me.stamp - n.stamp, params.radius + n.who.radius
-    seen = here and (memory.lost is None or bool(neighbors.flock) or n.who.role == AVOID)
+    age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
+    seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
     places = [_expected(n, memory, me, params)]
-    if age > SEEN and not n.heard:  # its acceleration is a guess: keep farther away, never chase
+    if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
     found = list[Bound]()
     for place in places:
         found += in_sight(place, me.position, velocity, seen,
-                          joined and place is places[-1], params, hull)
-    if memory.lost is not None and not (seen or n.heard):
+                          joined and place is places[-1], params, radii_sum)
+    if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
-    return [each._replace(seen=False) for each in found] if n.heard else found
+    return [each._replace(seen=False) for each in found] if n.received else found
 
 
 def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood,
                   view: View, params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
     n = None if neighbors.faced is None else memory.flock[neighbors.faced.name]
-    if n is None or not view or n.heard:
+    if n is None or not view or n.received:
         return []
     it = _expected(n, memory, me, params)
     offset = it.position - me.position
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
-        bounds += marker_bounds(offset, velocity, it, n.yaw, n.who.faces, params)
+        bounds += marker_bounds(offset, velocity, it, n.yaw, n.member.faces, params)
     return bounds
 
 
@@ -278,7 +278,7 @@ def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
     """Return what to expect of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
-    if not n.heard:  # errors of own sightings are part of the guard's margin
+    if not n.received:  # errors of own sightings are part of the guard's margin
         return expected(n, memory.motions[n.name].acceleration, age, params)
     it = expected(n, np.zeros(3), age, params)  # an acceleration from late messages is outdated
     offset = it.position - me.position

@@ -22,16 +22,16 @@ source whose odometry is usually too old, on average or at its oldest, is too sl
 
 Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
 
-1. It goes on with the velocity of its newest estimate, and with its acceleration, if that is
-   credible, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
+1. The neighbor keeps the velocity of its newest estimate, and its acceleration, if plausible, for
+   at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
    An acceleration a as small as the noise of an estimate counts as
-   a / (1 + (ACCELERATION_NOISE / a)^4): taken as it is, it makes the guard twitch.
-2. If the estimate is older than SEEN, its acceleration may make the vehicle keep farther away,
-   but not follow: never chase a guess.
+   a / (1 + (ACCELERATION_NOISE / a)^4): otherwise the noise would make the guard jerk.
+2. If the estimate is older than SEEN, its acceleration may only increase the distance that the
+   vehicle keeps: the vehicle never follows a guess.
 3. Up to FRESH, and up to ``heard_timeout`` if it was received from another vehicle, the margin of
-   the guard covers what else it may do. From then on it may be anywhere that an acceleration of
-   ``leader_acceleration_max`` takes it to, at up to ``leader_speed_max``: in a sphere that grows,
-   around the place of 1.
+   the guard covers deviations from 1. Later the neighbor may be anywhere in a growing sphere
+   around the place of 1: it reaches as far as ``leader_acceleration_max`` and ``leader_speed_max``
+   allow.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.messages import FARTHEST, FASTEST, FUTURE_TOLERANCE
 from flock_follower.planner.limits import limit_norm
-from flock_follower.planner.params import Member, PlannerParams, SEEN_FIRST
+from flock_follower.planner.params import Member, PlannerParams, SEEN_DEFAULT
 
 LATE = 0.5  # share of the timeout: younger odometry is never overdue
 LATEST = 0.8  # share of the timeout: older odometry always is, to brake before commands end
@@ -110,10 +110,10 @@ class Neighbor(NamedTuple):
     velocity_covariance: Array = UNKNOWN
     acceleration: Array | None = None
     yaw: float | None = None
-    heard: bool = False
+    received: bool = False
     """Whether another vehicle reported it; else the own camera sees it."""
-    who: Member = SEEN_FIRST
-    """Its role and size, known beforehand."""
+    member: Member = SEEN_DEFAULT
+    """Role and size of the neighbor, from its file."""
 
 
 Moving = TypeVar('Moving', OwnState, Neighbor)
@@ -172,8 +172,8 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
     """
     Return whether the distance is known of a neighbor whose position is too uncertain.
 
-    It is if its variance is at most a third of what is admitted of a position's three axes: of a
-    position that is equally uncertain in all of them nothing is known.
+    The distance is known if its variance is at most a third of the variance admitted for a whole
+    position. A position that is equally uncertain along all axes gives no distance.
     """
     if own is None:
         return False
@@ -185,7 +185,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
     return 0.0 <= float(along @ n.position_covariance @ along) <= most / 3.0
 
 
-TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
 ACCELERATION_NOISE = 0.35  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
@@ -215,7 +215,7 @@ def expected(n: Neighbor, acceleration: Array, age: float, params: PlannerParams
     known = min(max(age, 0.0), TRUSTED_TIME)
     position = n.position + age * n.velocity + known * (age - 0.5 * known) * a
     velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * a
-    blind = max(age - (params.heard_timeout if n.heard else FRESH), 0.0)
+    blind = max(age - (params.heard_timeout if n.received else FRESH), 0.0)
     most, fastest = params.leader_acceleration_max, (
         params.leader_speed_max + math.hypot(*n.velocity.tolist()))
     speeding = min(blind, fastest / most) if most > 0.0 else 0.0

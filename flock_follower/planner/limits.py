@@ -34,11 +34,11 @@ from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
 
-# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
-# norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
+# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in
+# a caller's check, cannot exceed it; a limited vector thus passes a second time unchanged.
 INSIDE = 1.0 - 1e-12
-# Accelerations are limited to this share of a_max: what is sent has the 24 bits of a MAVLink
-# float, and rounding to those must not carry it over a_max.
+# Accelerations are limited to this share of a_max: rounding to the 24 bits of a MAVLink float must
+# not exceed a_max.
 SENT_INSIDE = 1.0 - 2e-7
 
 # Reasons of bounds.
@@ -47,14 +47,14 @@ STEEP = 0.1  # horizontal share of a direction below which no horizontal command
 
 
 class LimitedCommand(NamedTuple):
-    """An acceleration made safe, and what was done to it."""
+    """A limited acceleration, and the limits that changed it."""
 
     acceleration: Array
     """Acceleration (3,), m/s^2, in the frame of the inputs."""
     reason: str
-    """Why it differs from what was asked for, '' if it does not; 'a_max', 'v_max', 'a_max, v_max',
+    """Why it differs from the nominal one, '' if it does not; 'a_max', 'v_max', 'a_max, v_max',
     reasons of bounds, or which input is not finite."""
-    away: Array | None = None
+    separation_axis: Array | None = None
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
 
@@ -66,7 +66,7 @@ class Bound(NamedTuple):
     least: float
     reason: str
     distance: float = 0.0
-    """From the neighbor that causes it, m."""
+    """Distance of the neighbor that causes the bound, m."""
     seen: bool = True
     """Whether that neighbor is in sight."""
 
@@ -87,7 +87,7 @@ def limit_norm(vector: ArrayLike, limit: float) -> Array:
 
 
 def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
-                  period: float, away: Array | None = None) -> LimitedCommand:
+                  period: float, axis: Array | None = None) -> LimitedCommand:
     """
     Limit an acceleration, and the speed it leads to when held for one period.
 
@@ -101,27 +101,27 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     A non-finite acceleration becomes braking, ``-v / T`` within ``a_max``; a non-finite velocity,
     against which no acceleration can be judged, gives zeros.
 
-    :param acceleration: wanted acceleration (3,), m/s^2.
+    :param acceleration: nominal acceleration (3,), m/s^2.
     :param velocity: present velocity (3,), m/s, in the same frame.
     :param a_max: largest acceleration, m/s^2, in (0, 100].
     :param v_max: largest speed, m/s, in [0, 100].
     :param period: time T the acceleration will be held for, s, in (0, 10].
-    :param away: unit vector (3,) along which the acceleration is cut last, because it keeps clear
+    :param axis: unit vector (3,) along which the acceleration is cut last, because it keeps clear
         of a neighbour: within the limits, as much of it is left as there can be.
     """
-    wanted, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
-    asked, flown, strongest = wanted.tolist(), v.tolist(), a_max * SENT_INSIDE
-    reached = [x + u * period for x, u in zip(flown, asked)]
-    if (math.hypot(*asked) < strongest * INSIDE
+    nominal, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
+    requested, flown, strongest = nominal.tolist(), v.tolist(), a_max * SENT_INSIDE
+    reached = [x + u * period for x, u in zip(flown, requested)]
+    if (math.hypot(*requested) < strongest * INSIDE
             and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
-        return LimitedCommand(wanted.copy(), '')
+        return LimitedCommand(nominal.copy(), '')
     if not all(map(math.isfinite, flown)):
         return LimitedCommand(np.zeros(3), 'velocity not finite')
-    if not all(map(math.isfinite, asked)):
+    if not all(map(math.isfinite, requested)):
         return LimitedCommand(brake(v, a_max, period), 'acceleration not finite')
 
-    a = limit_norm(wanted, strongest)
-    reasons = [] if a.tolist() == asked else ['a_max']
+    a = limit_norm(nominal, strongest)
+    reasons = [] if a.tolist() == requested else ['a_max']
     predicted = v + a * period
     target = limit_norm(predicted, v_max)
     if target.tolist() != predicted.tolist():
@@ -129,15 +129,15 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
         # far the second clip shortens the step from v towards target, it ends in that ball too.
         a = limit_norm(limit_norm(target - v, strongest * period) / period, strongest)
         reasons.append('v_max')
-    if reasons and away is not None and math.hypot(*flown) <= FASTEST_OWN:
-        wanted = limit_norm(wanted, SANE)
-        if away @ wanted > 0.0:
-            clear = _away_first(wanted, v, away, a_max, v_max, period)
-            a = clear if away @ clear > away @ a else a
+    if reasons and axis is not None and math.hypot(*flown) <= FASTEST_OWN:
+        nominal = limit_norm(nominal, SANE)
+        if axis @ nominal > 0.0:
+            clear = _separation_first(nominal, v, axis, a_max, v_max, period)
+            a = clear if axis @ clear > axis @ a else a
     return LimitedCommand(a, ', '.join(reasons))
 
 
-def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
+def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
                      v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part goes before the horizontal one.
@@ -145,16 +145,16 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     As :func:`limit_command`, but the horizontal part gets what the vertical one leaves of
     ``a_max`` and ``v_max``: the law's pull may be far beyond both and would leave no climb.
 
-    :param wanted: acceleration (3,), m/s^2; its vertical part is not looked at.
+    :param nominal: acceleration (3,), m/s^2; its vertical part is not looked at.
     :param vertical: acceleration, m/s^2, at most ``a_max``.
     :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
     """
-    v, wanted = np.asarray(velocity, dtype=float), np.asarray(wanted, dtype=float)
+    v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
-        return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
+        return limit_command([*nominal[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
-    horizontal = limit_norm(wanted[:2], strongest)
-    reasons = [] if horizontal.tolist() == wanted[:2].tolist() else ['a_max']
+    horizontal = limit_norm(nominal[:2], strongest)
+    reasons = [] if horizontal.tolist() == nominal[:2].tolist() else ['a_max']
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     reached = v[:2] + horizontal * period
@@ -163,36 +163,36 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
         horizontal = limit_norm((target - v[:2]) / period, strongest)
         reasons.append('v_max')
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
-    said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
-    reason = ', '.join(said) if 'finite' not in command.reason else command.reason
+    binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
+    reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
     return LimitedCommand(command.acceleration, reason)
 
 
-def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
+def _separation_first(a: Array, v: Array, axis: Array, a_max: float, v_max: float,
                 period: float) -> Array:
     """
-    Return the acceleration within the limits that loses least along ``away``, and then across.
+    Return the acceleration within the limits that loses least along ``axis``, and then across.
 
     ``|a| <= a_max`` is a ball around zero, ``|v + a T| <= v_max`` one around ``-v / T``. The point
-    of both that lies farthest along ``away`` is in the plane of ``away`` and ``v``. If that is
-    farther than ``a``, the part along ``away`` stays as it is. The part across is the nearest one
-    in both discs that the plane across ``away`` cuts out of the balls.
+    of both that lies farthest along ``axis`` is in the plane of ``axis`` and ``v``. If that is
+    farther than ``a``, the part along ``axis`` stays as it is. The part across is the nearest one
+    in both discs that the plane across ``axis`` cuts out of the balls.
     """
     fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
     strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, -v / period
-    along = float(away @ centre)
-    side = centre - along * away
+    along = float(axis @ centre)
+    side = centre - along * axis
     beside = math.hypot(*side.tolist())
     highest = Discs(0j, strongest, complex(along, beside), reach).best(1 + 0j, far=True).real
-    level = min(float(away @ a), highest)
-    # If v lies along ``away`` but for rounding, any direction across will do.
-    x = side if beside > 1e-9 * reach else np.cross(away, np.eye(3)[int(abs(away).argmin())])
+    level = min(float(axis @ a), highest)
+    # If v lies along ``axis`` but for rounding, any direction across will do.
+    x = side if beside > 1e-9 * reach else np.cross(axis, np.eye(3)[int(abs(axis).argmin())])
     x = x / math.hypot(*x.tolist())
-    y = np.cross(away, x)
+    y = np.cross(axis, x)
     cut = Discs(0j, math.sqrt(max(strongest ** 2 - level ** 2, 0.0)), complex(beside, 0.0),
                 math.sqrt(max(reach ** 2 - (level - along) ** 2, 0.0)))
     point = cut.best(complex(float(x @ a), float(y @ a)))
-    found = level * away + point.real * x + point.imag * y
+    found = level * axis + point.real * x + point.imag * y
     return limit_command(found, v, a_max, fastest, period).acceleration
 
 
@@ -215,7 +215,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration
 
 
-def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound], a_max: float,
+def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
           v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
@@ -231,26 +231,27 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound]
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
-    :param wanted: the bounds, the most important first (see ``ordered``).
+    :param required: the bounds, the most important first (see ``ordered``).
     """
     a, v = np.asarray(command, dtype=float), np.asarray(velocity, dtype=float)
     speed = math.hypot(*v.tolist())
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST_OWN
     fastest = max(v_max, speed * INSIDE) if flyable else v_max
-    asked = a.tolist()
-    if not flyable or not all(map(math.isfinite, asked)) or all(
-            scalar_product(each.normal.tolist(), asked) >= each.least for each in wanted):
+    requested = a.tolist()
+    if not flyable or not all(map(math.isfinite, requested)) or all(
+            scalar_product(each.normal.tolist(), requested) >= each.least for each in required):
         return limit_command(a, v, a_max, fastest, period)
     # Those on the horizontal part that it can do anything for.
-    sides = [(complex(x, y), each.least - z * asked[2], each.reason)
-             for each in wanted for x, y, z in [each.normal.tolist()] if math.hypot(x, y) > STEEP]
+    sides = [(complex(x, y), each.least - z * requested[2], each.reason)
+             for each in required for x, y, z in [each.normal.tolist()]
+             if math.hypot(x, y) > STEEP]
     bounds = [side[:2] for side in sides]
-    missed = [product(normal, complex(*asked[:2])) < least for normal, least in bounds]
+    missed = [product(normal, complex(*requested[:2])) < least for normal, least in bounds]
     if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
-    vertical, strongest = asked[2], a_max * SENT_INSIDE
+    vertical, strongest = requested[2], a_max * SENT_INSIDE
     left = float(v[2]) + vertical * period
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
                   complex(*(-v[:2] / period)),
@@ -260,10 +261,10 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound]
     # Those that the command did not keep, and those that hold it where it is now.
     acting = [k for k, (normal, least) in enumerate(bounds)
               if missed[k] or product(normal, point) <= least + TOLERANCE]
-    away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
+    axis = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
         bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
-    said = sorted({sides[k][2] for k in acting}, key=REASONS.index)
-    return LimitedCommand(limited.acceleration, ', '.join(said), away)
+    binding = sorted({sides[k][2] for k in acting}, key=REASONS.index)
+    return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:

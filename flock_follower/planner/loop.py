@@ -28,8 +28,8 @@ from flock_follower.planner.inputs import at, Neighbor, OwnState, Span
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
-    believed,
     BridgeState,
+    effective_state,
     odometry_fault,
     parse,
     State,
@@ -51,8 +51,9 @@ class PlannerLoop:
     """
     Gathers inputs, and passes them to one step of the core per tick.
 
-    It is active while it is engaged and the bridge reports that it flies the commands. ``memory``
-    is the state that the last step left; ``missed`` counts the ticks that did not come in time.
+    The planner is active while it is engaged and the bridge reports that it flies the commands.
+    ``memory`` is the state that the last step left; ``missed`` counts the ticks that did not come
+    in time.
 
     :param require_bridge: whether the bridge has to report that; else engaging is enough.
     """
@@ -64,7 +65,7 @@ class PlannerLoop:
         """Fields of view of the cameras; () if unknown."""
         self._fields: dict[str, FieldOfView] = {}
         self.ground: float | None = None
-        """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
+        """Height at which the vehicle was armed, in the frame of the odometry, m, if known."""
         self._require_bridge = require_bridge
         self.engaged = False
         """Whether commands are requested; set by :meth:`engage`."""
@@ -81,14 +82,14 @@ class PlannerLoop:
         self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
 
-    def engage(self, wanted: bool) -> None:
+    def engage(self, requested: bool) -> None:
         """
         Request commands, or end the request.
 
         A repeated request changes nothing, except after the planner had given up.
         """
-        self.engaged, self._disengaged_by = wanted, ''
-        self._interrupted |= not wanted or self.memory.given_up
+        self.engaged, self._disengaged_by = requested, ''
+        self._interrupted |= not requested or self.memory.given_up
         self.memory = self.memory._replace(given_up=False)
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
@@ -102,8 +103,8 @@ class PlannerLoop:
         # If it does not fly now, the next tick or the next message finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
-        if self._require_bridge and self.engaged and self._bridge.word == TAKEN_OVER and (
-                before is None or before.word != TAKEN_OVER):
+        if self._require_bridge and self.engaged and self._bridge.name == TAKEN_OVER and (
+                before is None or before.name != TAKEN_OVER):
             self.engage(False)
             why = f' ({self._bridge.reason})' if self._bridge.reason else ''
             self._disengaged_by = f'the pilot took over{why}: call planner/engage to follow again'
@@ -117,8 +118,8 @@ class PlannerLoop:
         """
         if not self._require_bridge:
             return ''
-        bridge = believed(self._bridge, bridge_age)
-        return '' if bridge.word == ACTIVE else f'the bridge: {bridge}'
+        bridge = effective_state(self._bridge, bridge_age)
+        return '' if bridge.name == ACTIVE else f'the bridge: {bridge}'
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
         """Take the own state at a time, ns; only the newest since the last tick counts."""
@@ -134,11 +135,11 @@ class PlannerLoop:
         self._own = state
         self._frame = state.frame
 
-    def take_neighbor(self, neighbor: OdometryState, heard: bool = False) -> None:
+    def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
         """
         Take a neighbour's state.
 
-        :param heard: whether another vehicle reported it; else the own camera sees it.
+        :param received: whether another vehicle reported it; else the own camera sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:
@@ -146,7 +147,7 @@ class PlannerLoop:
         if neighbor.frame != self._frame:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
-        self._neighbors.append((neighbor, heard))
+        self._neighbors.append((neighbor, received))
 
     def take_camera_info(self, info: Any, rpy: ArrayLike, camera: str = '') -> None:
         """
@@ -208,8 +209,8 @@ class PlannerLoop:
             self._own.frame == RELATIVE)
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if heard else n.acceleration, _yaw(n), heard)
-            for n, heard in self._neighbors]
+            n.velocity_covariance, None if received else n.acceleration, _yaw(n), received)
+            for n, received in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
@@ -228,8 +229,9 @@ class PlannerLoop:
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(
-            decision.acceleration, decision.yaw, decision.yaw_rate, decision.away, self._frame,
-            stamp, nanoseconds - stamp, decision.lift, decision.state is State.RELATIVE)
+            decision.acceleration, decision.yaw, decision.yaw_rate, decision.separation_axis,
+            self._frame, stamp, nanoseconds - stamp, decision.thrust_bias,
+            decision.state is State.RELATIVE)
 
 
 def _yaw(n: OdometryState) -> float | None:

@@ -84,24 +84,24 @@ NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebod
 
 
 class Loss(NamedTuple):
-    """The neighbor followed is out of sight."""
+    """The loss of sight of the followed neighbor."""
 
     towards: Array
-    """Horizontal unit vector (3,) to where it was expected then."""
+    """Horizontal unit vector (3,) to its predicted place at the loss."""
     origin: Array
-    """Where the follower was then, or has moved on to along that since (3,), m: it retreats from
-    there."""
+    """Place of the follower at the loss, moved on along ``towards`` since (3,), m: origin of the
+    retreat."""
     free: float = math.inf
-    """Distance along ``towards`` in which nothing was in the way when it was seen last, m, counted
-    from the frame's origin."""
+    """Coordinate along ``towards`` up to which the last line of sight was free, m, in the
+    frame of the odometry."""
     approach: float = 0.0
-    """Horizontal speed at which it came nearer then, m/s."""
+    """Horizontal speed of approach at the loss, m/s."""
     height: float = math.inf
-    """Its height then, m."""
+    """Height of the neighbor at the loss, m."""
     side: Array = np.zeros(3)
-    """Horizontal unit vector (3,) across its path, to the follower's side of it."""
+    """Horizontal unit vector (3,) across the neighbor's path, towards the follower."""
     name: str = ''
-    """Its name; '' if unknown."""
+    """Name of the lost neighbor; '' if unknown."""
 
     def retreated(self, position: Array) -> float:
         """Return the horizontal distance of a position (3,) from the origin, m."""
@@ -120,7 +120,7 @@ class Memory(NamedTuple):
     flock: Mapping[str, Neighbor] = NONE
     """The neighbors at hand and those lost since: to keep clear of."""
     ranged: Mapping[str, Neighbor] = NONE
-    """Those of which no more than the distance is known at present."""
+    """The neighbors of which only the distance is known at present."""
     motions: Mapping[str, SmoothedMotion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
@@ -170,7 +170,7 @@ class Memory(NamedTuple):
         """Return it in the frame of another odometry: what was known of places is forgotten."""
         altitude = self.altitude
         if altitude is not None:
-            altitude = Altitude.begun(own, None, params)._replace(lift=altitude.lift)
+            altitude = Altitude.begun(own, None, params)._replace(thrust_bias=altitude.thrust_bias)
         return Memory(
             now=self.now, own=own, faced=self.faced, followed=self.followed, begun=self.begun,
             given_up=self.given_up, altitude=altitude, yaw=self.yaw, command=self.command,
@@ -208,21 +208,21 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
+        what, before = 'heard estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped
-        n = n._replace(who=member(params.vehicles, n.name, n.heard))
-        if vague and not (unusable or outside or old or n.heard) and (
+        n = n._replace(member=member(params.vehicles, n.name, n.received))
+        if vague and not (unusable or outside or old or n.received) and (
                 distance_known(n, me, params.max_position_std)):
             ranged[n.name] = n
         elif problem := unusable or vague or outside:
             rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
         elif old:
             rejected.append(Rejection(f'{what} older than the jump of odometry', n.name))
-        elif before is None or (before.heard and not n.heard):  # sightings beat received states
+        elif before is None or (before.received and not n.received):  # sightings come first
             kept[n.name] = n
-        elif before.heard == n.heard and n.stamp >= before.stamp:
+        elif before.received == n.received and n.stamp >= before.stamp:
             if (by := off(n, before)) > NEIGHBOR_JUMP:
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
@@ -235,7 +235,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
 
 def longest(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
-    return params.heard_timeout if n.heard else params.predict_timeout
+    return params.heard_timeout if n.received else params.predict_timeout
 
 
 def off(n: Neighbor, before: Neighbor) -> float:

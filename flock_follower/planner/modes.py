@@ -21,7 +21,7 @@ state    when                                              horizontal command
 IDLE     not engaged, or nobody flies the commands         none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
-         one told by others of at most ``heard_timeout``
+         one received of at most ``heard_timeout``
 COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
 HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
          occluded, odometry is overdue, or no image was    lost, then all round
@@ -31,27 +31,28 @@ RELATIVE odometry lost or contradicted, and the bridge     see ``relative``; wit
 =======  ================================================  ===================================
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
-let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD it keeps out
-of the way of whom it no longer sees, a little. From SEARCH and HOLD it follows by itself until
-``resume_timeout``. After that the state stays, and no command is given until it is engaged anew.
+let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD the vehicle
+moves a little out of the way of the lost neighbor. In SEARCH and HOLD the planner
+follows again by itself until ``resume_timeout``. After that the state stays, and the planner sends
+no command until it is engaged again.
 
-Whether the planner's commands are flown: the text of ``mavlink_bridge/state``.
+``mavlink_bridge/state`` reports whether the vehicle flies the planner's commands.
 
-Its text is a word and, after a colon, the reason::
+Its text is a state and, after a colon, the reason::
 
-    NO_AUTOPILOT: none heard yet
+    NO_AUTOPILOT: none received yet
     INACTIVE: offboard was not requested
     READY: waiting for offboard mode
     ACTIVE
     TAKEN_OVER: offboard was left for POSCTL
 
-The bridge sends it where it changes, and at 2 Hz: a bridge that died would else leave ``ACTIVE``
-on the latched topic for ever. Nothing here reads a clock.
+The bridge sends it at each change, and at 2 Hz: otherwise ``ACTIVE`` of a dead bridge would stay
+on the latched topic. Nothing here reads a clock.
 
-Stamps and ages when the system clock is set, as by NTP or by hand.
+Stamps and ages are corrected if the system clock is set, for example by NTP.
 
-A message's stamp is of the system clock, which may jump; the monotonic clock never does. Nothing
-here reads a clock: whoever does reads both at the same time, and passes them on.
+A message's stamp is of the system clock, which may jump; the monotonic clock never does. The
+caller reads both clocks at the same time and passes both times.
 """
 
 from __future__ import annotations
@@ -79,17 +80,17 @@ class State(str, enum.Enum):
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
                params: PlannerParams, waiting: str = '', given_up: bool = False,
-               heard: float | None = None, occluded: bool = False) -> tuple[State, str]:
+               received: float | None = None, occluded: bool = False) -> tuple[State, str]:
     """
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
-    :param fault: what is wrong with the own odometry, or with perception, or ''.
+    :param fault: fault of the own odometry or of perception, or ''.
     :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
-    :param given_up: whether it followed nobody for too long to command anything unasked.
-    :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
-    :param occluded: whether the neighbour that it faces is covered by something.
+    :param given_up: whether it followed nobody for too long, and must be engaged again.
+    :param received: age of the youngest estimate reported by another vehicle, s, or None.
+    :param occluded: whether the faced neighbour is occluded.
     """
     if not engaged:
         return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
@@ -104,8 +105,8 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
         return lost, fault
     if youngest is not None and youngest <= params.predict_timeout:
         return State.TRACK, ''
-    if heard is not None and heard <= params.heard_timeout:
-        return State.TRACK, 'nobody seen: flies by what others tell'
+    if received is not None and received <= params.heard_timeout:
+        return State.TRACK, 'no neighbor in sight: follows received states'
     if followed is None:
         return State.SEARCH, 'no neighbor seen since engaging'
     if occluded:
@@ -133,14 +134,14 @@ def late(own: OwnState | None, slow: float | None, now: float, params: PlannerPa
 
 
 def blind(looked: float | None, now: float, params: PlannerParams) -> str:
-    """Return that perception, or the camera before it, has fallen silent, or ''."""
+    """Return the reason if perception, or its camera, has stopped, or ''."""
     silent = 0.0 if looked is None else now - looked
     # The tolerance lets a timer that fires exactly at the timeout brake at once.
     return (f'no image processed for {silent:.2f} s'
             if silent > params.perception_timeout - 1e-6 else '')
 
 
-NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = WORDS = (
+NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = BRIDGE_STATES = (
     'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
 TOPIC = 'mavlink_bridge/state'
 #: Where the vehicle was armed, in the frame of the odometry; latched.
@@ -150,37 +151,37 @@ _LONGEST_REASON = 200  # characters
 
 
 class BridgeState(NamedTuple):
-    """One of ``WORDS``, and why it is that one."""
+    """One of ``BRIDGE_STATES``, and why it is that one."""
 
-    word: str
+    name: str
     reason: str = ''
 
     def __str__(self) -> str:
-        return f'{self.word}: {self.reason}' if self.reason else self.word
+        return f'{self.name}: {self.reason}' if self.reason else self.name
 
 
 def parse(text: str) -> BridgeState:
-    """Return the state in a message; an unknown word, or none, counts as ``INACTIVE``."""
-    word, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
+    """Return the state in a message; an unknown state, or none, counts as ``INACTIVE``."""
+    name, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
         r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
-    if word not in WORDS:
-        return BridgeState(INACTIVE, f'the bridge says {text[:40]!r}, which means nothing here')
-    return BridgeState(word, ' '.join(reason.split())[:_LONGEST_REASON])
+    if name not in BRIDGE_STATES:
+        return BridgeState(INACTIVE, f'unknown state of the bridge: {text[:40]!r}')
+    return BridgeState(name, ' '.join(reason.split())[:_LONGEST_REASON])
 
 
-def believed(said: BridgeState | None, age: float) -> BridgeState:
+def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     """
     Return the state of the bridge, which counts as absent after a silence.
 
-    :param said: its last message, None without one.
+    :param reported: its last message, None without one.
     :param age: how long ago that was, s, by a clock that neither stops nor jumps.
     """
-    if said is None or math.isinf(age):
-        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} (where somebody else flies '
+    if reported is None or math.isinf(age):
+        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (where somebody else flies '
                            'the commands, require_bridge:=false)')
     if not age <= SILENCE:  # written so that NaN fails
-        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} for {age:.1f} s')
-    return said
+        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
+    return reported
 
 
 #: A smaller change, s, is slewing or a late reading, and followed as it is.

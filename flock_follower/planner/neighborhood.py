@@ -24,7 +24,7 @@ it last looks where it was, to both sides, then all round. Meanwhile it follows 
 their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
 vehicle would turn to another follower, and the whole flock would hover without its leader.
 
-Warnings name what is beyond the follower's means, and members of the flock whose position is
+Warnings name motions that the follower cannot follow, and members of the flock whose position is
 unknown.
 """
 
@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.flock import neighbor_graph
-from flock_follower.flock.neighbor_graph import attended, HELD
+from flock_follower.flock.neighbor_graph import graph_law, HELD
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
@@ -45,7 +45,7 @@ from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory, SmoothedMotion
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
-HULLS_APART = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
+GAP_MIN = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
 
 
 class Neighborhood(NamedTuple):
@@ -61,7 +61,7 @@ class Neighborhood(NamedTuple):
     level: Neighbor | None
     """The neighbor whose altitude it follows."""
     peers: Sequence[Neighbor] = ()
-    """Those at the ends of its edges, to meet at one altitude, if no leader is at hand."""
+    """The neighbors at its edges, to meet at one altitude, if no leader is at hand."""
 
 
 NOBODY = Neighborhood((), {}, frozenset(), None, None)
@@ -69,7 +69,7 @@ NOBODY = Neighborhood((), {}, frozenset(), None, None)
 
 def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
     """Return the distance between the own hull and a neighbor's, m."""
-    return max(math.dist(n.position, me.position) - (params.radius + n.who.radius), 0.0)
+    return max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0)
 
 
 def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: PlannerParams,
@@ -88,10 +88,10 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     shares = {n.name: min(max(before.get(n.name, 0.0) + (
         change if n.name in joined else -change), 0.0), 1.0) if before else float(n.name in joined)
         for n in flock}
-    follow = [n for n in flock if n.who.role != AVOID]
-    leaders = [n for n in follow if n.who.role == LEADER]
+    follow = [n for n in flock if n.member.role != AVOID]
+    leaders = [n for n in follow if n.member.role == LEADER]
     ends = [n for n in follow if n.name in joined]
-    seen = [[n for n in some if not n.heard] for some in (leaders, ends)]
+    seen = [[n for n in some if not n.received] for some in (leaders, ends)]
     # Never turn away from a neighbor in sight to one that is only received.
     faced = _nearest(me, memory.faced, next(filter(None, [*seen, leaders, ends]), []))
     return Neighborhood(flock, shares, joined, faced, _nearest(me, memory.faced, leaders) or faced,
@@ -105,16 +105,16 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
 
     :param held: those of before.
     """
-    follow = [n for n in flock if n.who.role != AVOID]
+    follow = [n for n in flock if n.member.role != AVOID]
     if len(follow) < 2:
         return frozenset(n.name for n in follow)
     joined = neighbor_graph.edges(
         me.position, np.array([n.position for n in follow]),
-        np.array([params.radius + n.who.radius for n in follow]), params.radius,
+        np.array([params.radius + n.member.radius for n in follow]), params.radius,
         np.array([n.name in held for n in follow]))
-    seen = [n for n in follow if not n.heard]
+    seen = [n for n in follow if not n.received]
     # A received position never removes the edge to the only leader in sight.
-    kept = [n.name for n in seen if len(seen) == 1 and n.who.role == LEADER]
+    kept = [n.name for n in seen if len(seen) == 1 and n.member.role == LEADER]
     return frozenset(n.name for n, edge in zip(follow, joined) if edge or n.name in kept)
 
 
@@ -131,7 +131,7 @@ REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> list[str]:
-    """Return warnings of what is beyond the follower's means."""
+    """Return warnings of motions that the follower cannot follow."""
     v_max, most = params.v_max, params.climb_rate
     near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
@@ -161,23 +161,23 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 
     The search begins within ``coast_timeout``, if all other neighbors are only received: a vehicle
-    that has another one in view stays with that. It ends when a leader is at hand again.
+    that has another one in view stays with that. The search ends when a leader is at hand again.
     """
     last = memory.leader
-    if last is None or any(n.who.role == LEADER for n in neighbors.flock):
+    if last is None or any(n.member.role == LEADER for n in neighbors.flock):
         return None
     age = me.stamp - last.stamp
-    begins = age <= params.coast_timeout and all(n.heard for n in neighbors.flock)
+    begins = age <= params.coast_timeout and all(n.received for n in neighbors.flock)
     return last if (memory.looking or begins) and age <= params.resume_timeout else None
 
 
 def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
     """Return the newest estimate of a leader that it has seen and faced."""
     faced, last = neighbors.faced, memory.leader
-    if faced is not None and not faced.heard and faced.who.role == LEADER:
+    if faced is not None and not faced.received and faced.member.role == LEADER:
         return faced
     return next((n for n in neighbors.flock if last is not None and n.name == last.name
-                 and n.who.role == LEADER), last)
+                 and n.member.role == LEADER), last)
 
 
 def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
@@ -187,14 +187,14 @@ def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
 
     Members are named by parameters, or were known in this flight up to ``resume_timeout`` ago.
     """
-    missing = {name for name, who in params.vehicles.items() if who.role != AVOID}
+    missing = {name for name, member in params.vehicles.items() if member.role != AVOID}
     missing.update(name for name, n in memory.met.items()
                    if me.stamp - n.stamp <= params.resume_timeout)
     missing -= memory.flock.keys()  # with those lost a moment ago
-    help_wanted = '' if any(n.heard for n in neighbors.flock) else (
-        ': not a formation for what its cameras see; more of them, or words, would help')
-    return [f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
-            f'{help_wanted}'] if missing else []
+    advice = '' if any(n.received for n in neighbors.flock) else (
+        ': more cameras or flock messages are needed for this formation')
+    return [f'{", ".join(sorted(missing))} neither seen nor received, not kept clear of{advice}'
+            ] if missing else []
 
 
 def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
@@ -207,8 +207,8 @@ def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
         law = acceleration(offsets, differences, params.law)
     else:
         share = np.array([neighbors.shares[n.name] for n in flock])
-        others = np.array([n.who.role == AVOID for n in flock])
-        law = attended(offsets, differences, share, others, params.law, params.a_max)
+        others = np.array([n.member.role == AVOID for n in flock])
+        law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
     if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
         return law, None  # too near already: at once
@@ -226,6 +226,6 @@ def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
 def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
     """Return the vector (3,), m, from the own hull to a neighbor's."""
     offset: Array = n.position - me.position
-    distance = max(math.hypot(*offset.tolist()), HULLS_APART)
-    gap = max(distance - (params.radius + n.who.radius), HULLS_APART)
+    distance = max(math.hypot(*offset.tolist()), GAP_MIN)
+    gap = max(distance - (params.radius + n.member.radius), GAP_MIN)
     return offset * (gap / distance)

@@ -31,9 +31,9 @@ RADIUS = Range(0.0, 5.0, 'm')
 @dataclass(frozen=True)
 class Member(Checked):
     """
-    What is known of a vehicle beforehand.
+    The role and size of a vehicle, known before the flight.
 
-    :raises ValueError: naming what is wrong, its value and what is valid.
+    :raises ValueError: naming the field, its value and the valid range.
     """
 
     role: str = parameter(
@@ -46,17 +46,17 @@ class Member(Checked):
         'Directions in which its markers face, anticlockwise from its own, rad.')
 
 
-SEEN_FIRST, HEARD_FIRST = Member(LEADER), Member(FOLLOWER)  # strangers
+SEEN_DEFAULT, RECEIVED_DEFAULT = Member(LEADER), Member(FOLLOWER)  # strangers
 
 
-def member(members: Mapping[str, Member], name: str, heard: bool) -> Member:
+def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     """
-    Return what is known of a vehicle; of a stranger, that depends on how it is known.
+    Return the role and size of a vehicle; a stranger's role depends on how it was detected.
 
-    What carries the marker of another without being it is avoided, and as large as that one.
+    A duplicate of a neighbor's marker is avoided, with the neighbor's radius.
     """
     base, duplicate, _ = name.partition(DUPLICATE)
-    known = members.get(base, HEARD_FIRST if heard else SEEN_FIRST)
+    known = members.get(base, RECEIVED_DEFAULT if received else SEEN_DEFAULT)
     return Member(AVOID, known.radius) if duplicate else known
 
 
@@ -66,7 +66,7 @@ RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no 
 @dataclass(frozen=True)
 class GuardParams(Checked):
     """
-    How the guard holds the band.
+    Parameters of the guard.
 
     :raises ValueError: naming the parameter, its value and the valid range.
     """
@@ -114,22 +114,23 @@ class PlannerParams(Checked):
     law: FlockingParams = field(default_factory=lambda: FlockingParams(beta=0.25, d1=8.0))
     guard: bool = parameter(
         True, None,
-        'hold the band where the law alone does not; it cannot be switched off while the bridge '
-        'is ACTIVE', live=True)
+        'keep the band of distances if the law alone does not; the guard cannot be switched off '
+        'while the bridge is ACTIVE', live=True)
     guarding: GuardParams = field(default_factory=GuardParams)
     a_max: float = parameter(
         2.5, Range(0.1, 20.0, 'm/s^2'),
-        'largest acceleration, of the vector; never above its value at the start, and only '
-        'lowered while the bridge is ACTIVE; braking and separation keep that of the start',
+        'largest magnitude of the acceleration; never above its initial value, and only lowered '
+        'while the bridge is ACTIVE; braking and separation use the initial value',
         live=True)
     v_max: float = parameter(
-        0.5, Range(0.05, 20.0, 'm/s'), 'largest speed, of the vector; likewise', live=True)
+        0.5, Range(0.05, 20.0, 'm/s'), 'largest speed; the same conditions as for '
+                                       'a_max', live=True)
     a_max_start: float = parameter(
         0.0, Range(0.0, 20.0, 'm/s^2'),
-        '``a_max`` of the start, m/s^2, if it was lowered since; see ``strongest``.')
+        'initial ``a_max``, m/s^2, if it was lowered in flight; see ``strongest``.')
     v_max_start: float = parameter(
         0.0, Range(0.0, 20.0, 'm/s'),
-        '``v_max`` of the start, m/s, if it was lowered since; see ``fastest``.')
+        'initial ``v_max``, m/s, if it was lowered in flight; see ``fastest``.')
     period: float = parameter(
         0.1, Range(0.02, 1.0, 's'),
         'time between commands')
@@ -138,17 +139,17 @@ class PlannerParams(Checked):
         'age up to which a neighbor is extrapolated and followed', live=True)
     heard_timeout: float = parameter(
         1.0, Range(0.05, 5.0, 's'),
-        'age up to which what others tell of a neighbor is used')
+        'age up to which a state received from another vehicle is used')
     coast_timeout: float = parameter(
         2.0, Range(0.05, 10.0, 's'),
-        'age of the last neighbor up to which to coast, then brake', live=True)
+        'age of the last estimate up to which the vehicle coasts; then it brakes', live=True)
     odom_timeout: float = parameter(
         0.3, Range(0.02, 2.0, 's'),
-        'age of the odometry up to which to command at all; it brakes from half of it on, or, '
-        'where odometry usually becomes older, when it is overdue', live=True)
+        'largest age of the odometry for commands; the planner brakes from half of it on or, if '
+        'odometry is usually older, when the next message is overdue', live=True)
     perception_timeout: float = parameter(
         0.2, Range(0.05, 2.0, 's'),
-        'time without an image processed by relative_pose, once one was, after which to brake; at '
+        'time without an image processed by relative_pose after which the planner brakes; at '
         'least 2 periods of the camera', live=True)
     max_position_std: float = parameter(
         0.5, Range(0.01, 10.0, 'm'),
@@ -166,22 +167,23 @@ class PlannerParams(Checked):
         "Time over which the law's command is faded in when following begins or changes, s.")
     altitude_mode: str = parameter(
         'follow', ALTITUDE_MODES,
-        'follow the altitude of the leader, or of the nearest neighbor attended to, or hold the '
+        'follow the altitude of the leader, or of the nearest neighbor with an edge, or hold the '
         'one at which it became active', live=True)
     altitude_offset: float = parameter(
         0.0, Range(-10.0, 10.0, 'm'),
-        'how far above the neighbor that it follows to fly', live=True)
+        'height above the followed neighbor', live=True)
     altitude_min: float = parameter(
         1.0, Range(-1000.0, 1000.0, 'm'),
-        'least altitude, above the height at arming; where the bridge does not know that, it is '
-        'the altitude at which it became active. Who begins below it does not jump up', live=True)
+        'least altitude above the height at arming; if the bridge does not know that height, the '
+        'altitude at which the planner became active. A vehicle that begins below it does not '
+        'climb at once', live=True)
     altitude_max: float = parameter(
         100.0, Range(-1000.0, 10000.0, 'm'),
-        'greatest altitude, above the same; set below its default, it permits leaving the plane '
-        'of a closing neighbor out of sight upwards, by at most 1 m', live=True)
+        'greatest altitude above the same height; a value below the default permits a climb of at '
+        'most 1 m out of the way of an approaching neighbor out of sight', live=True)
     range_max: float = parameter(
         500.0, Range(1.0, 100000.0, 'm'),
-        'greatest horizontal distance from where it became active', live=True)
+        'greatest horizontal distance from the place where the planner became active', live=True)
     climb_rate_max: float = parameter(
         0.8, Range(0.05, 10.0, 'm/s'),
         'largest rate at which the altitude to hold changes', live=True)
@@ -192,34 +194,34 @@ class PlannerParams(Checked):
         'largest acceleration of the control of altitude')
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
-        'speed up to which a neighbor out of sight is reckoned with', live=True)
+        'largest assumed speed of a neighbor out of sight', live=True)
     leader_acceleration_max: float = parameter(
         1.0, Range(0.0, 20.0, 'm/s^2'),
-        'acceleration up to which one out of sight is reckoned with; more makes it retreat '
+        'largest assumed acceleration of a neighbor out of sight; with more the vehicle retreats '
         'earlier', live=True)
     retreat_max: float = parameter(
         1.0, Range(0.0, 10.0, 'm'),
-        'how far to move out of the way of a neighbor out of sight; farther, by at most 3 m, if '
-        'it was coming; 0: not', live=True)
+        'largest retreat from a neighbor out of sight; up to 3 m more if the neighbor was '
+        'approaching; 0: no retreat', live=True)
     resume_timeout: float = parameter(
         30.0, Range(0.1, 3600.0, 's'),
-        'time without a neighbor followed up to which it follows by itself; then it stops '
-        'commanding until planner/engage is called', live=True)
+        'time without a followed neighbor, up to which the planner follows again by itself; then '
+        'it stops commanding until planner/engage is called', live=True)
     yaw_mode: str = parameter(
         'leader', YAW_MODES,
-        'face the leader, or the nearest neighbor attended to, or hold the yaw at which it became '
-        'active', live=True)
+        'face the leader, or the nearest neighbor with an edge, or hold the yaw at which it '
+        'became active', live=True)
     yaw_rate_max: float = parameter(
         1.0, Range(0.05, 6.0, 'rad/s'),
-        'largest rate at which the commanded yaw turns, and to turn to it', live=True)
+        'largest rate of the commanded yaw, and of the turn to it', live=True)
     scan_rate: float = parameter(
         0.5, Range(0.0, 3.0, 'rad/s'),
-        'rate of turning to look for a neighbor; 0: none', live=True)
+        'yaw rate of the search for a neighbor; 0: no search', live=True)
 
     radius: float = parameter(
-        0.0, RADIUS, 'of the own hull: distances are kept between hulls', live=True)
+        0.0, RADIUS, 'radius of the own hull: all distances are between hulls', live=True)
     vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
-    """What is known beforehand of others, by name."""
+    """Roles and sizes of other vehicles, by name."""
 
     @property
     def strongest(self) -> float:

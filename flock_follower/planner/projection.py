@@ -31,7 +31,7 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
-TOLERANCE = 1e-9  # of lengths of the order of 1; what is left over is cut off by the caller
+TOLERANCE = 1e-9  # of lengths of the order of 1; the caller cuts off the rest
 ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below TOLERANCE
 PARALLEL = 1e-11  # slope along a line of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
@@ -66,12 +66,12 @@ class Discs(NamedTuple):
         towards = goal / abs(goal) if far else goal - centre
         for here, here_radius, there, there_radius in (
                 (centre, radius, other, other_radius), (other, other_radius, centre, radius)):
-            away = abs(goal - here)
+            distance = abs(goal - here)
             if far:
                 point = here + here_radius * towards
             else:
-                point = goal if away <= here_radius else (
-                    here + (goal - here) * (here_radius / away))
+                point = goal if distance <= here_radius else (
+                    here + (goal - here) * (here_radius / distance))
             if abs(point - there) <= there_radius + TOLERANCE:
                 return point
         return self._on_rim(towards)
@@ -102,7 +102,7 @@ class _Line(NamedTuple):
     high: float
     """At most ``low`` where the line misses what the discs share."""
     gap: float
-    """By how much it misses; at most 0 if it does not."""
+    """Distance by which the line misses the discs; at most 0 if it meets them."""
 
     @classmethod
     def of(cls, normal: complex, level: float, discs: Discs) -> _Line:
@@ -168,15 +168,15 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
     return point, len(sides)
 
 
-def lexicographic(wanted: complex, sides: Sequence[Side], discs: Discs) -> complex:
+def lexicographic(goal: complex, sides: Sequence[Side], discs: Discs) -> complex:
     """
-    Return the point of the discs nearest to ``wanted`` that meets the bounds, the first first.
+    Return the point of the discs nearest to ``goal`` that meets the bounds, the first first.
 
     A bound that the ones before it leave no room for is met as nearly as they allow, so none
     costs one before it anything. A bound whose normal is zero bounds nothing.
     """
     sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
-    point, k = optimum(wanted, False, sides, discs)
+    point, k = optimum(goal, False, sides, discs)
     if k == len(sides):
         return point
     while True:
@@ -197,4 +197,4 @@ def lexicographic(wanted: complex, sides: Sequence[Side], discs: Discs) -> compl
             low = max(low, min(there, high))
         else:
             high = min(high, max(there, low))
-    return line.at(wanted, False, low, high)
+    return line.at(goal, False, low, high)

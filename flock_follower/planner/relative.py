@@ -66,9 +66,9 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     if fault := untimely(own.stamp, now, params.odom_timeout):
         return f'no odometry, and the motion by attitude is {fault.detail} old'
     seen = {name: n for name, n in memory.neighbors.items()
-            if not n.heard and now - n.stamp <= OLDEST}
+            if not n.received and now - n.stamp <= OLDEST}
     leader = seen.get(memory.faced) or max(
-        (n for n in seen.values() if n.who.role != AVOID), key=lambda n: n.stamp, default=None)
+        (n for n in seen.values() if n.member.role != AVOID), key=lambda n: n.stamp, default=None)
     if leader is None:
         return 'no odometry, and no neighbor in sight'
     me, there = at(own, now), at(leader, now)
@@ -85,10 +85,10 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
-    lift = np.array([0.0, 0.0, altitude.lift])
+    bias = np.array([0.0, 0.0, altitude.thrust_bias])
     return memory._replace(
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
-        pending=left * memory.pending + (1.0 - left) * params.response_time * (command - lift),
+        pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
     ), leader, yaw, turning(last, yaw, me, params, elapsed)
 
 
@@ -124,7 +124,7 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     x, y, _ = (place - me.position).tolist()
     distance = math.hypot(x, y)
     towards = np.array([x, y]) / distance if distance > 1e-6 else np.zeros(2)
-    return distance - params.radius - n.who.radius, towards
+    return distance - params.radius - n.member.radius, towards
 
 
 def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:

@@ -78,17 +78,17 @@ class FieldOfView(NamedTuple):
         aside = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
         up = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
         if not several and not (aside[1] < 0.0 < aside[0] and up[1] < 0.0 < up[0]):
-            raise ValueError(f'camera_rpy = {angles}: straight ahead must be in the image')
+            raise ValueError(f'camera_rpy = {angles}: the forward direction must be in the image')
         return cls(max(aside), -min(aside), max(up), -min(up), heading)
 
     def outside(self, bearing: float, edge: float = 0.0) -> float:
-        """Return how far a bearing from the forward axis is off the image less an edge, rad."""
+        """Return by how much a bearing is outside the image, shrunk by ``edge``, rad; 0 inside."""
         off = wrap_angle(bearing - self.heading)
         return max(off - self.left + edge, edge - self.right - off, 0.0)
 
 
 View = tuple[FieldOfView, ...]
-"""Of all cameras; () if unknown."""
+"""Fields of view of all cameras; () if unknown."""
 
 
 def visible(view: View, offset: Array, yaw: float, forward: float, margin: float) -> bool:
@@ -154,7 +154,7 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     :param frames: stamps of the newest processed images, s, in their order.
     :param forward: own acceleration ahead, m/s^2, which tilts the camera.
     """
-    if n is None or n.heard or not view:
+    if n is None or n.received or not view:
         return None if n is None else before
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:

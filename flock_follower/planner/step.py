@@ -88,7 +88,7 @@ class Decision(NamedTuple):
     """Commanded yaw, rad, ENU; None exactly if the acceleration is None."""
     yaw_rate: float = 0.0
     """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
-    away: Array | None = None
+    separation_axis: Array | None = None
     """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
     stamp: float | None = None
     """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
@@ -97,7 +97,7 @@ class Decision(NamedTuple):
     rejected: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
     """Motions of the neighbors that are beyond the follower's means."""
-    lift: float = 0.0
+    thrust_bias: float = 0.0
     """The part of the vertical acceleration that only makes up for a wrong hover thrust, m/s^2."""
     edges: tuple[str, ...] = ()
     """The neighbors at the ends of its edges; others are only kept clear of."""
@@ -111,7 +111,7 @@ class Decision(NamedTuple):
 
 
 class _Mode(NamedTuple):
-    """The state of one step, and what it rests on."""
+    """The state of one step, and the inputs that it depends on."""
 
     state: State
     reason: str
@@ -167,10 +167,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
         memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
-    # The lift only makes up for a wrong hover thrust: it moves the vehicle nowhere.
-    lift = np.array([0.0, 0.0, altitude.lift])
+    # The thrust bias only corrects a wrong hover thrust: it does not move the vehicle.
+    bias = np.array([0.0, 0.0, altitude.thrust_bias])
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
-                               me.velocity + coming - lift * params.period, params)
+                               me.velocity + coming - bias * params.period, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -183,11 +183,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         leader=last_known(memory, neighbors), looking=leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (
-            command.acceleration - lift))
+            command.acceleration - bias))
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw,
-        turning(last_yaw, yaw, me, params, elapsed), command.away, stamp, command.reason, rejected,
-        _warnings(memory, mode, me, neighbors, leader, params), float(lift[2]),
+        turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
+        command.reason, rejected,
+        _warnings(memory, mode, me, neighbors, leader, params), float(bias[2]),
         tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
 
 
@@ -212,10 +213,10 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
     occluded = None if fault else _occluded(memory, now, frames, view)
-    follow = [n for n in memory.neighbors.values() if n.who.role != AVOID and (
-        occluded is None or n.heard or n.name != memory.faced)]
-    seen, heard = (max((n.stamp for n in follow if n.heard is received), default=None)
-                   for received in (False, True))
+    follow = [n for n in memory.neighbors.values() if n.member.role != AVOID and (
+        occluded is None or n.received or n.name != memory.faced)]
+    seen, received = (max((n.stamp for n in follow if n.received is by_message), default=None)
+                      for by_message in (False, True))
     unfollowed = None if memory.followed is None else now - memory.followed
     begun = now if memory.begun is None else memory.begun
     given_up = memory.given_up or (
@@ -224,13 +225,13 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     state, reason = next_state(
         engaged, fault or late(memory.own, slow, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
-        None if heard is None else now - heard, occluded is not None)
+        None if received is None else now - received, occluded is not None)
     memory = memory._replace(slow=slow is not None)
     if state is not State.IDLE:
         memory = memory._replace(given_up=given_up, begun=begun, occlusion=occluded)
     if state is State.TRACK:
         memory = memory._replace(met={**memory.met, **{n.name: n for n in follow}})
-    newest = heard if seen is None else seen
+    newest = received if seen is None else seen
     return memory, _Mode(state, reason, bool(fault) or given_up, bool(blinded), newest)
 
 
@@ -253,13 +254,13 @@ def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
     :param leader: the leader to look for.
     """
     # The vehicle always keeps clear of vehicles to avoid.
-    here = [n for n in memory.neighbors.values() if tracking or n.who.role == AVOID]
+    here = [n for n in memory.neighbors.values() if tracking or n.member.role == AVOID]
     flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
-             or not (tracking or n.who.role == AVOID) or (leader and leader.name == n.name)}
+             or not (tracking or n.member.role == AVOID) or (leader and leader.name == n.name)}
     for n in here:
         before = flock.get(n.name)
-        if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
+        if before is not None and not before.received and off(n, before) > NEIGHBOR_JUMP:
             # The old track may be a second drone: avoid it until coast_timeout.
             name = f'{n.name} before'
             flock[name] = before._replace(name=name)
@@ -284,7 +285,7 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
         ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
         return memory.lost._replace(origin=memory.lost.origin + ahead * along)
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [leader] if leader else [n for n in flock.values() if n.who.role != AVOID]
+    near = [leader] if leader else [n for n in flock.values() if n.member.role != AVOID]
     if not near:
         return Loss(towards, me.position)
     n = min(near, key=lambda n: math.dist(n.position, me.position))
@@ -293,7 +294,7 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     motion = memory.motions.get(n.name)
-    a = np.zeros(3) if n.heard or motion is None else motion.acceleration
+    a = np.zeros(3) if n.received or motion is None else motion.acceleration
     soon = expected(n, a, TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
     return Loss(towards, me.position, float(towards @ n.position), approach,
@@ -334,24 +335,25 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
     :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
     :param velocity: own velocity when the command acts (3,), m/s.
     """
-    wanted: Array = np.zeros(3)
+    unlimited: Array = np.zeros(3)
     fading = None
     # Limits lowered in flight do not bind braking and keeping clear.
     strongest = params.strongest, params.fastest
     limits = params.a_max, params.v_max
     if mode.state is State.TRACK:
-        wanted, fading = nominal(memory, me, neighbors, params)
+        unlimited, fading = nominal(memory, me, neighbors, params)
     elif mode.state is not State.COAST:
         limits = strongest
-        wanted = brake(velocity, params.strongest, params.brake_time_constant)
+        unlimited = brake(velocity, params.strongest, params.brake_time_constant)
     rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
+    command = limit_horizontal(unlimited, vertical, velocity, *limits, params.period, rising)
     if params.guard and (mode.state is not State.SEARCH or memory.flock):
         command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # What is still to be flown is a guess: the measured velocity is limited, too.
+    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = strongest
-    final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
+    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
+                          command.separation_axis)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
     a = final.acceleration
@@ -377,7 +379,7 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
         if memory.lost is None:
             return last
         since, towards = me.stamp - (memory.followed or 0.0), memory.lost.towards
-        newest = max((n for n in memory.flock.values() if n.who.role != AVOID),
+        newest = max((n for n in memory.flock.values() if n.member.role != AVOID),
                      key=lambda n: n.stamp, default=None)
         faced = None if newest is None else at(newest, me.stamp)
     since -= params.coast_timeout
@@ -388,7 +390,7 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
               leader: Neighbor | None, params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means, and what it does about neighbors not seen."""
+    """Return warnings: neighbors that it cannot follow, and the reaction to lost ones."""
     if mode.state is State.TRACK:
         search = '' if leader is None else (
             f'looks for {leader.name}, not known of for {me.stamp - leader.stamp:.1f} s')

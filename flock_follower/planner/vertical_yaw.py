@@ -13,24 +13,23 @@
 # limitations under the License.
 
 """
-Which altitude to fly at, and the vertical acceleration that gets there.
+Altitude and yaw control: the altitude to hold, the vertical acceleration and the yaw.
 
 The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
-loses one that climbs or descends. It is controlled with the characteristic polynomial
-s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, and an integral that takes up what the
-autopilot's estimate of the hover thrust errs by.
+loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
+s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, with an integral that corrects errors of
+the autopilot's hover thrust.
 
-It stops in time before the lowest and the highest altitude: the nearer they are, the slower it may
-approach them, by where it is when a command acts. A target that ends there is no more than that:
-the vehicle passed it by 0.25 m, by the climb of the target, by what was still to be flown, and by
-an integral that had wound up.
+The vehicle stops in time before the lowest and the highest altitude: the nearer they are when a
+command acts, the slower it may approach them. A target that ends there is not enough: the vehicle
+overshot it by 0.25 m, because of the target's climb, of commands not yet flown, and of a wound-up
+integral.
 
-The noise of the neighbour's vertical velocity is kept out of the command, without lag for one that
-climbs: what is new in it counts little where its acceleration is known, and what is as small as
-the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
-is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
+The neighbour's vertical velocity is smoothed, without lag if its acceleration is known. A
+velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
+after a loss, is reduced slowly: with the delay of the vehicle, a fast climb overshoots ``v_max``.
 
-The yaw turns the camera to the neighbor, after it, or round in search of it.
+The yaw turns the camera to the neighbor, or turns round to search for it.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from flock_follower.geometry import wrap_angle
 from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams
 
-LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
+THRUST_BIAS_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
 MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
 MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
@@ -51,8 +50,8 @@ INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
 INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
 BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
 CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
-BELIEVED_CLIMB = 0.3  # of what is new in it that is believed at once, its acceleration known
-BELIEVED_HEIGHT = 0.5  # likewise of what is new in its height
+CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
+HEIGHT_GAIN = 0.5  # likewise of a change in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
 INSIDE = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
 BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
@@ -70,11 +69,11 @@ class Altitude(NamedTuple):
     highest: float
     """m."""
     climb: float = 0.0
-    """How fast ``held`` changes, m/s."""
-    lift: float = 0.0
+    """Rate of ``held``, m/s."""
+    thrust_bias: float = 0.0
     """The integral, m/s^2."""
     neighbor_climb: float | None = None
-    """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
+    """Vertical velocity of the neighbour that is followed, m/s; None without one."""
 
     @classmethod
     def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
@@ -91,39 +90,39 @@ class Altitude(NamedTuple):
 
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return it after following a neighbour, at the own time, for some time, s."""
+        """Return the altitude after ``elapsed`` s of following a neighbour."""
         if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
-        wanted = float(leader.position[2]) + params.altitude_offset
-        within = min(max(wanted, self.lowest), self.highest)
+        goal = float(leader.position[2]) + params.altitude_offset
+        within = min(max(goal, self.lowest), self.highest)
         most, faster = params.climb_rate, CLIMB_ACCELERATION * elapsed
-        its = float(leader.velocity[2])
+        neighbor_climb = float(leader.velocity[2])
         if self.neighbor_climb is not None and leader.acceleration is not None:
             # Smoothed, without lag if it accelerates.
             change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
                          TRUSTED_ACCELERATION) * elapsed
             due = self.neighbor_climb + change
-            its = due + BELIEVED_CLIMB * (its - due)
+            neighbor_climb = due + CLIMB_GAIN * (neighbor_climb - due)
         significant = 0.0
-        if within == wanted:
-            share = (its / CLIMB_NOISE) ** 4  # of it that is more than its noise
-            significant = min(max(its * share / (1.0 + share), -most), most)
+        if within == goal:
+            share = (neighbor_climb / CLIMB_NOISE) ** 4  # share that exceeds its noise
+            significant = min(max(neighbor_climb * share / (1.0 + share), -most), most)
         ahead = self.held + significant * elapsed
-        ahead = min(max(ahead + BELIEVED_HEIGHT * (within - ahead), self.lowest), self.highest)
+        ahead = min(max(ahead + HEIGHT_GAIN * (within - ahead), self.lowest), self.highest)
         held = min(max(ahead, self.held - most * elapsed), self.held + most * elapsed)
         climb = min(max(significant + (ahead - held) / CATCH_UP_TIME, -most), most)
         climb = min(max(climb, min(self.climb, significant) - faster),
                     max(self.climb, significant) + faster)
-        return self._replace(held=held, climb=climb, neighbor_climb=its)
+        return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
-        Return it after meeting followers at one altitude, at the own time, for some time, s.
+        Return the altitude after ``elapsed`` s of meeting other followers at one altitude.
 
-        They follow this vehicle, too: a vehicle that took their mean at once would answer its own
-        motion, and all would leave together. So slowly, and with half of their climb, the way
-        round has a gain below 1 at every frequency, whoever is joined to whom.
+        The others follow this vehicle, too. If it took their mean at once, it would follow its own
+        motion, and all would drift together. With this slow rate and half of their climb, the
+        loop gain is below 1 at every frequency, for every neighbor graph.
         """
         height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
             [n.position for n in others], [n.velocity for n in others]))
@@ -138,7 +137,7 @@ class Altitude(NamedTuple):
                    least: float = -math.inf, most: float = math.inf,
                    coming: float = 0.0) -> tuple[Altitude, float]:
         """
-        Return it, and the vertical acceleration, m/s^2, for the next period.
+        Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
         :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
             lowest and the highest altitude go before.
@@ -154,7 +153,7 @@ class Altitude(NamedTuple):
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
-        wanted, within = (2.0 * w * (each - rate)
+        nominal, within = (2.0 * w * (each - rate)
                           for each in (speed, min(max(clear, -down), up)))
         vertical = min(max(within, -strongest), strongest)
         # An overshoot of the climb would be taken from backing off, which shares v_max with it.
@@ -169,13 +168,14 @@ class Altitude(NamedTuple):
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
             BEYOND < above < FAR_BEYOND and rate > -RETURNING)
         share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
-        lift = self.lift + share * w ** 3 * error * elapsed
-        # Anti-windup: what a limit takes away the integral does not ask for as well.
-        if (vertical - wanted) * (lift - self.lift) < 0.0 and abs(lift) > abs(self.lift):
-            lift = self.lift
-        lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
-        total = min(max(vertical + self.lift, -params.a_max), params.a_max)
-        return self._replace(lift=lift if math.isfinite(lift) else 0.0), total
+        bias = self.thrust_bias + share * w ** 3 * error * elapsed
+        # Anti-windup: a limited acceleration does not increase the integral.
+        if (vertical - nominal) * (bias - self.thrust_bias) < 0.0 and (
+                abs(bias) > abs(self.thrust_bias)):
+            bias = self.thrust_bias
+        bias = min(max(bias, -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
+        total = min(max(vertical + self.thrust_bias, -params.a_max), params.a_max)
+        return self._replace(thrust_bias=bias if math.isfinite(bias) else 0.0), total
 
 
 def _stopped_within(gap: float, gain: float) -> float:
@@ -238,6 +238,6 @@ def turning(before: float, commanded: float, me: OwnState, params: PlannerParams
     return min(max(rate, -params.yaw_rate_max), params.yaw_rate_max)
 
 
-def _turned(last: float, wanted: float, params: PlannerParams, elapsed: float) -> float:
+def _turned(last: float, goal: float, params: PlannerParams, elapsed: float) -> float:
     most = params.yaw_rate_max * elapsed
-    return wrap_angle(last + min(max(wrap_angle(wanted - last), -most), most))
+    return wrap_angle(last + min(max(wrap_angle(goal - last), -most), most))

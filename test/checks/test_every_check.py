@@ -30,7 +30,7 @@ import pytest
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
-from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
+from flock_follower.checks.observations import NodeStatus, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.resting_marker import HOW
 from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
@@ -79,7 +79,7 @@ def rows(columns: slice, values: list[float]) -> Change:
 
 
 def bridge(key: str, value: str) -> Change:
-    return lambda seen: seen.told['mavlink_bridge'].values.update({key: value})
+    return lambda seen: seen.statuses['mavlink_bridge'].values.update({key: value})
 
 
 def parameter(node: str, name: str, value: Any) -> Change:
@@ -112,7 +112,7 @@ def stamped(name: str, seconds: float) -> Change:
 
 FAULTS: list[Fault] = [
     Fault('a state that is not latched', LIVE, ERROR, 'mavlink_bridge/state QoS',
-          '/planner hears nothing: /mavlink_bridge sends volatile', 'change the QoS',
+          '/planner receives nothing: /mavlink_bridge sends volatile', 'change the QoS',
           change(lambda seen: seen.topic('mavlink_bridge/state').publishers[0], latched=False)),
     Fault('a camera at 2 Hz', BOTH, ERROR, 'images rate', '2.0 Hz', 'raise the frame rate',
           thinned('image_raw', 15)),
@@ -155,13 +155,13 @@ FAULTS: list[Fault] = [
     Fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', '50 ms later',
           'middle of the exposure, by one clock; else set time_offset:=-0.050',
           change(shifts=shift_rows(offset=0.05))),
-    Fault('a marker printed larger than told', BOTH, ERROR, 'marker size',
+    Fault('a marker printed larger than configured', BOTH, ERROR, 'marker size',
           'moves 0.80 ± 0.01 times as far', '0.200 m would fit',
           change(sightings=sighting_rows(scale=0.8))),
-    Fault('a marker printed a little smaller than told', BOTH, WARNING, 'marker size',
+    Fault('a marker printed a little smaller than configured', BOTH, WARNING, 'marker size',
           'moves 1.07 ± 0.01 times as far', '0.150 m would fit',
           change(sightings=sighting_rows(scale=0.16 / 0.15))),
-    Fault('a camera that looks lower than told', BOTH, ERROR, 'camera mounting',
+    Fault('a camera that looks lower than configured', BOTH, ERROR, 'camera mounting',
           'looks lower by 15 deg', 'camera_rpy:=[0.0,0.262,0.0] would fit',
           change(sightings=sighting_rows(mounted=quaternion_to_matrix(
               quaternion_from_rpy(0.0, math.radians(15.0), 0.0))))),
@@ -194,7 +194,7 @@ FAULTS: list[Fault] = [
           bridge('link', 'never received')),
     Fault('an error of a node', LIVE, ERROR, 'relative_pose says', 'no image processed for 4 s',
           'see images',
-          lambda seen: seen.told.update(relative_pose=Told(
+          lambda seen: seen.statuses.update(relative_pose=NodeStatus(
               2, 'no image processed for 4 s: no usable camera_info'))),
     Fault('odometry as late as the planner allows', BOTH, ERROR, 'odom latency', '310 ms',
           'processor time',
@@ -239,7 +239,7 @@ FAULTS: list[Fault] = [
           '[-1.5708, 0.0, -1.5708] in planner', '/**',
           parameter('planner', 'odom_child_rpy', [-1.5708, 0.0, -1.5708])),
     Fault('a recording cut short', BAG, WARNING, 'bag', 'incomplete: the disk is full',
-          'record anew',
+          'record again',
           change(incomplete='the disk is full')),
 ]
 
@@ -295,7 +295,7 @@ def silent(seen: Observed) -> None:
 
 
 @fault('best effort where reliable is wanted', LIVE, ERROR, 'command/trajectory QoS',
-       '/mavlink_bridge hears nothing: /planner sends best effort', 'change the QoS')
+       '/mavlink_bridge receives nothing: /planner sends best effort', 'change the QoS')
 def unreliable(seen: Observed) -> None:
     seen.topic('command/trajectory').publishers[0].reliable = False
     seen.topic('command/trajectory').subscribers[0].reliable = True
@@ -310,7 +310,7 @@ def time_of_day(seen: Observed) -> None:
 
 
 @fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
-       'but the topic says rectified', 'rectified:=true')
+       'but the topic is marked as rectified', 'rectified:=true')
 def rectified(seen: Observed) -> None:
     seen.topics['/image_rect'] = lose(seen, 'image_raw')
     seen.names['image_raw'] = '/image_rect'
@@ -501,7 +501,7 @@ def test_the_share_of_the_processors_that_idles() -> None:
 
 def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:
     seen = healthy(live=False)
-    seen.told = {'planner': Told(2, 'no /odom for 4 s: no publisher')}
+    seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
     findings = seen.judged()
     assert [f.level for f in findings if f.what == 'planner says'] == [WARNING]
     assert ready(findings)
@@ -542,8 +542,9 @@ def test_one_cause_has_one_row() -> None:
     no_calibration(seen)
     seen.sightings = []  # without a calibration a marker has no place
     seen.topic('neighbors/frames').arrivals = []
-    seen.told['relative_pose'] = Told(2, 'no image processed for 4 s: no usable camera_info')
-    seen.told['planner'] = Told(1, 'no neighbor: relative_pose processes no image')
+    seen.statuses['relative_pose'] = NodeStatus(
+        2, 'no image processed for 4 s: no usable camera_info')
+    seen.statuses['planner'] = NodeStatus(1, 'no neighbor: relative_pose processes no image')
     left = rows(healthy()).keys() - rows(seen).keys()
     assert left == {'calibration', 'odom ahead', 'camera time offset', 'marker size',
                     'camera mounting', 'images processed', 'relative_pose says', 'planner says'}
@@ -557,7 +558,7 @@ def test_one_cause_has_one_row() -> None:
 
 def test_without_what_is_essential_it_is_never_ready() -> None:
     seen = healthy()
-    del seen.told['planner']
+    del seen.statuses['planner']
     findings = seen.judged()
     assert still_needed(findings) == ['planner says'] and not ready(findings)
 

@@ -43,9 +43,9 @@ D435I = {
     ('image_raw', '/camera/camera/infra1/image_rect_raw'),
     ('camera_info', '/camera/camera/infra1/camera_info'), ('odom', '/ov_msckf/odomimu')])
 def test_of_a_drivers_topics_the_likeliest_is_offered_first(name: str, there: str) -> None:
-    told = offer(name, D435I, ['/mavlink/odom', '/neighbors'])
-    assert f': --remap {name}:={there}' in told
-    assert 'depth' not in told and 'mavlink' not in told
+    reported = offer(name, D435I, ['/mavlink/odom', '/neighbors'])
+    assert f': --remap {name}:={there}' in reported
+    assert 'depth' not in reported and 'mavlink' not in reported
 
 
 def test_compressed_images_are_offered_under_their_name_and_depth_never() -> None:
@@ -58,12 +58,12 @@ def test_compressed_images_are_offered_under_their_name_and_depth_never() -> Non
 def test_remaps_are_ours_first_as_in_ros() -> None:
     assert parse_remaps(['/odom:=/vio/odom', 'camera_info := info ']) == {
         'odom': '/vio/odom', 'camera_info': 'info'}
-    for wrong, told in (('odom', 'must be from:=to'), ('odom:=', 'must be from:=to'),
+    for wrong, reported in (('odom', 'must be from:=to'), ('odom:=', 'must be from:=to'),
                         ('/vio/odom:=odom', 'did you mean odom:=/vio/odom?'),
                         ('imu:=/imu', 'must be one of image_raw, ')):
         with pytest.raises(ValueError, match=r'--remap') as error:
             parse_remaps([wrong])
-        assert told in str(error.value)
+        assert reported in str(error.value)
 
 
 def test_names_are_those_of_the_namespace_but_where_they_are_absolute() -> None:

@@ -94,12 +94,12 @@ def test_each_vehicle_has_settings_of_its_own(tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-@pytest.mark.parametrize(('arguments', 'told'), [
+@pytest.mark.parametrize(('arguments', 'reported'), [
     (['--name', 'a b'], 'letters, digits and _ only'), (['--user', 'a b'], 'not a user name'),
     (['--workspace', 'ws'], 'must begin with /'), (['--user', ''], '--user USER names the user'),
     (['--what'], 'unknown argument: --what'), (['--name'], '--name needs a value')])
 def test_what_cannot_be_is_refused_before_anything_is_written(
-        tmp_path: Path, arguments: list[str], told: str) -> None:
+        tmp_path: Path, arguments: list[str], reported: str) -> None:
     ended = install(tmp_path, *arguments)
-    assert ended.returncode == 2 and told in ended.stderr
+    assert ended.returncode == 2 and reported in ended.stderr
     assert files(tmp_path) == {}

@@ -93,7 +93,7 @@ class Machines:
         self.running.append(process)
         return process
 
-    def told(self, log: str) -> str:
+    def reported(self, log: str) -> str:
         return (self.folder / log).read_text()
 
     def follower(self, which: str, environment: dict[str, str]) -> None:
@@ -129,7 +129,7 @@ def test_an_engage_from_another_machine_arrives_only_where_ros_is_left_open(
     assert CLOSED['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     machines.follower('closed', CLOSED)
     machines.follower('open', OPEN)
-    wait_until(lambda: all('IDLE' in machines.told(which) for which in DOMAINS), 20.0, 'both')
+    wait_until(lambda: all('IDLE' in machines.reported(which) for which in DOMAINS), 20.0, 'both')
     # Discovery between two machines now and then takes longer than a call waits: once more, then.
     wait_until(
         lambda: machines.engage('laptop', 'open', OPEN, 'into the open one').wait(20.0) == 0,
@@ -137,10 +137,10 @@ def test_an_engage_from_another_machine_arrives_only_where_ros_is_left_open(
     tried = {log: machines.engage('laptop', 'closed', environment, log) for environment, log in (
         (OPEN, 'found by multicast'), (BY_ADDRESS, 'named by its address'))}
     ended = {log: process.wait(20.0) for log, process in tried.items()}
-    assert ENGAGED in machines.told('open')
+    assert ENGAGED in machines.reported('open')
     for log, code in ended.items():
-        assert code == 1 and 'no such service' in machines.told(log), machines.told(log)
-    assert ENGAGED not in machines.told('closed')
+        assert code == 1 and 'no such service' in machines.reported(log), machines.reported(log)
+    assert ENGAGED not in machines.reported('closed')
     # It could have been engaged all the time, by whoever is on the drone.
     assert machines.engage('drone', 'closed', CLOSED, 'on the drone').wait(20.0) == 0
-    wait_until(lambda: ENGAGED in machines.told('closed'), 5.0, 'the engagement')
+    wait_until(lambda: ENGAGED in machines.reported('closed'), 5.0, 'the engagement')

@@ -52,22 +52,22 @@ def test_the_barometer_is_streamed_once_it_is_asked_for(personality):
     assert ask(flight, PRESSURE) == [0]
     flight.messages.clear()
     flight.fly(20.0)
-    told = all_of(flight, 'SCALED_PRESSURE')
-    assert len(told) == 400
-    heights = np.array([height(m) for m in told]) - GROUND_AMSL
+    reported = all_of(flight, 'SCALED_PRESSURE')
+    assert len(reported) == 400
+    heights = np.array([height(m) for m in reported]) - GROUND_AMSL
     assert np.mean(heights) == pytest.approx(3.0, abs=0.1)
     assert np.std(np.diff(heights)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.15)
-    assert told[0].temperature == 1181
-    assert np.diff([m.time_boot_ms for m in told]).tolist() == [50] * 399
+    assert reported[0].temperature == 1181
+    assert np.diff([m.time_boot_ms for m in reported]).tolist() == [50] * 399
 
 
 def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
     ask(flight, PRESSURE)
     flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
-    told = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
-    assert told == pytest.approx(flight.vehicle.position[2], abs=0.01)
-    assert told < 2.0 - 0.5  # it holds the height of the odometry, and sinks
+    reported = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
+    assert reported == pytest.approx(flight.vehicle.position[2], abs=0.01)
+    assert reported < 2.0 - 0.5  # it holds the height of the odometry, and sinks
 
 
 def test_the_drift_is_slow_and_bounded():

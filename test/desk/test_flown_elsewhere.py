@@ -49,7 +49,7 @@ def camera():
     return real_time_camera(0)
 
 
-def told(north, up, yaw=0.0, velocity=(0.0, 0.0, 0.0)):
+def reported(north, up, yaw=0.0, velocity=(0.0, 0.0, 0.0)):
     """Return ground truth, yaw from north."""
     return mavlink.MAVLink_sim_state_message(
         math.cos(yaw / 2), 0, 0, math.sin(yaw / 2), *[0] * 11, 488.0 + up, 0, 0, *velocity,
@@ -65,8 +65,8 @@ class Elsewhere:
 
     def __init__(self, camera, led=False):
         self.motion, self.ahead = ExternalMotion(), ExternalMotion()
-        self.told_ns, self.led_ns = START - PERIOD, START - PERIOD
-        self.tell(START, NEVER, NEVER)
+        self.sent_ns, self.led_ns = START - PERIOD, START - PERIOD
+        self.report(START, NEVER, NEVER)
         self.vehicle = ExternalVehicle(self.motion, START, height=0.0)
         self.flight = RealTimeFlight(
             Scenario('test', 'for a test', sensing=Sensing(latency=(0.1, 0.1)), odometry=EXACT,
@@ -75,27 +75,27 @@ class Elsewhere:
             ExternalLeader(self.ahead, START, self.vehicle.origin) if led else None)
         self.odometry, self.frames, self.distances = [], [], []
 
-    def tell(self, now, silent, leader_silent):
-        while self.told_ns + PERIOD <= now:
-            self.told_ns += PERIOD
-            time = (self.told_ns - START) * 1e-9
+    def report(self, now, silent, leader_silent):
+        while self.sent_ns + PERIOD <= now:
+            self.sent_ns += PERIOD
+            time = (self.sent_ns - START) * 1e-9
             if not silent[0] < time < silent[1]:
                 climb = -2.0 * (time < 1.0)
-                self.motion.take(told(0.2 * time, 2.0 * min(time, 1.0), math.pi / 4,
-                                      (0.2, 0.0, climb)), self.told_ns)
+                self.motion.take(reported(0.2 * time, 2.0 * min(time, 1.0), math.pi / 4,
+                                      (0.2, 0.0, climb)), self.sent_ns)
         self.ahead.origin = self.motion.origin
         while self.led_ns + PERIOD + LATE * (self.led_ns > START) <= now:
             self.led_ns += PERIOD
             time = (self.led_ns - START) * 1e-9
             if not leader_silent[0] < time < leader_silent[1]:
-                self.ahead.take(told(2.0 + 0.3 * time, 2.0, velocity=(0.3, 0.0, 0.0)),
+                self.ahead.take(reported(2.0 + 0.3 * time, 2.0, velocity=(0.3, 0.0, 0.0)),
                                 self.led_ns)
 
     def fly(self, seconds, engaged=False, silent=NEVER, leader_silent=NEVER):
         """Fly on; nothing is told from one moment of the flight to another, s."""
         end = self.flight.time_ns + round(seconds * 1e9)
         while self.flight.time_ns < end:
-            self.tell(START + self.flight.time_ns + STEP_NS + PERIOD, silent, leader_silent)
+            self.report(START + self.flight.time_ns + STEP_NS + PERIOD, silent, leader_silent)
             self.odometry += [(stamp, state) for stamp, state in self.flight.after_step(engaged)]
             self.distances.append(self.flight.distance)
             frame = self.flight.look(self.flight.time_ns)

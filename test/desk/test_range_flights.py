@@ -74,9 +74,9 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(
         def watched(self, now: float) -> Any:
             arrived = Lookout.arrived(self.lookout, now)
             if 16.0 < now < 20.0:
-                for row, (_, [told]) in enumerate(arrived):
-                    assert told.yaw is None and now - told.stamp < 0.2  # by its ranges
-                    away = np.linalg.norm(told.position - self._vio.position[row])
+                for row, (_, [reported]) in enumerate(arrived):
+                    assert reported.yaw is None and now - reported.stamp < 0.2  # by its ranges
+                    away = np.linalg.norm(reported.position - self._vio.position[row])
                     errors.append(float(away - self.distances[row, 0]))
             return arrived
 

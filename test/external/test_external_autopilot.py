@@ -44,7 +44,7 @@ def pose(north=0.0, up=0.0):
         round((488.0 + up) * 1e3), *[0] * 8)
 
 
-class Told:
+class Report:
     """A link to an autopilot that tells nothing by itself, and that autopilot's end of it."""
 
     def __init__(self, system=1, parameter='truth_connection'):
@@ -76,10 +76,10 @@ class Told:
 def two(monkeypatch):
     monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.3)
     monkeypatch.setattr(external_vehicles, 'POSE_TIMEOUT', 1.0)
-    both = [Told(), Told(2, 'leader_truth_connection')]
+    both = [Report(), Report(2, 'leader_truth_connection')]
     yield both
-    for told in both:
-        told.close()
+    for reported in both:
+        reported.close()
 
 
 @pytest.mark.parametrize(('personality', 'source'), [
@@ -112,15 +112,15 @@ def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(personality, s
         end.close()
 
 
-@pytest.mark.parametrize(('heard', 'forwarded', 'told'), [
+@pytest.mark.parametrize(('received', 'forwarded', 'reported'), [
     (None, '', 'no pose of a vehicle within 0.4 s: nothing arrives$'),
     # An autopilot without a position is told from one that is not there.
-    (Told.say, '', 'PX4 is heard, but sends no LOCAL_POSITION_NED: it has no position'),
-    (Told.estimate, FORWARDED,
-     'PX4 is heard, but sends no HIL_STATE_QUATERNION.*it would feed itself$')])
-def test_where_no_pose_comes_it_says_so_in_time(two, heard, forwarded, told):
-    speak = partial(heard, two[0]) if heard else lambda: True
-    with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:.*{told}"):
+    (Report.say, '', 'PX4 is connected, but sends no LOCAL_POSITION_NED: it has no position'),
+    (Report.estimate, FORWARDED,
+     'PX4 is connected, but sends no HIL_STATE_QUATERNION.*it would feed itself$')])
+def test_where_no_pose_comes_it_says_so_in_time(two, received, forwarded, reported):
+    speak = partial(received, two[0]) if received else lambda: True
+    with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:.*{reported}"):
         two[0].link.await_pose(0.4, forwarded, speak)
 
 
@@ -146,23 +146,23 @@ def test_both_count_from_where_the_follower_was_first_heard_of(two):
     while not leader.link._arrived:  # the leader tells first
         assert leader.say(pose(1.5, 2.0)) and time.monotonic() < deadline
     vehicles.find(False, lambda: follower.say(pose()) and leader.say(pose(1.5, 2.0)))
-    places = [told.link.motion.at(told.link.motion.newest).position for told in two]
+    places = [reported.link.motion.at(reported.link.motion.newest).position for reported in two]
     np.testing.assert_allclose(places, [[0.0, 0.0, 0.0], [0.0, 1.5, 2.0]], atol=0.006)  # 1e-7 deg
     assert vehicles.sources == dict.fromkeys(('vehicle', 'leader'), 'HIL_STATE_QUATERNION')
     assert vehicles.start_ns == follower.link.motion.newest
 
 
-@pytest.mark.parametrize(('silent', 'heard', 'told'), [
-    (0, True, '^truth_connection = .*PX4 is heard, but sends no HIL_STATE_QUATERNION; its own '
+@pytest.mark.parametrize(('silent', 'received', 'reported'), [
+    (0, True, '^truth_connection = .*PX4 is connected, but sends no HIL_STATE_QUATERNION; its own '
               'estimate will not do where two vehicles are flown elsewhere'),
     (1, True, '^leader_truth_connection = .*its own estimate will not do'),
     (1, False, '^leader_truth_connection = .*no pose of a vehicle within 1 s: nothing arrives$')])
-def test_of_two_vehicles_both_have_to_tell_the_truth(silent, heard, told, two):
+def test_of_two_vehicles_both_have_to_tell_the_truth(silent, received, reported, two):
     vehicles = ExternalVehicles(two[0].link, two[1].link)
 
     def speak():
-        return (two[silent].say() if heard else True) and two[1 - silent].say(pose())
-    with pytest.raises(ValueError, match=told):
+        return (two[silent].say() if received else True) and two[1 - silent].say(pose())
+    with pytest.raises(ValueError, match=reported):
         vehicles.find(False, speak)
 
 
@@ -170,13 +170,13 @@ def test_whose_poses_stall_is_told_and_what_is_missing(two):
     follower, leader = two
     vehicles = ExternalVehicles(follower.link, leader.link)
     vehicles.find(False, lambda: follower.say(pose()) and leader.say(pose(1.5)))
-    newest = [told.link.motion.newest for told in two]
+    newest = [reported.link.motion.newest for reported in two]
     assert vehicles.stalled(max(newest) * 1e-9, 0) == ''  # though one pose is all that there is
     # As if both had told at 50 Hz for 0.3 s, and the leader no more.
     for k in range(1, 60):
-        for told, since in zip(two if k < 16 else two[:1], newest):
-            told.link.motion.take(pose(), since + k * 20_000_000)
-        now = max(told.link.motion.newest for told in two) * 1e-9
+        for reported, since in zip(two if k < 16 else two[:1], newest):
+            reported.link.motion.take(pose(), since + k * 20_000_000)
+        now = max(reported.link.motion.newest for reported in two) * 1e-9
         flown = follower.link.motion.newest - vehicles.start_ns
         stalled, missing = vehicles.stalled(now, flown), (k - 15) * 0.02
         if missing < 0.13:

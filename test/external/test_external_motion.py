@@ -59,7 +59,7 @@ def estimate(boot_ms, ned, velocity=(0.0, 0.0, 0.0), yaw=0.0):
             mavlink.MAVLink_local_position_ned_message(boot_ms, *ned, *velocity))
 
 
-def heard(*arrived, by_estimate=False):
+def received(*arrived, by_estimate=False):
     """Return the motion after messages, or tuples of them, that arrived at times, ms."""
     motion = ExternalMotion()
     if by_estimate:
@@ -72,7 +72,7 @@ def heard(*arrived, by_estimate=False):
 
 @pytest.mark.parametrize('kind', ['SIM_STATE', 'HIL_STATE_QUATERNION'])
 def test_both_truths_are_enu_from_where_the_vehicle_was_first_heard_of(kind):
-    motion = heard((0, truth(kind)), (1_000, truth(
+    motion = received((0, truth(kind)), (1_000, truth(
         kind, (3.0, 2.0, -1.0), (0.5, 0.25, -0.125), math.radians(30.0), (0.1, 0.2, 0.3))))
     now = motion.at(1_000 * MS)  # 3 m to the north in a second: no flight
     assert motion.source == kind
@@ -81,7 +81,7 @@ def test_both_truths_are_enu_from_where_the_vehicle_was_first_heard_of(kind):
     assert yaw_from_quaternion(now.quaternion) == pytest.approx(math.radians(60.0))
     np.testing.assert_allclose(now.angular, [0.1, -0.2, -0.3], atol=1e-6)
     # An attitude with a roll faces where its yaw says: east, right side down.
-    x, _, _, w = heard((0, truth(kind, yaw=math.pi / 2, roll=0.2))).at(0).quaternion
+    x, _, _, w = received((0, truth(kind, yaw=math.pi / 2, roll=0.2))).at(0).quaternion
     assert (x, w) == (pytest.approx(math.sin(0.1)), pytest.approx(math.cos(0.1)))
 
 
@@ -95,7 +95,7 @@ def test_a_place_told_in_steps_of_a_centimetre_moves_evenly_and_does_not_drift()
 
 
 def test_between_poses_the_motion_is_interpolated_and_beyond_them_it_stands_still():
-    motion = heard(*((20 * k, truth('SIM_STATE', (k * JUMP * 0.02, 0.0, 0.0), (JUMP, 0.0, 0.0),
+    motion = received(*((20 * k, truth('SIM_STATE', (k * JUMP * 0.02, 0.0, 0.0), (JUMP, 0.0, 0.0),
                                     yaw=math.pi - 0.1 + 0.1 * k)) for k in range(3)))
     half = motion.at(30 * MS)
     assert half.position[1] == pytest.approx(1.5 * JUMP * 0.02, abs=0.006)
@@ -112,15 +112,15 @@ def test_what_happened_in_a_gap_or_after_the_last_pose_is_not_known():
     with pytest.raises(ValueError, match='no pose'):
         motion.at(0)
     late = 100 * MS + LONGEST_GAP + 1
-    motion = heard(*((time / MS, truth('SIM_STATE')) for time in (
+    motion = received(*((time / MS, truth('SIM_STATE')) for time in (
         0, 100 * MS, late, late + 20 * MS)))
     assert all(map(motion.knows, (0, 50 * MS, 100 * MS, late, late + 10 * MS)))
     assert not any(map(motion.knows, (100 * MS + 1, late - 1, late + 20 * MS + 1)))
 
 
 def test_the_estimate_counts_only_where_no_truth_came():
-    assert heard((0, estimate(1_000, (1.0, 0.0, 0.0)))).newest is None
-    motion = heard(*((20 * k, estimate(1_000 + 20 * k, (1.0 + 0.01 * k, 0.5, -2.0),
+    assert received((0, estimate(1_000, (1.0, 0.0, 0.0)))).newest is None
+    motion = received(*((20 * k, estimate(1_000 + 20 * k, (1.0 + 0.01 * k, 0.5, -2.0),
                                        (0.5, 0.0, 0.0), yaw=0.5)) for k in range(3)),
                    (70, truth('SIM_STATE', (9.0, 9.0, 9.0))), by_estimate=True)
     assert motion.estimated and motion.knows(30 * MS) and motion.newest == 40 * MS
@@ -128,9 +128,9 @@ def test_the_estimate_counts_only_where_no_truth_came():
     np.testing.assert_allclose(now.position, [0.0, 0.015, 0.0], atol=1e-6)
     np.testing.assert_allclose(now.velocity, [0.0, 0.5, 0.0], atol=1e-6)
     assert now.angular[2] == pytest.approx(-0.1)
-    told = heard((0, truth('SIM_STATE')))
-    told.use_estimate()
-    assert not told.estimated
+    reported = received((0, truth('SIM_STATE')))
+    reported.use_estimate()
+    assert not reported.estimated
 
 
 def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
@@ -145,7 +145,7 @@ def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
     clock.stamp(50_000, 1_000 * MS)
     assert clock.stamp(400, 2_000 * MS) == 2_000 * MS and clock.reboots == 1
     # After it nothing is interpolated from before.
-    motion = heard(*((now, estimate(boot, (0.0, 0.0, 0.0))) for boot, now in (
+    motion = received(*((now, estimate(boot, (0.0, 0.0, 0.0))) for boot, now in (
         (50_000, 0), (50_020, 20), (100, 60))), by_estimate=True)
     assert (motion.reboots, motion.knows(50 * MS), motion.knows(60 * MS)) == (1, False, True)
 
@@ -156,11 +156,11 @@ def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
     mavlink.MAVLink_hil_state_quaternion_message(0, [1, 0, 0, 0], *[0] * 14),  # nowhere yet
 ])
 def test_what_is_no_pose_places_nothing(message):
-    assert heard((0, message)).newest is None
+    assert received((0, message)).newest is None
 
 
 def test_the_pace_of_the_autopilots_time_is_told_once_there_is_a_second_of_it():
     assert math.isnan(ExternalMotion().pace(0.0))
-    motion = heard(*((500 * k, mavlink.MAVLink_system_time_message(0, 400 * k))
+    motion = received(*((500 * k, mavlink.MAVLink_system_time_message(0, 400 * k))
                      for k in range(12)))
     assert motion.pace(0.0) == pytest.approx(0.8) and math.isnan(motion.pace(5.4))

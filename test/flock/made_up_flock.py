@@ -85,7 +85,7 @@ class Conditions:
 
 
 @dataclass
-class Told:
+class Report:
     """How a flight was for one who was told of another."""
 
     errors: list[float] = field(default_factory=list)
@@ -100,7 +100,7 @@ class Told:
 
 
 class MadeUpFlock:
-    """The flock; ``run`` lets it fly, and fills ``heard`` and ``nees``."""
+    """The flock; ``run`` lets it fly, and fills ``received`` and ``nees``."""
 
     def __init__(self, conditions: Conditions | None = None) -> None:
         self.conditions = conditions or Conditions()
@@ -119,7 +119,7 @@ class MadeUpFlock:
         self.odometry = self.origin.copy()
         self.history: list[tuple[Array, Array, Array]] = []
         self.wire: list[tuple[float, str, OdometryState]] = []
-        self.heard: dict[tuple[str, str], Told] = {}
+        self.received: dict[tuple[str, str], Report] = {}
         self.nees: list[float] = []
         self.events: dict[str, int] = {}
         self.silent: set[str] = set()
@@ -224,29 +224,29 @@ class MadeUpFlock:
         due = [word for word in self.wire if word[0] <= self.time + 1e-9 and word[1] == name]
         self.wire = [word for word in self.wire if word[1] != name or word[0] > self.time + 1e-9]
         for _, _, state in due:
-            sharing.take_word(state, self.stamp(self.time, name))
+            sharing.take_message(state, self.stamp(self.time, name))
         now = self.stamp(self.time, name)
-        told = sharing.neighbors(now)
-        words = [] if name in self.silent else sharing.words(now)
+        reported = sharing.neighbors(now)
+        words = [] if name in self.silent else sharing.messages(now)
         for word in words:
             for other in self.names[1:]:
                 if other != name and self.rng.random() >= how.loss:
                     spoiled = [word] if self.spoil is None else self.spoil(name, word)
                     self.wire += [(self.time + how.delay, other, w) for w in spoiled]
-        for reason, _ in sharing.told():
+        for reason, _ in sharing.new_events():
             self.events[reason] = self.events.get(reason, 0) + 1
-        self._judge(k, name, told)
+        self._judge(k, name, reported)
 
     def relative(self, k: int, of: int, step: int, at: int | None = None) -> Array:
         """Return where a vehicle is in k's odometry at a step, which is k's own of ``at``."""
         true, odometry, turn = self.history[step if at is None else at]
         return odometry[k] + turned(turn[k]) @ (self.history[step][0][of] - true[k])
 
-    def _judge(self, k: int, name: str, told: list[OdometryState]) -> None:
+    def _judge(self, k: int, name: str, reported: list[OdometryState]) -> None:
         last = len(self.history) - 1
-        for state in told:
+        for state in reported:
             of = self.names.index(state.child)
-            record = self.heard.setdefault((name, state.child), Told())
+            record = self.received.setdefault((name, state.child), Report())
             if record.since is None:
                 record.since = self.time
             age = (self.stamp(self.time, name) - state.stamp) / NANOSECONDS
@@ -260,9 +260,9 @@ class MadeUpFlock:
             record.ticks += 1
         frames = self.sharing[name].frames
         for j, other in enumerate(self.names[1:], 1):
-            teller = self.sharing[name].senders.get(other)
-            if other in frames and teller is not None and not (
-                    self.sharing[name].unusable(teller)):
+            sender = self.sharing[name].senders.get(other)
+            if other in frames and sender is not None and not (
+                    self.sharing[name].unusable(sender)):
                 self.nees.append(self.misfit(k, j, other, frames))
 
     def misfit(self, k: int, j: int, other: str, frames: Any) -> float:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from made_up_flock import Conditions, LEADER, MadeUpFlock, Told
+from made_up_flock import Conditions, LEADER, MadeUpFlock, Report
 import numpy as np
 import pytest
 
@@ -31,7 +31,7 @@ def flown(conditions: Conditions, seconds: float = 20.0) -> MadeUpFlock:
     return flock
 
 
-def rms(records: list[Told]) -> float:
+def rms(records: list[Report]) -> float:
     return math.sqrt(np.mean(np.square(np.concatenate([r.errors for r in records]))))
 
 
@@ -42,11 +42,11 @@ def test_every_geometry_is_aligned_from_any_yaw(shape: str, attitude_std: float)
     followers = flock.names[1:]
     known = {LEADER, *followers} if any(0 in row for row in flock.sees) else {*followers}
     for name, sees in zip(followers, flock.sees[1:]):
-        told = {of: r for (who, of), r in flock.heard.items() if who == name}
-        assert told.keys() == known - {name} - {flock.names[of] for of in sees}
-        for record in told.values():
+        reported = {of: r for (who, of), r in flock.received.items() if who == name}
+        assert reported.keys() == known - {name} - {flock.names[of] for of in sees}
+        for record in reported.values():
             assert record.since is not None and record.since < (2.5 if attitude_std else 5.0)
-        assert not told or rms(list(told.values())) < 0.15
+        assert not reported or rms(list(reported.values())) < 0.15
 
 
 @pytest.mark.slow
@@ -58,25 +58,25 @@ def test_what_is_claimed_of_frames_and_places_is_true(conditions: Conditions) ->
     """Errors of sightings that last, a marker askew, half of the words lost and the rest late."""
     flock = flown(conditions, 14.0)
     assert 0.2 < np.mean(flock.nees) / 4.0 < 2.0
-    chi2 = [c for r in flock.heard.values() for c in r.chi2]
+    chi2 = [c for r in flock.received.values() for c in r.chi2]
     assert 0.2 < np.mean(chi2) / 3.0 < 2.0
 
 
 def test_sightings_of_something_else_are_neither_believed_nor_told() -> None:
     flock = flown(Conditions('line', 1, outliers=0.05, attitude_std=0.03), 15.0)
     assert flock.events['does not fit the alignment'] > 10
-    errors = np.concatenate([r.errors for r in flock.heard.values()])
+    errors = np.concatenate([r.errors for r in flock.received.values()])
     assert np.quantile(errors, 0.999) < 0.5
 
 
 def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
     flock = flown(Conditions('side by side', still=True), 20.0)
-    assert flock.heard == {}
+    assert flock.received == {}
     (status,) = flock.sharing['follower_1'].status(flock.stamp(flock.time, ''))
     assert 'somebody has to move' in status.why
     assert flock.events['not aligned with follower_2'] > 150
     seeing = flown(Conditions('side by side', still=True, attitude_std=0.03), 5.0)
-    assert set(seeing.heard) == {('follower_1', 'follower_2'), ('follower_2', 'follower_1')}
+    assert set(seeing.received) == {('follower_1', 'follower_2'), ('follower_2', 'follower_1')}
 
 
 @pytest.mark.slow
@@ -84,17 +84,17 @@ def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
 def test_a_teller_whose_odometry_steps_is_aligned_anew(step: float) -> None:
     flock = flown(Conditions('line', 2, attitude_std=0.03), 6.0)
     flock.odometry[2] += [step, -step, 0.0]
-    before = set(flock.heard)
-    flock.heard.clear()
+    before = set(flock.received)
+    flock.received.clear()
     flock.run(2.0)
     leaps = step > 0.2  # a shorter one the filter follows
     assert ('aligned anew with follower_2' in flock.events) == leaps
     assert ('own odometry leapt' in flock.events) == leaps
-    assert max(max(r.errors) for r in flock.heard.values()) < 0.4
-    flock.heard.clear()
+    assert max(max(r.errors) for r in flock.received.values()) < 0.4
+    flock.received.clear()
     flock.run(6.0)
-    assert before == set(flock.heard)
-    assert rms(list(flock.heard.values())) < 0.1
+    assert before == set(flock.received)
+    assert rms(list(flock.received.values())) < 0.1
 
 
 @pytest.mark.slow
@@ -108,12 +108,12 @@ def test_a_liar_is_refused_and_harms_nobody_else() -> None:
         away = word.position + rng.uniform(-30.0, 30.0, 3)
         return [word._replace(position=away), word]
     flock.spoil = lie
-    flock.heard.clear()
+    flock.received.clear()
     flock.run(10.0)
-    honest = [r for (who, of), r in flock.heard.items()
+    honest = [r for (who, of), r in flock.received.items()
               if 'follower_4' not in (who, of)]
     assert honest and rms(honest) < 0.15
-    assert not any(of == 'follower_4' and r.ticks > 20 for (_, of), r in flock.heard.items())
+    assert not any(of == 'follower_4' and r.ticks > 20 for (_, of), r in flock.received.items())
 
 
 def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
@@ -134,7 +134,7 @@ def test_words_go_on_where_sight_is_lost_and_say_how_vague_they_become() -> None
         flock = flown(Conditions('one sees the other', seed, attitude_std=0.03), 5.0)
         flock.sees[2] = []
         flock.run(20.0)
-        record = flock.heard['follower_1', 'follower_2']
+        record = flock.received['follower_1', 'follower_2']
         assert record.ticks > 230
         assert max(record.errors) < 0.6
         chi2 += record.chi2[-50:]
@@ -149,6 +149,6 @@ def test_a_teller_that_falls_silent_is_heard_no_longer_than_said() -> None:
     flock = flown(Conditions('line', 0, attitude_std=0.03), 8.0)
     flock.silent.add('follower_4')
     flock.run(1.5)
-    flock.heard.clear()
+    flock.received.clear()
     flock.run(1.0)
-    assert flock.heard and not any(of == 'follower_4' for _, of in flock.heard)
+    assert flock.received and not any(of == 'follower_4' for _, of in flock.received)

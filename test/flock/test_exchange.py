@@ -52,7 +52,7 @@ def listening() -> Sharing:
 
 
 def reasons(sharing: Sharing) -> list[str]:
-    return [reason for reason, _ in sharing.told()]
+    return [reason for reason, _ in sharing.new_events()]
 
 
 @pytest.mark.parametrize('name', ['', ' ', 'a/b', 'a' * 65, 'a b', 'ä'])
@@ -64,20 +64,20 @@ def test_a_vehicle_without_a_proper_name_is_refused(name: str) -> None:
 def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> None:
     sharing = listening()
     sharing.take_seen(state('odom', LEADER))
-    words = sharing.words(EPOCH + 10 * MS)
+    words = sharing.messages(EPOCH + 10 * MS)
     assert [(w.frame, w.child) for w in words] == [('f1/odom', 'f1'), ('f1/odom', LEADER)]
-    assert sharing.words(EPOCH + 20 * MS) == []  # 10 Hz
-    assert sharing.words(EPOCH + 120 * MS) == []  # nothing new
+    assert sharing.messages(EPOCH + 20 * MS) == []  # 10 Hz
+    assert sharing.messages(EPOCH + 120 * MS) == []  # nothing new
     sharing.take_own(own(EPOCH + 100 * MS))
-    assert [w.child for w in sharing.words(EPOCH + 220 * MS)] == ['f1']
-    assert sharing.words(EPOCH + 900 * MS) == []  # odometry is lost
+    assert [w.child for w in sharing.messages(EPOCH + 220 * MS)] == ['f1']
+    assert sharing.messages(EPOCH + 900 * MS) == []  # odometry is lost
 
 
 def test_a_second_print_of_a_marker_is_not_told() -> None:
     sharing = listening()
     sharing.take_seen(state('odom', f'{LEADER}/duplicate'))
-    assert [w.child for w in sharing.words(EPOCH + 10 * MS)] == ['f1']
-    assert sharing.told() == []
+    assert [w.child for w in sharing.messages(EPOCH + 10 * MS)] == ['f1']
+    assert sharing.new_events() == []
 
 
 def test_what_is_stamped_in_the_future_is_not_told() -> None:
@@ -86,22 +86,22 @@ def test_what_is_stamped_in_the_future_is_not_told() -> None:
     for stamp in (EPOCH + 800 * MS, latest):
         now += 100 * MS
         sharing.take_own(own(stamp))
-        assert sharing.words(now) == []
+        assert sharing.messages(now) == []
         assert reasons(sharing)[-1] == 'own odometry from the future'
         assert sharing.why_silent(now) == 'own odometry from the future'
     for stamp in (EPOCH + 1000 * MS, latest):
         now += 100 * MS
         sharing.take_own(own(now))
         sharing.take_seen(state('odom', LEADER, stamp))
-        assert [word.child for word in sharing.words(now)] == ['f1']
+        assert [word.child for word in sharing.messages(now)] == ['f1']
 
 
 def test_own_words_that_come_back_are_no_impostors() -> None:
     sharing = listening()
-    for word in sharing.words(EPOCH):
-        sharing.take_word(word, EPOCH)
+    for word in sharing.messages(EPOCH):
+        sharing.take_message(word, EPOCH)
     assert reasons(sharing) == []
-    sharing.take_word(state('f1/odom', 'f1', EPOCH + MS), EPOCH + MS)
+    sharing.take_message(state('f1/odom', 'f1', EPOCH + MS), EPOCH + MS)
     assert reasons(sharing) == ['somebody uses my name']
 
 
@@ -121,27 +121,27 @@ def test_own_words_that_come_back_are_no_impostors() -> None:
 def test_a_word_that_cannot_be_is_refused_by_its_reason(
         word: OdometryState, received: int, reason: str) -> None:
     sharing = listening()
-    sharing.take_word(word, received)
+    sharing.take_message(word, received)
     assert reasons(sharing) == [reason]
-    sharing.take_word(state(), EPOCH + 10 * MS)
+    sharing.take_message(state(), EPOCH + 10 * MS)
     assert reasons(sharing) == ['not aligned with f2']
 
 
 def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:
     sharing = listening()
-    sharing.take_word(state(child=LEADER), EPOCH)  # an image takes a while
-    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
-    sharing.take_word(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
+    sharing.take_message(state(child=LEADER), EPOCH)  # an image takes a while
+    sharing.take_message(state(stamp=EPOCH + 45 * MS), EPOCH)
+    sharing.take_message(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
     assert reasons(sharing)[1:] == ['word from the future', 'not listened to for a while']
     assert sharing.status(EPOCH + 10 * MS)[0].why == 'has a clock that is ahead'
-    sharing.take_word(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
+    sharing.take_message(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
     assert sharing.status(EPOCH + 5100 * MS)[0].why != 'has a clock that is ahead'
 
 
 def test_a_repeated_or_late_word_changes_nothing() -> None:
     sharing = listening()
     for stamp in (EPOCH, EPOCH, EPOCH - 50 * MS):
-        sharing.take_word(state(stamp=stamp), EPOCH)
+        sharing.take_message(state(stamp=stamp), EPOCH)
     assert reasons(sharing) == [
         'not aligned with f2', 'word out of order', 'word out of order']
 
@@ -149,10 +149,10 @@ def test_a_repeated_or_late_word_changes_nothing() -> None:
 def test_tellers_and_whom_they_tell_of_are_counted() -> None:
     sharing = listening()
     for k in range(40):
-        sharing.take_word(state(f'v{k}/odom', f'v{k}'), EPOCH)
+        sharing.take_message(state(f'v{k}/odom', f'v{k}'), EPOCH)
     assert reasons(sharing).count('too many tellers') == 8
     for k in range(60):
-        sharing.take_word(state('v0/odom', f'w{k}'), EPOCH)
+        sharing.take_message(state('v0/odom', f'w{k}'), EPOCH)
     assert reasons(sharing).count('too many vehicles') == 21
 
 
@@ -162,9 +162,9 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
         now = EPOCH + k * 50 * MS
         apart.take_own(own(now))
         near.take_own(own(now))
-        apart.take_word(state(stamp=now, position=(8 * (k % 2), 0, 1)), now)
-        near.take_word(state(stamp=now, position=(0.1 * (k % 2), 0, 1)), now)
-    assert near.status(now)[0].why.startswith('talks at 20 Hz')
+        apart.take_message(state(stamp=now, position=(8 * (k % 2), 0, 1)), now)
+        near.take_message(state(stamp=now, position=(0.1 * (k % 2), 0, 1)), now)
+    assert near.status(now)[0].why.startswith('sends at 20 Hz')
     assert apart.status(now)[0].why.startswith('leapt 3 times')
     for sharing in (apart, near):
         assert 'not listened to for a while' in reasons(sharing)
@@ -174,8 +174,8 @@ def test_why_nothing_is_heard_is_told() -> None:
     sharing = Sharing('f1')
     assert sharing.why_silent(EPOCH) == 'no own odometry'
     sharing.take_own(own())
-    assert sharing.why_silent(EPOCH) == 'nobody else talks'
-    sharing.take_word(state(), EPOCH)
+    assert sharing.why_silent(EPOCH) == 'no other sender'
+    sharing.take_message(state(), EPOCH)
     assert sharing.why_silent(EPOCH) == (
         'not aligned with f2: neither sees the other, nor do both see one vehicle')
     assert sharing.neighbors(EPOCH) == []
@@ -183,16 +183,16 @@ def test_why_nothing_is_heard_is_told() -> None:
 
 def test_an_aligned_teller_is_heard_and_what_is_heard_is_not_told_on() -> None:
     flock = MadeUpFlock(Conditions('line', attitude_std=0.03))
-    told: dict[str, set[str]] = {}
+    sent: dict[str, set[str]] = {}
 
     def listen(name: str, word: OdometryState) -> list[OdometryState]:
-        told.setdefault(name, set()).add(word.child)
+        sent.setdefault(name, set()).add(word.child)
         return [word]
     flock.spoil = listen
     flock.run(8.0)
-    assert told == {f'follower_{k}': {f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER}
+    assert sent == {f'follower_{k}': {f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER}
                     for k in range(1, 5)}
-    assert set(flock.heard) == {
+    assert set(flock.received) == {
         (f'follower_{k}', name) for k in range(1, 5) for name in flock.names
         if name not in (f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER)}
 
@@ -232,8 +232,8 @@ def test_no_nonsense_breaks_it_or_comes_out_of_it(events: list[Any]) -> None:
         elif kind == 'seen':
             sharing.take_seen(what)
         else:
-            sharing.take_word(what, now)
-        for out in (*sharing.neighbors(now), *sharing.words(now)):
+            sharing.take_message(what, now)
+        for out in (*sharing.neighbors(now), *sharing.messages(now)):
             assert np.all(np.isfinite(out.position)) and np.all(np.isfinite(out.velocity))
         sharing.status(now), sharing.why_silent(now)
-    sharing.told()
+    sharing.new_events()

@@ -216,7 +216,7 @@ def test_one_agent_that_knows_all_commands_itself_what_the_law_of_the_flock_does
         others = np.arange(len(x)) != k
         share = np.array([graph.joins(np.array([[min(k, j), max(k, j)]]))[0]
                           for j in np.flatnonzero(others)], dtype=float)
-        own = neighbor_graph.attended(x[others] - x[k], v[others] - v[k], share,
+        own = neighbor_graph.graph_law(x[others] - x[k], v[others] - v[k], share,
                                    np.zeros(len(share), dtype=bool), params, 1e9)
         assert own == pytest.approx(whole[k], rel=1e-9)
 
@@ -225,9 +225,9 @@ def test_an_edge_longer_than_the_band_pulls_no_harder_than_it_may() -> None:
     params = flocking.FlockingParams(beta=0.25, d1=8.0)
     offsets, differences = np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 0.2, 0.0]])
     nobody = np.zeros(1, dtype=bool)
-    pulled = neighbor_graph.attended(offsets, differences, np.ones(1), nobody, params, 2.5)
+    pulled = neighbor_graph.graph_law(offsets, differences, np.ones(1), nobody, params, 2.5)
     assert pulled[0] == pytest.approx(2.5)
-    pushed = neighbor_graph.attended(offsets / 6.0, differences, np.ones(1), nobody, params, 2.5)
+    pushed = neighbor_graph.graph_law(offsets / 6.0, differences, np.ones(1), nobody, params, 2.5)
     assert pushed[0] < -1e3  # what keeps apart is not bounded here
 
 
@@ -237,7 +237,7 @@ def test_one_that_is_no_part_of_the_flock_makes_nobody_else_nervous() -> None:
     offsets = np.array([[2.2, 0.0, 0.0], [0.0, 3.0, 0.0]])
     differences = np.array([[0.0, 0.1, 0.0], [9.0, 0.0, 0.0]])
     share, others = np.array([1.0, 0.0]), np.array([False, True])
-    alone = neighbor_graph.attended(
+    alone = neighbor_graph.graph_law(
         offsets[:1], differences[:1], share[:1], others[:1], params, 2.5)
-    both = neighbor_graph.attended(offsets, differences, share, others, params, 2.5)
+    both = neighbor_graph.graph_law(offsets, differences, share, others, params, 2.5)
     assert both == pytest.approx(alone)

@@ -82,8 +82,8 @@ def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer()
     errors = []
     for _ in range(20):
         flight.fly(0.05)
-        told = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
-        errors.append(-told.vz - flight.vehicle.velocity[2])  # it is almost level
+        reported = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
+        errors.append(-reported.vz - flight.vehicle.velocity[2])  # it is almost level
     assert np.mean(errors) == pytest.approx(0.0, abs=0.1)
 
 
@@ -124,7 +124,7 @@ def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():
 GIVEN = (47.4, 8.5, 488.0)
 
 
-@pytest.mark.parametrize(('personality', 'options', 'told'), [
+@pytest.mark.parametrize(('personality', 'options', 'reported'), [
     # PX4 is told an origin without height, and any where it flies without GPS.
     ('px4', without_gps('px4'), {(473977420, 85455940, 0)}),
     ('px4', without_gps('px4', origin=GIVEN), {(474000000, 85000000, 0)}),
@@ -133,12 +133,12 @@ GIVEN = (47.4, 8.5, 488.0)
     ('arducopter', {'bridge': {'origin': GIVEN}, 'faults': [
         Fault('drop', 0.0, 8.0, 'sent', message='GPS_GLOBAL_ORIGIN')]},
      {(474000000, 85000000, 488000)})])
-def test_an_origin_is_told_until_the_autopilot_has_one(personality, options, told):
+def test_an_origin_is_told_until_the_autopilot_has_one(personality, options, reported):
     flight = forwarding(Flight(personality, **options))
     flight.fly(8.0)
     origins = [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
                if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
-    assert set(origins) == told and (len(origins) == 2 if 'faults' in options else True)
+    assert set(origins) == reported and (len(origins) == 2 if 'faults' in options else True)
     origin = mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 488000)
     flight.wire.arrived.append(origin.pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(6.0)

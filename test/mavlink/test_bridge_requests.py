@@ -89,7 +89,7 @@ def test_what_is_no_danger_or_was_waived_is_not_refused(waits, options, odometry
     ({'start': 'landed'}, 0.0, 2.5, 'no HEARTBEAT from the autopilot'),
     ({'start': 'landed'}, 1.5, 2.5, 'disarmed: arm first'), ({}, 1.5, 2.5, 'already in the air'),
     ({'start': 'armed', **never('LOCAL_POSITION_NED')}, 1.5, 2.5,
-     'nothing would tell when the height is reached'),
+     'the height reached would be unknown'),
     ({'start': 'armed', 'parameters': {'MIS_TAKEOFF_ALT': 10.0}}, 7.0, 1.0,
      'PX4 would climb to MIS_TAKEOFF_ALT = 10 m'),
     ({'start': 'armed', **never('PARAM_VALUE')}, 7.0, 1.0, 'MIS_TAKEOFF_ALT is not known yet'),
@@ -118,10 +118,10 @@ def test_a_take_off_is_refused_while_it_climbs_out_or_lands(lands):
 
 @pytest.mark.parametrize(('abort', 'argument', 'name'), [
     ('offboard', [False], 'hold'), ('arm', [False], 'disarm'), ('land', [], 'land')])
-@pytest.mark.parametrize('heard', [True, False])
-def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, name, heard):
+@pytest.mark.parametrize('received', [True, False])
+def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, name, received):
     flight = Flight('arducopter')
-    flight.fly(1.5 if heard else 0.0)
+    flight.fly(1.5 if received else 0.0)
     asked = flight.bridge.requests
     first = asked.offboard(True, flight.now)
     assert asked.arm(True, flight.now).outcome == (
@@ -129,25 +129,25 @@ def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, n
     second = getattr(asked, abort)(*argument, flight.now)
     assert first.outcome == (False, f'offboard refused: superseded by {name}')
     assert second.outcome == (
-        None if heard else (False, f'{name} refused: no HEARTBEAT from the autopilot'))
+        None if received else (False, f'{name} refused: no HEARTBEAT from the autopilot'))
     flight.controller.pilot_switches('GUIDED')  # nor does the mode alone let it follow
     flight.planner = np.array([0.6, 0.0, 0.0])
     flight.fly(3.0)
     assert flight.kinds(40) == {'none'}
 
 
-@pytest.mark.parametrize(('options', 'told'), [
+@pytest.mark.parametrize(('options', 'reported'), [
     ({'personality': 'arducopter', 'arming_denial': 'Compass not calibrated'},
      'failed: Arm: Compass not calibrated'),
     ({'arming_denial': 'Compass not calibrated'},
      'temporarily rejected: arm authorization denied'),
     # GPS is off, and no vision comes.
     ({'parameters': NO_GPS['px4']}, 'its estimator lacks VELOCITY_HORIZ, POS_HORIZ_REL')])
-def test_a_refusal_carries_the_words_of_the_autopilot(options, told):
+def test_a_refusal_carries_the_words_of_the_autopilot(options, reported):
     flight = Flight(start='landed', **options)
     flight.fly(1.5)
     outcome = flight.ask('arm', True)
-    assert outcome.message.startswith('arm refused: ') and told in outcome.message
+    assert outcome.message.startswith('arm refused: ') and reported in outcome.message
 
 
 @pytest.mark.parametrize(('personality', 'words'), [
@@ -187,9 +187,9 @@ def test_arming_after_a_take_off_that_was_ended_by_a_landing_does_not_climb():
     assert flight.mode == 'AUTO.LOITER' and flight.vehicle.position[2] < 0.1
 
 
-@pytest.mark.parametrize(('system', 'component', 'believed'), [
+@pytest.mark.parametrize(('system', 'component', 'estimated'), [
     (255, 190, False), (1, 190, False), (0, 0, True), (1, 191, True)])
-def test_only_answers_to_us_are_believed(system, component, believed):
+def test_only_answers_to_us_are_believed(system, component, estimated):
     flight = Flight(faults=[Fault('drop', 1.6, 9.0, 'received', message='COMMAND_LONG')])
     flight.fly(2.0)
     request = flight.bridge.requests.offboard(True, flight.now)
@@ -198,7 +198,7 @@ def test_only_answers_to_us_are_believed(system, component, believed):
         mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_DENIED, target_system=system,
         target_component=component).pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(1.0)
-    assert (request.outcome is not None and 'denied' in request.outcome.message) == believed
+    assert (request.outcome is not None and 'denied' in request.outcome.message) == estimated
 
 
 # Which take-off explains that an armed vehicle is in its offboard mode.
@@ -222,11 +222,11 @@ def test_a_take_off_of_arducopter_explains_guided(firmware, goal, success, lande
     assert bridge.requests.takeoff_explains_mode(1.0) == explained
 
 
-@pytest.mark.parametrize(('options', 'told'), [
+@pytest.mark.parametrize(('options', 'reported'), [
     (never('TIMESYNC'), 'the autopilot signs its messages and answers none of ours'), ({}, '')])
-def test_an_autopilot_that_signs_and_answers_nothing_is_reported(options, told):
+def test_an_autopilot_that_signs_and_answers_nothing_is_reported(options, reported):
     flight = Flight('arducopter', **options)
-    for seconds, expected in ((4.0, ''), (3.0, told)):
+    for seconds, expected in ((4.0, ''), (3.0, reported)):
         flight.fly(seconds)
         flight.bridge.link.autopilot_signs = True  # as its newest message showed
         assert flight.bridge.housekeeping.unreceived(flight.now).partition(':')[0] == expected

@@ -32,7 +32,7 @@ BLIND = {
         f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 
 
-def heard(name, until=math.inf, **options):
+def received(name, until=math.inf, **options):
     """Return a bridge that has heard a capture up to a time, s."""
     bridge = Bridge(link(**options), Gate(), now=0.0)
     for time, data in captured(name):
@@ -44,7 +44,7 @@ def heard(name, until=math.inf, **options):
 
 @pytest.mark.parametrize('name', ['px4_refusals', 'px4_vision_lost'])
 def test_every_message_of_px4_is_understood(name):
-    assert not {*heard(name).link.ignored} - {
+    assert not {*received(name).link.ignored} - {
         'before HEARTBEAT', 'LOCAL_POSITION_NED is none, says its estimator'}
 
 
@@ -55,11 +55,11 @@ def test_every_message_of_px4_is_understood(name):
     (36.0, 'AUTO.LAND', ['it does not arm in this mode']),
     (58.4, 'OFFBOARD', []), (60.7, 'OFFBOARD', ['no setpoint stream'])])
 def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, reasons):
-    assert heard('px4_refusals', time).texts.checks.against(mode) == reasons
+    assert received('px4_refusals', time).texts.checks.against(mode) == reasons
 
 
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
-    bridge = heard('px4_refusals', 60.8)
+    bridge = received('px4_refusals', 60.8)
     assert bridge.texts.since(60.0) == ['failsafe: Position']
     modes = [bridge.telemetry.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
@@ -108,7 +108,7 @@ def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
 
 
 def test_ardupilots_words_say_why():
-    bridge = heard('ardupilot_refusals')
+    bridge = received('ardupilot_refusals')
     assert {'Arm: VisOdom: not healthy', 'PreArm: VisOdom: not healthy',
             'Arm: Need Position Estimate'} <= set(bridge.texts.since(0.0))
 
@@ -121,7 +121,7 @@ def test_ardupilots_words_say_why():
                                     'no setpoint stream'),
     (HOLD, 'OFFBOARD', 58.0,
      'hold refused: temporarily rejected; POSCTL refused: temporarily rejected: no transmitter; '
-     'AUTO.LAND refused: temporarily rejected; PX4 tells the cause only to a ground station: look '
+     'AUTO.LAND refused: temporarily rejected; PX4 sends the cause only to a ground station: look '
      'there, or set announce_as_gcs')])
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
     status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')

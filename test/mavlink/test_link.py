@@ -80,10 +80,10 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
 
 
 @pytest.mark.parametrize(('who', 'autopilot', 'silence'), [
-    ({'system': 7}, PX4, 'heard system id 7, not target_system 1'),
+    ({'system': 7}, PX4, 'received system id 7, not target_system 1'),
     ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4, 'no autopilot with system id 1'),
     ({}, mavlink.MAV_AUTOPILOT_GENERIC,
-     "heard GENERIC QUADROTOR, which autopilot = 'auto' does not speak")])
+     "received GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
 def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_answered(
         who, autopilot, silence):
     bench = Bench()
@@ -94,10 +94,10 @@ def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_an
 
 def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent():
     bench = Bench()
-    for vehicle, now, heard, answered in (
+    for vehicle, now, received, answered in (
             ('first', 1.0, ['HEARTBEAT'], 'first'), ('second', 2.0, [], 'first'),
             ('second', 3.5, ['HEARTBEAT'], 'second')):
-        assert bench.beats(vehicle, now=now) == heard and bench.link.transport.peer == answered
+        assert bench.beats(vehicle, now=now) == received and bench.link.transport.peer == answered
     assert bench.link.ignored['second sender'] == 1 and bench.link.peer_changes == 1
 
 
@@ -121,18 +121,18 @@ def test_no_bytes_whatsoever_break_the_link(data):
 
 # Signing.
 
-@pytest.mark.parametrize(('key', 'at', 'reason', 'told'), [
+@pytest.mark.parametrize(('key', 'at', 'reason', 'reported'), [
     (None, UNIX, 'wrong signature', 'signed with another key'),
     (bytes(32), UNIX + 1e8, 'wrong signature', 'signed with another key'),
     (KEY, UNIX - 30.0, '', ''), (KEY, UNIX - 120.0, 'older timestamp', 'older timestamp'),
     (KEY, UNIX + 59.0, '', ''), (KEY, UNIX + 86400.0, 'future timestamp', 'ahead of this')])
-def test_signed_links_hear_only_their_key_and_time(key, at, reason, told):
+def test_signed_links_hear_only_their_key_and_time(key, at, reason, reported):
     bench = Bench(signing=Signing(KEY, UNIX))
     ours = bench.link._sender.signing.timestamp
     assert bench.beats('vehicle', signing=key and Signing(key, at)) == (
         [] if reason else ['HEARTBEAT'])
     assert dict(bench.link.ignored) == ({reason: 1} if reason else {})
-    assert told in bench.link.silence()
+    assert reported in bench.link.silence()
     if reason:
         assert bench.link._sender.signing.timestamp == ours  # nor is what we send of that time
     else:
@@ -143,27 +143,27 @@ def test_signed_links_hear_only_their_key_and_time(key, at, reason, told):
 def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
     bench = Bench(signing=Signing(KEY, UNIX))
     bench.beats('vehicle', now=100.0, signing=Signing(KEY, UNIX))
-    for ahead, now, heard in ((86400.0, 101.0, False), (1.0, 101.0, True), (59.0, 100.0, True),
+    for ahead, now, received in ((86400.0, 101.0, False), (1.0, 101.0, True), (59.0, 100.0, True),
                               # Our clock goes on: what was too far ahead is not any more.
                               (100.0, 139.0, False), (100.0, 141.0, True)):
         bench.codecs['vehicle'].signing.timestamp = Signing(KEY, UNIX + ahead).state.timestamp
-        assert bool(bench.beats('vehicle', now=now)) == heard
+        assert bool(bench.beats('vehicle', now=now)) == received
 
 
-@pytest.mark.parametrize(('content', 'mode', 'told'), [
+@pytest.mark.parametrize(('content', 'mode', 'reported'), [
     (KEY, 0o400, ''), (KEY.hex().encode() + b'\n', 0o600, ''),
     *((content, 0o600, 'must hold 32 bytes') for content in (b'', b'short', b'z' * 64, b'a' * 63)),
     *((KEY, mode, f'mode {mode:03o} gives others access: chmod 600')
       for mode in (0o640, 0o604, 0o620, 0o601)),
     (None, 0, 'No such file')])
-def test_a_bad_key_file_is_named_and_its_content_is_not(content, mode, told, tmp_path):
+def test_a_bad_key_file_is_named_and_its_content_is_not(content, mode, reported, tmp_path):
     path = tmp_path / 'key'
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
-    if not told:
+    if not reported:
         Signing.from_file(str(path), 0.0)
         return
-    with pytest.raises(ValueError, match=f'signing_key_file = .*{told}') as error:
+    with pytest.raises(ValueError, match=f'signing_key_file = .*{reported}') as error:
         Signing.from_file(str(path), 0.0)
     assert not content or content.decode() not in str(error.value)

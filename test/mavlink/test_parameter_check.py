@@ -169,9 +169,9 @@ def test_each_that_matters_has_to_be_read(dialect, forwarding):
     assert unread(dialect, checked(needed=NEEDED, **ALLOWED[dialect.name]), forwarding) == ''
     for rule in RULES[dialect.name]:
         check = checked(needed=NEEDED, **ALLOWED[dialect.name] | {rule.name: None})
-        told = unread(dialect, check, forwarding)
+        reported = unread(dialect, check, forwarding)
         needed = forwarding or not rule.forwarding
-        assert told.partition(':')[0] == (f'{rule.name} could not be read' if needed else '')
+        assert reported.partition(':')[0] == (f'{rule.name} could not be read' if needed else '')
     nothing_read = ParameterCheck([], bytewise=True)
     assert obstacle(dialect, nothing_read, forwarding) == ''
     names = ', '.join(rule.name for rule in rules(dialect, forwarding))

@@ -27,7 +27,7 @@ from flock_follower.mavlink.permission import (
     Blinded,
     EndRequested,
     Landed,
-    LONGEST_UNHEARD,
+    LONGEST_SILENCE,
     next_permission,
     NOT_REQUESTED,
     OffboardFailed,
@@ -53,8 +53,8 @@ SECOND = SecondCommander('/planner, /other')
 GROUND = 'on the ground'
 
 
-def seen(status, heard=2.0, airborne=True):
-    return Seen(status, heard, airborne)
+def seen(status, received=2.0, airborne=True):
+    return Seen(status, received, airborne)
 
 
 def after(*events):
@@ -94,8 +94,10 @@ def test_a_landing_ends_the_permission(events):
 
 def test_a_takeover_bars_offboard_for_ten_seconds():
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
-    assert permission.taken_over(5.0).startswith('the pilot took over 0 s ago')
-    assert permission.taken_over(14.9) and not permission.taken_over(15.0)
+    for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
+        assert permission.taken_over(now).startswith(f'the pilot took over {seconds} s ago')
+    assert permission.taken_over(14.9)
+    assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
 
@@ -116,10 +118,26 @@ def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
     assert next_permission(permission, seen(OURS)) is permission
 
 
+@pytest.mark.parametrize('received', [0.5, 1.0])
+def test_a_heartbeat_from_before_the_request_shows_nothing(received):
+    assert next_permission(after(ASKED), seen(OURS, received)) == after(ASKED)
+
+
+def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
+    for obeying in (after(ASKED, seen(OURS)), after(ASKED, seen(OURS, airborne=None))):
+        assert next_permission(obeying, OffboardFailed('late')) is obeying
+        assert next_permission(obeying, ENDED).phase is Phase.GIVING_BACK
+        # The vehicle was not asked at all: nothing that streams may go on.
+        assert next_permission(obeying, OffboardFailed('blind', asked=False)).announced() == (
+            'INACTIVE: blind')
+    before = Permission()
+    assert next_permission(before, OffboardFailed('blind', asked=False)) is before
+
+
 @pytest.mark.parametrize('airborne', [False, True, None])  # a false report removes no thrust
 def test_active_it_stays_from_heartbeat_to_heartbeat(airborne):
     active = after(ASKED, seen(OURS))
-    assert next_permission(active, seen(OURS, 3.0, airborne)) == replace(active, heard=3.0)
+    assert next_permission(active, seen(OURS, 3.0, airborne)) == replace(active, received=3.0)
 
 
 def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
@@ -137,7 +155,7 @@ def test_who_sees_no_velocity_any_more_falls_silent_until_asked_again():
     for events in ((ASKED,), (ASKED, seen(OURS)), (ASKED, seen(OURS), ENDED)):
         blinded = next_permission(after(*events), Blinded('velocity from odom stale'))
         assert blinded.announced() == 'INACTIVE: fell silent: velocity from odom stale'
-        assert next_permission(blinded, seen(OURS, heard=3.0)) is blinded
+        assert next_permission(blinded, seen(OURS, received=3.0)) is blinded
     over = after(ASKED, seen(OURS), seen(PILOT))
     assert next_permission(over, Blinded('velocity from odom stale')) is over
 
@@ -153,9 +171,9 @@ def test_where_two_nodes_command_it_brakes_until_asked_again():
 
 
 def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
-    active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_UNHEARD))
+    active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_SILENCE))
     assert active.phase is Phase.ACTIVE
-    lost = next_permission(active, seen(OURS, active.heard + LONGEST_UNHEARD + 0.1))
+    lost = next_permission(active, seen(OURS, active.received + LONGEST_SILENCE + 0.1))
     assert lost.announced() == (
         'READY: giving back: no HEARTBEAT for 5 s, the pilot may have taken over')
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
@@ -172,7 +190,7 @@ STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
 EVENTS = [OffboardRequested(1.0), Blinded('no velocity'), OffboardFailed('late'),
           OffboardFailed('blind', False), Landed(), ENDED,
           REBOOTED, SECOND,
-          *(Seen(status, heard, airborne) for status in STATUSES for heard in (0.5, 2.0, 9.0)
+          *(Seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]
 
 
@@ -203,10 +221,10 @@ def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_comma
         if permission.streams and not before.streams:
             assert isinstance(event, OffboardRequested)
         if permission.phase is Phase.ACTIVE and before.phase is not Phase.ACTIVE:
-            assert isinstance(event, Seen) and event.heard > before.since
+            assert isinstance(event, Seen) and event.received > before.since
             assert event.status.offboard and event.status.armed and event.airborne
         if isinstance(event, Seen) and before.phase is Phase.ACTIVE and not (
-                event.status.offboard and event.status.armed) and event.heard > before.since:
+                event.status.offboard and event.status.armed) and event.received > before.since:
             assert not permission.streams
         assert (permission.reason == '') == (permission.phase is Phase.ACTIVE)
         assert permission.reason != NOT_REQUESTED or permission == Permission()

@@ -296,27 +296,27 @@ SHORT = st.floats(0.0, 3e-7) | st.floats(-1.0, 1.0)  # by this share a vector mi
 @given(a_max=st.floats(0.1, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
        v_max=st.sampled_from([0.5, 20.0]), direction=DIRECTION, short=SHORT,
        velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 5.0]),
-       commanded=st.sampled_from([True, True, False]), away=st.none() | DIRECTION,
-       airborne=st.sampled_from([True, True, False]), lift=st.sampled_from([0.0, 0.5, -1.0]),
+       commanded=st.sampled_from([True, True, False]), axis=st.none() | DIRECTION,
+       airborne=st.sampled_from([True, True, False]), bias=st.sampled_from([0.0, 0.5, -1.0]),
        wind=st.just((0.0, 0.0, 0.0)) | DIRECTION, offset=st.sampled_from([0.0, 1.0, -1.0]),
        height=st.sampled_from([0.4, 0.6, 5.0, 9.9, 11.0]), climb_rate=st.floats(-1.0, 1.0),
        out=st.sampled_from([0.0, 49.9, 51.0]))
 def test_single_precision_of_the_wire_does_not_exceed_a_max(
-        a_max, lower, v_max, direction, short, velocity, speed, commanded, away, airborne, lift,
+        a_max, lower, v_max, direction, short, velocity, speed, commanded, axis, airborne, bias,
         wind, offset, height, climb_rate, out):
     full = GateLimits(a_max=a_max, v_max=v_max)
     limits = GateLimits(a_max=lower * a_max, v_max=v_max)
     wanted = (1.0 - short) * limits.a_max * np.array(direction) / np.linalg.norm(direction)
     motion = Motion(tuple(speed * v_max * np.array(velocity) / np.linalg.norm(velocity)), 0.02)
-    unit = None if away is None else np.array(away) / np.linalg.norm(away)
+    unit = None if axis is None else np.array(axis) / np.linalg.norm(axis)
     setpoint = decide(
         limits, full=full, known=KnownMotion(odom=motion, autopilot=motion, source=ODOM),
         link_age=0.1, armed=True, command_age=0.05,
-        command=Command(wanted, 0.5, lift, unit) if commanded else None,
+        command=Command(wanted, 0.5, bias, unit) if commanded else None,
         airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset,
         place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
-    assert norm_on_wire(setpoint) <= (limits if commanded and away is None else full).a_max
+    assert norm_on_wire(setpoint) <= (limits if commanded and axis is None else full).a_max
 
 
 COMPONENTS = st.floats(-3.0, 3.0)
@@ -326,13 +326,13 @@ VECTORS = st.tuples(COMPONENTS, COMPONENTS, COMPONENTS)
 @settings(max_examples=300)
 @given(VECTORS, VECTORS, VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1),
        st.floats(0.05, 3.0))
-def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted, velocity, away,
+def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted, velocity, axis,
                                                                          v_max):
-    limits, direction = GateLimits(v_max=v_max), np.array(away) / np.linalg.norm(away)
+    limits, direction = GateLimits(v_max=v_max), np.array(axis) / np.linalg.norm(axis)
     known = Motion(velocity, 0.02)
     command = Command(wanted, 0.0)
     scaled = judge(limits, command=command, odom=known, autopilot=UNKNOWN).acceleration
-    kept = judge(limits, command=command._replace(away=direction), odom=known,
+    kept = judge(limits, command=command._replace(separation_axis=direction), odom=known,
                  autopilot=UNKNOWN).acceleration
     assert np.linalg.norm(kept) <= limits.a_max
     reached = np.linalg.norm(np.array(velocity) + limits.speed_horizon * kept)
@@ -341,12 +341,13 @@ def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted,
     assert direction @ kept >= within - 1e-6
 
 
-@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0),
+@pytest.mark.parametrize('axis', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0),
                                   (0.0, 1e200, 0.0), (0.0, -1e300, 1.0), (0.0, 3.0, 0.0),
                                   (0.0, 0.0, 0.0)])
-def test_a_direction_that_is_none_changes_nothing(away):
+def test_a_direction_that_is_none_changes_nothing(axis):
     known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
     evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.0)
     np.testing.assert_array_equal(
-        judge(lowered, command=evade._replace(away=away), odom=known, full=LIMITS).acceleration,
+        judge(lowered, command=evade._replace(separation_axis=axis), odom=known,
+              full=LIMITS).acceleration,
         judge(lowered, command=evade, odom=known, full=LIMITS).acceleration)

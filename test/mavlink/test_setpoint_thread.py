@@ -91,22 +91,22 @@ def make_stream():
 
     def make(period):
         """Return a bridge, its stream after the first cycle, and the arguments of callbacks."""
-        bridge, told = Bridge(), {'messages': [], 'cycles': [], 'errors': []}
+        bridge, passed = Bridge(), {'messages': [], 'cycles': [], 'errors': []}
         stream = SetpointThread(
-            bridge, period, lambda messages, now: told['messages'].append(messages),
-            lambda cycle, now: told['cycles'].append((cycle, now)), told['errors'].append)
+            bridge, period, lambda messages, now: passed['messages'].append(messages),
+            lambda cycle, now: passed['cycles'].append((cycle, now)), passed['errors'].append)
         streams.append(stream)
         stream.start()
-        while not told['cycles']:
+        while not passed['cycles']:
             time.sleep(0.001)
-        return bridge, stream, told
+        return bridge, stream, passed
     yield make
     for stream in streams:
         stream.stop()
 
 
 def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream):
-    bridge, stream, told = make_stream(NEVER)
+    bridge, stream, passed = make_stream(NEVER)
     bridge.theirs.send(b'x')
     bridge.wait_until('receive', 1)
     threads = []
@@ -114,8 +114,8 @@ def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream)
                    lambda: bridge.note('forward')):
         assert stream.submit(action)
     time.sleep(2 * SHORTEST_PERIOD)
-    assert threads == ['stream'] and told['messages'] == [['a message']]
-    assert [str(error) for error in told['errors']] == ['division by zero']
+    assert threads == ['stream'] and passed['messages'] == [['a message']]
+    assert [str(error) for error in passed['errors']] == ['division by zero']
     # No cycle without a new command; what was submitted may have been odometry.
     assert len(bridge.times('cycle')) == 1 and bridge.calls[-1][0] == 'odometry'
 
@@ -176,12 +176,12 @@ def test_every_action_that_was_taken_is_run_or_refused_at_the_end(make_stream):
 
 
 def test_neither_a_device_that_is_away_nor_a_cycle_that_raises_ends_the_cycles(make_stream):
-    bridge, _, told = make_stream(0.01)
+    bridge, _, passed = make_stream(0.01)
     bridge.fault, bridge.broken = 'unplugged', True
     bridge.wait_for('receive', 3)
     bridge.wait_for('cycle', 3)
     bridge.broken = False
     bridge.wait_for('cycle', 3)
-    assert {str(error) for error in told['errors']} == {'broken'} and len(told['errors']) >= 2
+    assert {str(error) for error in passed['errors']} == {'broken'} and len(passed['errors']) >= 2
     # The callback gets the time of the end of the cycle, not of its beginning.
-    assert told['cycles'][0][1] >= bridge.times('cycle')[0]
+    assert passed['cycles'][0][1] >= bridge.times('cycle')[0]

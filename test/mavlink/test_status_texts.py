@@ -31,7 +31,7 @@ def statustext(text, severity=CRITICAL, number=0, chunk=0):
     return mavlink.MAVLink_statustext_message(severity, text.encode(), number, chunk)
 
 
-def told(texts, now):
+def new(texts, now):
     return [text for _, _, text in texts.new(now)]
 
 
@@ -48,7 +48,7 @@ def test_texts_are_joined_from_their_chunks_and_told_once(chunks, whole):
     for number, chunk, text in chunks:
         texts.add(statustext(text, number=number, chunk=chunk), 1.0)
     assert texts.new(1.1) == [(1.0, CRITICAL, text) for text in whole]
-    assert told(texts, 1.2) == [] and texts.since(1.0) == whole
+    assert new(texts, 1.2) == [] and texts.since(1.0) == whole
 
 
 def test_a_refusal_is_explained_by_more_than_information():
@@ -60,16 +60,16 @@ def test_a_refusal_is_explained_by_more_than_information():
 def test_a_text_whose_end_is_lost_is_told_after_a_while():
     texts = StatusTexts()
     texts.add(statustext(A, number=3), 1.0)
-    assert told(texts, 1.0 + CHUNK_TIMEOUT) == []
-    assert told(texts, 1.1 + CHUNK_TIMEOUT) == texts.since(1.0) == [A + '...']
+    assert new(texts, 1.0 + CHUNK_TIMEOUT) == []
+    assert new(texts, 1.1 + CHUNK_TIMEOUT) == texts.since(1.0) == [A + '...']
 
 
 def test_many_unfinished_texts_are_told_and_do_not_add_up():
     texts = StatusTexts()
     for number in range(1, 101):
         texts.add(statustext(f'{number:050}', number=number), 1.0)
-    assert told(texts, 1.0) == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
-    assert len(told(texts, 9.0)) == MOST_UNFINISHED and told(texts, 99.0) == []
+    assert new(texts, 1.0) == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
+    assert len(new(texts, 9.0)) == MOST_UNFINISHED and new(texts, 99.0) == []
 
 
 def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():

@@ -63,13 +63,13 @@ def test_what_comes_well_below_the_rate_asked_for_comes_too_seldom(wanted, share
 
 def test_the_longest_pause_is_told_while_it_lasts_and_for_five_seconds():
     assert Arrivals().longest_pause(7.0) == 0.0 and arrived(3.0).longest_pause(7.0) == 4.0
-    arrivals, told = Arrivals(), {}
+    arrivals, reported = Arrivals(), {}
     for step in range(600):
         time = step * 0.02
         if not (3.0 < time < 3.5 or 4.0 < time < 4.3):
             arrivals.take((ATTITUDE, POSITION)[step % 2], time)
-        told[step] = arrivals.longest_pause(time)
-    assert [told[step] for step in (140, 170, 250, 420, 430, 599)] == pytest.approx(
+        reported[step] = arrivals.longest_pause(time)
+    assert [reported[step] for step in (140, 170, 250, 420, 430, 599)] == pytest.approx(
         [0.02, 0.4, 0.5, 0.5, 0.3, 0.02])
 
 
@@ -133,18 +133,18 @@ def test_all_is_asked_for_at_the_start_and_what_another_one_lowers_again(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('fault', 'told'), [
+@pytest.mark.parametrize(('fault', 'reported'), [
     # Below half of what was asked for; none at all has other causes than the link.
     ({'message': 'LOCAL_POSITION_NED', 'share': 0.7},
      r'LOCAL_POSITION_NED comes at 1[2-8] Hz of 50 asked for'),
     ({'at': 6.5, 'duration': 0.6},
      r'nothing came from the autopilot for 0.6[0-3] s in the last 5 s')])
-def test_a_slow_link_is_told_after_seven_seconds(fault, told):
+def test_a_slow_link_is_told_after_seven_seconds(fault, reported):
     flight = Flight(faults=[Fault('drop', direction='sent', **{'at': 0.0, **fault})])
     flight.fly(6.4)
     assert flight.bridge.housekeeping.too_slow(flight.now) == ''
     flight.fly(2.6)
-    assert re.fullmatch(told, flight.bridge.housekeeping.too_slow(flight.now))
+    assert re.fullmatch(reported, flight.bridge.housekeeping.too_slow(flight.now))
 
 
 @pytest.mark.slow

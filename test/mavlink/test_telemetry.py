@@ -49,11 +49,11 @@ def heartbeat(mode='OFFBOARD', base_mode=ARMED):
         mavlink.MAV_STATE_ACTIVE, 3)
 
 
-def tells(mode):
+def mode_message(mode):
     return mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode])
 
 
-def heard(*messages):
+def received(*messages):
     """Return what is known after messages that came at 1 s, 2 s and so on."""
     telemetry = Telemetry()
     for time, message in enumerate(messages, start=1):
@@ -64,7 +64,7 @@ def heard(*messages):
 def test_position_and_attitude_arrive_in_enu_and_flu():
     # Facing east (NED yaw 90 deg), nose up 0.1 rad, turning right at 0.3 rad/s.
     x, y, z, w = quaternion_from_rpy(0.0, 0.1, math.pi / 2)
-    telemetry = heard(
+    telemetry = received(
         mavlink.MAVLink_local_position_ned_message(0, 1, 2, -3, 0.1, 0.2, -0.3),
         mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.1, 0.2, 0.3))
     np.testing.assert_allclose(telemetry.local_position.position, [2, 1, 3])
@@ -77,7 +77,7 @@ def test_position_and_attitude_arrive_in_enu_and_flu():
 
 
 def test_telemetry_that_is_not_finite_is_dropped():
-    telemetry = heard(mavlink.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0),
+    telemetry = received(mavlink.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0),
                       mavlink.MAVLink_attitude_quaternion_message(0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
     assert telemetry.local_position is telemetry.attitude is None
 
@@ -89,7 +89,7 @@ def test_telemetry_that_is_not_finite_is_dropped():
         0, 0, 1, 2350, [3800, 3810, 3790, 65535] + [65535] * 6, -1, -1, -1, -1),
      (11.4, math.nan, math.nan), (3.8, 3.81, 3.79))])
 def test_the_battery_is_read_in_volts_amperes_and_fractions(message, numbers, cells):
-    battery = heard(message).battery
+    battery = received(message).battery
     assert battery[1:4] == pytest.approx(numbers, nan_ok=True)
     assert battery.cell_voltages == pytest.approx(cells)
     assert battery.temperature == pytest.approx(23.5 if cells else math.nan, nan_ok=True)
@@ -140,13 +140,13 @@ def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
     (mavlink.MAV_LANDED_STATE_IN_AIR, True), (mavlink.MAV_LANDED_STATE_TAKEOFF, False),
     (mavlink.MAV_LANDED_STATE_LANDING, True)])
 def test_the_vehicle_says_whether_it_flies(state, flying):
-    telemetry = heard(mavlink.MAVLink_extended_sys_state_message(0, state))
+    telemetry = received(mavlink.MAVLink_extended_sys_state_message(0, state))
     assert telemetry.flying(3.9) is flying
     assert telemetry.flying(4.1) is None and Telemetry().flying(0.0) is None  # told at 5 Hz
 
 
 def test_heights_are_known_above_the_sea_and_the_local_origin():
-    telemetry = heard(mavlink.MAVLink_global_position_int_message(
+    telemetry = received(mavlink.MAVLink_global_position_int_message(
         0, 0, 0, 491000, 3000, 0, 0, 0, 0), mavlink.MAVLink_local_position_ned_message(
             0, 0, 0, -3, 0, 0, 0))
     assert (telemetry.altitude(2.9), telemetry.altitude(3.1)) == (3.0, None)
@@ -163,8 +163,8 @@ def test_each_autopilot_is_asked_for_what_it_grants():
 
 
 def test_current_mode_tells_the_mode_and_leaves_the_rest_to_heartbeat():
-    assert heard(tells('OFFBOARD')).status is None
-    telemetry = heard(heartbeat('OFFBOARD'), tells('POSCTL'))
+    assert received(mode_message('OFFBOARD')).status is None
+    telemetry = received(heartbeat('OFFBOARD'), mode_message('POSCTL'))
     assert telemetry.status == (True, 'POSCTL', 'active', False)
     assert telemetry.shown_time(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1.0
     assert telemetry.shown_time(mavlink.MAV_CMD_DO_SET_MODE) == 2.0

@@ -24,6 +24,7 @@ from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     difference,
+    displaced,
     finite_vector,
     fresh,
     KnownMotion,
@@ -31,8 +32,10 @@ from flock_follower.mavlink.velocity_check import (
     Motion,
     ODOM,
     Path,
+    Source,
     VelocityComparison,
     WINDOW,
+    YAW_MEMORY,
 )
 
 LIMITS = GateLimits()
@@ -246,3 +249,42 @@ def test_what_is_old_or_interrupted_is_not_compared():
     for path in (first, second):
         path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
     assert difference(first, second, 0.0, 9.0) is None
+
+
+def test_motion_at_the_reported_velocity_is_no_jump_and_a_jump_in_motion_is_one():
+    velocity = np.array([0.0, 8.0, 0.0])
+    moving, _ = paths(2.0, lambda t: 8.0 * t * np.eye(3)[1], still, velocity=velocity)
+    assert moving.jumps == 0
+    moving, other = paths(2.0, lambda t: (8.0 * t + 1.5 * (t > 1.0)) * np.eye(3)[1],
+                          lambda t: 8.0 * t * np.eye(3)[1], velocity=velocity)
+    assert moving.jumps == 1 and np.linalg.norm(difference(moving, other, 0.0, 2.0)) < 1e-9
+
+
+@pytest.mark.parametrize(('axis', 'drift', 'std', 'height', 'contradicts'), [
+    (0, 0.6, 0.0, False, True), (1, -0.6, 0.0, False, True), (1, 0.4, 0.0, False, False),
+    (1, 0.6, 0.25, False, False), (2, 0.6, 0.0, False, False),
+    (2, 1.0, 0.0, True, True), (2, -1.0, 0.0, True, True), (2, 0.8, 0.0, True, False),
+    (2, 1.0, 0.4, True, False), (1, 2.0, 0.0, True, False)])
+def test_displacements_that_differ_beyond_their_deviations_are_reported(
+        axis, drift, std, height, contradicts):
+    odom, autopilot = Source(), Source()
+    odom.path, autopilot.path = paths(4.0, lambda t: drift * t / 4.0 * np.eye(3)[axis], still)
+    odom.std = std
+    why = displaced(odom, None if height else autopilot, 0.0,
+                    autopilot.path if height else Path(), 4.0)
+    assert bool(why) == contradicts
+    assert not why or ('barometer' in why) == height
+
+
+def test_the_yaw_nearest_to_a_time_is_returned_and_old_ones_are_forgotten():
+    source = Source()
+    assert source.yaw(1.0) == (0.0, -math.inf)
+    for step in range(31):
+        source.take_yaw(0.1 * step, 0.1 * step)
+    for refused, time in ((1.0, 2.95), (math.nan, 3.1)):  # out of order, not finite
+        source.take_yaw(refused, time)
+    assert source.newest_yaw == pytest.approx((3.0, 3.0))
+    assert source.yaw(2.52) == pytest.approx((2.5, 2.5))
+    assert source.yaw(0.0) == pytest.approx((3.0 - YAW_MEMORY, 3.0 - YAW_MEMORY))
+    source.take_yaw(3.0 + math.pi, 3.0)  # of the same time: the later report, wrapped
+    assert source.newest_yaw == pytest.approx((3.0 - math.pi, 3.0))

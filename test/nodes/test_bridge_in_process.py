@@ -127,7 +127,7 @@ class Bench:
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129 if armed else 1, mode,
             mavlink.MAV_STATE_ACTIVE, 3))
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Have the autopilot send what makes the node publish and log; it faces north."""
         self.beat()
         self.send(mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15200, 1850, 81, *[0] * 6),
@@ -210,7 +210,7 @@ def make_bench(ros: None) -> Iterator[Callable[..., Bench]]:
 
 def test_only_the_setpoint_thread_calls_what_changes_the_bridge(make_bench):
     bench = make_bench(forward_odometry=True)
-    bench.hear()
+    bench.receive()
     bench.wait(lambda: bench.bridge.telemetry.local_position is not None)
     bench.odometry()
     bench.command()
@@ -262,7 +262,7 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
     bench.beat(armed=False)
     bench.wait(lambda: bench.bridge.telemetry.status)
     bench.odometry()
-    bench.hear()
+    bench.receive()
     bench.wait(lambda: all(outlet.got for outlet in bench.outlets.values()))
     odom, battery, place = (bench.outlets[name].got[-1]
                             for name in ('odometry', 'battery', 'armed_at'))
@@ -304,7 +304,7 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
     for stuck in (bench.outlets['odometry'], bench.log):
         stuck.released.clear()
         stuck.got.clear()
-        bench.hear()
+        bench.receive()
         bench.wait(lambda stuck=stuck: stuck.got)
         cycles = bench.count('cycle')
         bench.wait(lambda cycles=cycles: bench.count('cycle') >= cycles + 10)
@@ -329,7 +329,7 @@ def test_a_request_that_fails_inside_is_answered_and_the_stream_goes_on(make_ben
 
 def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
     bench = make_bench()
-    bench.hear()
+    bench.receive()
     bench.wait(lambda: bench.bridge.telemetry.status is not None)
     waiting = [bench.serve('arm') for _ in range(2)]
     waiting[0].send(None)
@@ -353,7 +353,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     assert 'nothing arrives' in bench.problems(ahead=4.0)
     bench.codec.srcSystem = 7
     bench.beat()
-    bench.wait(lambda: 'heard system id 7, not target_system 1' in bench.problems(ahead=4.0))
+    bench.wait(lambda: 'received system id 7, not target_system 1' in bench.problems(ahead=4.0))
     bench.codec.srcSystem = 1
     bench.beat()
     bench.wait(lambda: bench.bridge.alive(time.monotonic()))
@@ -362,7 +362,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
                  'mavlink_bridge/offboard asks for offboard'):
         assert part in found
-    bench.hear()
+    bench.receive()
     bench.odometry(yaw=0.0)
     bench.wait(lambda: 'differ by' in bench.problems())
     assert not bench.call('offboard', True).success

@@ -171,4 +171,4 @@ def test_a_missing_package_of_ros_is_one_line() -> None:
               'import flock_follower.nodes.planner')
     ended = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
     assert ended.returncode == 1 and ended.stderr.count('\n') == 1
-    assert 'std_srvs' in ended.stderr and 'is ROS 2 there' in ended.stderr
+    assert 'std_srvs' in ended.stderr and 'source ROS 2' in ended.stderr

@@ -40,28 +40,28 @@ def publisher(errors):
 
 def test_actions_run_in_order_in_the_publisher_thread_and_one_that_raises_is_reported(
         publisher, errors):
-    told, done = [], threading.Event()
+    reported, done = [], threading.Event()
     publisher.submit(lambda: 1 / 0)
     for number in range(50):
         publisher.submit(
-            lambda number=number: told.append((number, threading.current_thread().name)))
+            lambda number=number: reported.append((number, threading.current_thread().name)))
     publisher.submit(done.set)
     assert done.wait(DEADLINE)
-    assert told == [(number, 'publisher') for number in range(50)] and publisher.dropped == 0
+    assert reported == [(number, 'publisher') for number in range(50)] and publisher.dropped == 0
     assert [str(error) for error in errors] == ['division by zero']
 
 
 def test_while_one_takes_long_the_oldest_are_dropped_and_nobody_waits_for_it(publisher):
-    begun, release, told = threading.Event(), threading.Event(), []
+    begun, release, reported = threading.Event(), threading.Event(), []
     publisher.submit(lambda: (begun.set(), release.wait(DEADLINE)))
     assert begun.wait(DEADLINE)
     start = time.monotonic()
     for number in range(3 * MOST_WAITING):
-        publisher.submit(lambda number=number: told.append(number))
+        publisher.submit(lambda number=number: reported.append(number))
     publisher.stop()
-    assert time.monotonic() - start < DEADLINE / 2 and not told
+    assert time.monotonic() - start < DEADLINE / 2 and not reported
     release.set()
     publisher.stop()
     # The end counts as an action, too; what waits is run before it.
-    assert publisher.dropped == 2 * MOST_WAITING and told == list(
+    assert publisher.dropped == 2 * MOST_WAITING and reported == list(
         range(2 * MOST_WAITING, 3 * MOST_WAITING))

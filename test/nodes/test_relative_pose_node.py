@@ -274,11 +274,11 @@ def test_a_wrong_marker_is_named_beside_the_wanted_one(
     assert r.problems() == ''  # not at once: markers come and go
     monkeypatch.setattr(relative_pose, 'UNSEEN_TIMEOUT', 0.2)
 
-    def told() -> bool:
+    def reported() -> bool:
         r.image(0.0, wrong)
         return r.problems() != ''
 
-    r.wait(told)
+    r.wait(reported)
     assert r.problems() == (
         'not in sight: leader (marker 0 of DICT_4X4_50); in sight are markers 7')
     assert not r.found
@@ -296,15 +296,15 @@ def test_every_corrupt_image_is_dropped_counted_and_explained(
     r = rig()
     r.camera_info()
     r.odom(0.0)
-    for count, (told, changes) in enumerate(IMAGE_FAULTS.items(), start=1):
+    for count, (text, changes) in enumerate(IMAGE_FAULTS.items(), start=1):
         message = Image(height=480, width=640, step=640, encoding='mono8',
                         data=array('B', image.tobytes()))
         message.header.stamp = nanoseconds_to_stamp(START)
         for name, value in changes.items():
             setattr(message, name, value)
         r.send('image_raw', message)
-        assert r.counters == {'invalid image': count}, told
-        assert told in r.problems(ahead=4.0)
+        assert r.counters == {'invalid image': count}, text
+        assert text in r.problems(ahead=4.0)
     assert not r.found
     r.image(0.0, image)
     r.wait(lambda: r.found)
@@ -323,11 +323,11 @@ def test_every_corrupt_camera_info_is_dropped_counted_and_explained(
     r = rig(max_wait=0.0)
     r.odom(0.0)
     r.camera_info()
-    for count, (told, changes) in enumerate(CAMERA_FAULTS, start=1):
+    for count, (text, changes) in enumerate(CAMERA_FAULTS, start=1):
         r.camera_info(**changes)
         r.image(0.0, image)
-        assert r.counters == {'invalid camera_info': count, 'no usable camera_info': count}, told
-        assert told in r.problems(ahead=4.0)
+        assert r.counters == {'invalid camera_info': count, 'no usable camera_info': count}, text
+        assert text in r.problems(ahead=4.0)
     assert not r.found
     r.camera_info()
     r.image(0.0, image)

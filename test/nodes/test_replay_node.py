@@ -80,10 +80,10 @@ def ear():
     node = rclpy.create_node('ear')
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    node.heard = defaultdict(list)
+    node.received = defaultdict(list)
 
     def listen(message_type, topic, qos=QoSProfile(depth=1000)):  # noqa: B008
-        node.create_subscription(message_type, topic, node.heard[topic].append, qos, raw=True)
+        node.create_subscription(message_type, topic, node.received[topic].append, qos, raw=True)
 
     def wait(condition, timeout=DEADLINE):
         deadline = time.monotonic() + timeout
@@ -165,12 +165,12 @@ def test_subscribers_get_every_message_bit_for_bit_and_a_clock_that_knows_its_st
     code, out, err = finish(process)
     assert (code, err) == (0, '')
     assert f'replayed {COUNT + 11} messages of 3 topics' in out
-    assert ear.wait(lambda: len(ear.heard['/stamps']) == COUNT)
+    assert ear.wait(lambda: len(ear.received['/stamps']) == COUNT)
     with open_bag(bag) as recorded:
         for topic in recorded.topics:
             sent = [padded(m.data) for m in recorded.messages([topic])]
-            assert [padded(raw) for raw in ear.heard[topic]] == sent
-    clocks = [clock_ns(raw) for raw in ear.heard['/clock']]
+            assert [padded(raw) for raw in ear.received[topic]] == sent
+    clocks = [clock_ns(raw) for raw in ear.received['/clock']]
     assert clocks == sorted(clocks) and clocks[0] == START
     assert {START + i * PERIOD for i in range(COUNT)} <= set(clocks)
     assert np.median(np.diff(clocks)) <= 5_500_000  # 200 Hz of bag time between the messages
@@ -179,10 +179,10 @@ def test_subscribers_get_every_message_bit_for_bit_and_a_clock_that_knows_its_st
 def test_best_effort_and_late_subscribers_are_served(bag, ear, replay):
     ear.listen(CompressedImage, '/image_raw/compressed', qos_profile_sensor_data)
     process = replay(bag, *playing('loop:=true', 'rate:=5.0', 'wait_for:=[image_raw/compressed]'))
-    assert ear.wait(lambda: ear.heard['/image_raw/compressed'])
+    assert ear.wait(lambda: ear.received['/image_raw/compressed'])
     ear.listen(String, '/mode', QoSProfile(
         depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    assert ear.wait(lambda: ear.heard['/mode'])
+    assert ear.wait(lambda: ear.received['/mode'])
     assert process.poll() is None
 
 
@@ -193,10 +193,10 @@ def test_start_duration_and_topics_choose_what_is_played_latched_messages_includ
     process = replay(bag, *playing('start:=0.5', 'duration:=0.2', 'topics:=[stamps, /mode]'))
     assert ear.wait(lambda: process.poll() is not None)
     assert finish(process)[0] == 0
-    assert ear.wait(lambda: len(ear.heard['/stamps']) == 10 and ear.heard['/mode'])
-    assert [header_ns(raw) for raw in ear.heard['/stamps']] == [
+    assert ear.wait(lambda: len(ear.received['/stamps']) == 10 and ear.received['/mode'])
+    assert [header_ns(raw) for raw in ear.received['/stamps']] == [
         START + i * PERIOD for i in range(25, 35)]
-    assert deserialize_message(ear.heard['/mode'][0], String).data == 'hover'
+    assert deserialize_message(ear.received['/mode'][0], String).data == 'hover'
 
 
 def test_namespace_and_remaps_apply_and_the_clock_can_be_left_out(bag, ear, replay):
@@ -208,9 +208,9 @@ def test_namespace_and_remaps_apply_and_the_clock_can_be_left_out(bag, ear, repl
         '-r', '__ns:=/drone', '-r', '/drone/mode:=/mode_out')
     assert ear.wait(lambda: process.poll() is not None)
     assert finish(process)[0] == 0
-    assert ear.wait(lambda: [len(ear.heard[t]) for t in (
+    assert ear.wait(lambda: [len(ear.received[t]) for t in (
         '/drone/vio', '/drone/camera', '/mode_out')] == [COUNT, 10, 1])
-    assert not ear.heard['/clock']
+    assert not ear.received['/clock']
 
 
 def test_pause_stops_messages_and_clock_and_resume_goes_on(bag, ear, replay):
@@ -220,20 +220,20 @@ def test_pause_stops_messages_and_clock_and_resume_goes_on(bag, ear, replay):
     client = ear.create_client(SetBool, 'replay/pause')
     answer = ear.call(client, SetBool.Request(data=True))
     assert answer.success and answer.message == 'paused at 0.00 s'
-    ear.wait(lambda: len(ear.heard['/stamps']) > 1, timeout=0.5)
-    assert not ear.heard['/stamps']
-    assert {clock_ns(raw) for raw in ear.heard['/clock']} <= {START}
+    ear.wait(lambda: len(ear.received['/stamps']) > 1, timeout=0.5)
+    assert not ear.received['/stamps']
+    assert {clock_ns(raw) for raw in ear.received['/clock']} <= {START}
     assert ear.call(client, SetBool.Request(data=False)).message == 'playing at 0.00 s'
-    assert ear.wait(lambda: len(ear.heard['/stamps']) > 5)
+    assert ear.wait(lambda: len(ear.received['/stamps']) > 5)
     ear.call(client, SetBool.Request(data=True))
     ear.wait(lambda: False, timeout=0.2)  # hear out what was under way
-    heard, ticks = len(ear.heard['/stamps']), len(ear.heard['/clock'])
+    received, ticks = len(ear.received['/stamps']), len(ear.received['/clock'])
     ear.wait(lambda: False, timeout=0.3)
-    assert (len(ear.heard['/stamps']), len(ear.heard['/clock'])) == (heard, ticks)
+    assert (len(ear.received['/stamps']), len(ear.received['/clock'])) == (received, ticks)
     ear.call(client, SetBool.Request(data=False))
     assert ear.wait(lambda: process.poll() is not None)
     assert finish(process)[0] == 0
-    assert ear.wait(lambda: len(ear.heard['/stamps']) == COUNT)
+    assert ear.wait(lambda: len(ear.received['/stamps']) == COUNT)
 
 
 def test_a_loop_steps_the_clock_back_reports_its_state_and_ends_on_sigterm(bag, ear, replay):
@@ -244,20 +244,20 @@ def test_a_loop_steps_the_clock_back_reports_its_state_and_ends_on_sigterm(bag, 
     process = replay(bag, *playing('loop:=true', 'rate:=2.0', 'wait_for:=[stamps]'))
 
     def jumps():
-        clocks = [clock_ns(raw) for raw in ear.heard['/clock']]
+        clocks = [clock_ns(raw) for raw in ear.received['/clock']]
         return [after for before, after in pairwise(clocks) if after < before]
 
     assert ear.wait(lambda: len(jumps()) >= 2)
     assert START in jumps()  # the jump itself is published before any message
     # On a busy machine a subscriber may lose the first ticks.
     assert max(jumps()) < START + 200_000_000
-    assert ear.wait(lambda: [header_ns(m) for m in ear.heard['/stamps']].count(START) >= 3)
+    assert ear.wait(lambda: [header_ns(m) for m in ear.received['/stamps']].count(START) >= 3)
     client = ear.create_client(SetParameters, '/replay/set_parameters')
     faster = Parameter('rate', value=20.0).to_parameter_msg()
     assert ear.call(client, SetParameters.Request(parameters=[faster])).results[0].successful
-    ear.heard['/diagnostics'].clear()
-    assert ear.wait(lambda: any(status(m)['rate'] == '20.0' for m in ear.heard['/diagnostics']))
-    values = status(ear.heard['/diagnostics'][-1])
+    ear.received['/diagnostics'].clear()
+    assert ear.wait(lambda: any(status(m)['rate'] == '20.0' for m in ear.received['/diagnostics']))
+    values = status(ear.received['/diagnostics'][-1])
     assert int(values['loops']) >= 2
     assert int(values['published /stamps']) >= 2 * COUNT
     assert 0.0 <= float(values['position_s']) <= 1.0
@@ -300,8 +300,8 @@ def test_ros1_topics_of_unknown_type_are_named_and_left_out(tmp_path, ear, repla
     code, _, err = finish(process)
     assert code == 0
     assert 'topic /zoo is not played: type zoo_msgs/msg/Animal does not exist' in err
-    assert ear.wait(lambda: ear.heard['/mode'])
-    assert deserialize_message(ear.heard['/mode'][0], String).data == 'hover'
+    assert ear.wait(lambda: ear.received['/mode'])
+    assert deserialize_message(ear.received['/mode'][0], String).data == 'hover'
 
 
 @pytest.mark.parametrize(('name', 'height'), [
@@ -316,10 +316,10 @@ def test_real_ros1_bags_arrive_as_ros2_messages(ear, replay, name, height):
         "'/raspicam_node/camera_info:=camera_info']"))
     assert ear.wait(lambda: process.poll() is not None)
     assert finish(process)[0] == 0
-    assert ear.wait(lambda: ear.heard['/image_raw/compressed'] and ear.heard['/camera_info'])
-    image = deserialize_message(ear.heard['/image_raw/compressed'][0], CompressedImage)
+    assert ear.wait(lambda: ear.received['/image_raw/compressed'] and ear.received['/camera_info'])
+    image = deserialize_message(ear.received['/image_raw/compressed'][0], CompressedImage)
     assert image.header.frame_id == 'raspicam'
     assert bytes(image.data[:3]) == b'\xff\xd8\xff'
-    info = deserialize_message(ear.heard['/camera_info'][0], CameraInfo)
+    info = deserialize_message(ear.received['/camera_info'][0], CameraInfo)
     assert (info.width, info.height, info.distortion_model) == (1280, height, 'plumb_bob')
     assert info.k[8] == 1.0 and info.k[0] > 1000.0

@@ -276,17 +276,17 @@ def test_what_is_polled_comes_by_itself_while_it_is_awaited(bench):
 
 def test_a_publisher_that_does_not_fit_is_told_within_seconds(bench):
     node = bench(FlockNode, 'tested')
-    told = []
+    reported = []
     subscription = node.create_subscription(
         String, 'words', print, QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE),
-        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=told.append))
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=reported.append))
     assert subscription.event_handlers
     begin = time.monotonic()
     bench.until(lambda: time.monotonic() - begin > 0.2, 'time')  # waits for no events by now
     bench.other.create_publisher(
         String, 'words', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    bench.until(lambda: told, 'the event')
-    assert told[0].total_count == 1
+    bench.until(lambda: reported, 'the event')
+    assert reported[0].total_count == 1
 
 
 @pytest.mark.parametrize('polled', [True, False])

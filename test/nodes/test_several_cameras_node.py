@@ -143,11 +143,11 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
         r.image('front', 0.05 * k, view('front', 0.0))
     r.wait(lambda: len(r.found) == 3)
     assert dict(r.perception.diagnostics.counters) == {'no usable camera_info of camera left': 1}
-    told = r.problems(ahead=4.0)
-    assert 'no /left/camera_info of camera left for 4 s' in told
-    assert 'no /left/image_raw of camera left for 4 s' in told
-    assert 'no image of camera left processed for 4 s: no usable camera_info' in told
-    assert 'no image of camera front processed' not in told
+    reported = r.problems(ahead=4.0)
+    assert 'no /left/camera_info of camera left for 4 s' in reported
+    assert 'no /left/image_raw of camera left for 4 s' in reported
+    assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
+    assert 'no image of camera front processed' not in reported
     values = r.perception.diagnostics.values
     assert values['camera front'] == '640x480 plumb_bob' and 'camera left' not in values
     r.problems()

@@ -64,11 +64,11 @@ class Flock:
             Odometry, f'/{name}/odom', qos_profile_sensor_data) for name in FRAMES}
         self.sightings = self.node.create_publisher(Odometry, '/rear/neighbors', 10)
         self.words = self.node.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
-        self.heard: dict[str, list[Odometry]] = {name: [] for name in FRAMES}
+        self.states: dict[str, list[Odometry]] = {name: [] for name in FRAMES}
         self.diagnostics: dict[str, dict[str, str]] = {}
-        for name, heard in self.heard.items():
-            self.node.create_subscription(Odometry, f'/{name}/neighbors/heard', heard.append, 10)
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._told, 10)
+        for name, states in self.states.items():
+            self.node.create_subscription(Odometry, f'/{name}/neighbors/heard', states.append, 10)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._take_status, 10)
         self.wait(lambda: all(
             publisher.get_subscription_count() for publisher in self.odom.values())
             and self.sightings.get_subscription_count()
@@ -76,7 +76,7 @@ class Flock:
             and self.node.count_publishers(SHARED_TOPIC) == 3
             and self.clock.get_subscription_count() == 2)
 
-    def _told(self, message: DiagnosticArray) -> None:
+    def _take_status(self, message: DiagnosticArray) -> None:
         (status,) = message.status
         self.diagnostics[status.name] = {
             'message': status.message, **{v.key: v.value for v in status.values}}
@@ -114,7 +114,7 @@ class Flock:
             self.wait(lambda: all(node.get_clock().now().nanoseconds == self.now
                                   for node in self.sharing.values()))
 
-    def told(self, name: str) -> dict[str, str]:
+    def status(self, name: str) -> dict[str, str]:
         self.diagnostics.clear()
         self.sharing[name].diagnostics.publish()
         self.wait(lambda: f'{name}/flock' in self.diagnostics)
@@ -137,21 +137,22 @@ def flock() -> Iterator[Flock]:
 
 def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     flock.run(0.3, seeing=False)
-    assert 'nobody else talks' in flock.told('front')['message'] or (
-        'not aligned with rear' in flock.told('front')['message'])
+    assert 'no other sender' in flock.status('front')['message'] or (
+        'not aligned with rear' in flock.status('front')['message'])
     flock.run(2.5)
-    flock.wait(lambda: flock.heard['front'])
-    word = flock.heard['front'][-1]
+    flock.wait(lambda: flock.states['front'])
+    word = flock.states['front'][-1]
     assert (word.header.frame_id, word.child_frame_id) == ('odom', 'rear')
     assert to_array(word.pose.pose.position) == pytest.approx(
         flock.place('front', 'rear'), abs=0.05)
     q = word.pose.pose.orientation
     assert 2.0 * math.atan2(q.z, q.w) == pytest.approx(FRAMES['front'][0], abs=0.05)
     assert 0.0 < np.trace(np.array(word.pose.covariance).reshape(6, 6)[:3, :3]) < 0.3 ** 2
-    assert flock.heard['rear'] == []  # it sees who is in front
-    told = flock.told('front')
-    assert told['message'] == 'running' and told['frame of rear'].startswith('known to 0.')
-    assert told['vehicle_name'] == 'front' and float(told['rejected: not aligned with rear']) > 0
+    assert flock.states['rear'] == []  # it sees who is in front
+    status = flock.status('front')
+    assert status['message'] == 'running' and status['frame of rear'].startswith('known to 0.')
+    assert status['vehicle_name'] == 'front'
+    assert float(status['rejected: not aligned with rear']) > 0
 
     bad = to_odometry(nanoseconds_to_stamp(flock.now), 'front/odom', 'front', np.zeros(3),
                       quaternion_from_yaw(0.0), np.zeros(3))
@@ -165,9 +166,9 @@ def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     flock.run(0.3)
     flock.wait(lambda: counters['somebody uses my name'] == 1
                and counters['frame of a word is not unique'] == 1)
-    count = len(flock.heard['front'])
+    count = len(flock.states['front'])
     flock.run(0.3)
-    flock.wait(lambda: len(flock.heard['front']) > count)
+    flock.wait(lambda: len(flock.states['front']) > count)
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -50,7 +50,7 @@ def simulator(*parameters, namespace=''):
 
 
 @pytest.fixture(scope='module')
-def heard():
+def seen_messages():
     """Give a second of what the simulator publishes, by topic, and how it ended."""
     rclpy.init()
     node = rclpy.create_node('ear')
@@ -84,15 +84,15 @@ def stamps(messages):
     return np.array([stamp_to_nanoseconds(m.header.stamp) for m in messages])
 
 
-def test_it_ends_on_ctrl_c_without_a_traceback(heard):
-    _, code, output, errors = heard
+def test_it_ends_on_ctrl_c_without_a_traceback(seen_messages):
+    _, code, output, errors = seen_messages
     assert code == 0
     assert 'Traceback' not in output + errors
     assert 'waiting for offboard mode and planner/engage' in errors
 
 
-def test_odometry_has_a_stamp_every_10_ms(heard):
-    odometry = heard[0]['odom']
+def test_odometry_has_a_stamp_every_10_ms(seen_messages):
+    odometry = seen_messages[0]['odom']
     assert np.all(np.diff(stamps(odometry)) == 10_000_000)
     for message in odometry:
         assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
@@ -100,8 +100,8 @@ def test_odometry_has_a_stamp_every_10_ms(heard):
         assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
 
 
-def test_every_image_has_its_calibration_and_its_truth_on_the_same_stamp(heard):
-    messages = heard[0]
+def test_every_image_has_its_calibration_and_its_truth_on_the_same_stamp(seen_messages):
+    messages = seen_messages[0]
     images = stamps(messages['image_raw'])
     gaps = np.diff(images) * 30e-9
     assert np.all(np.abs(gaps - np.rint(gaps)) < 1e-6) and np.all(gaps > 0.5)
@@ -114,8 +114,8 @@ def test_every_image_has_its_calibration_and_its_truth_on_the_same_stamp(heard):
     assert {m.header.frame_id for m in messages['truth/neighbors']} == {'odom'}
 
 
-def test_images_are_mono8_and_show_the_marker_where_truth_projects(heard):
-    messages = heard[0]
+def test_images_are_mono8_and_show_the_marker_where_truth_projects(seen_messages):
+    messages = seen_messages[0]
     own, leader = (states(messages[f'truth/{name}']) for name in ('odom', 'neighbors'))
     info = messages['camera_info'][0]
     camera = CameraModel.from_calibration(

@@ -167,7 +167,7 @@ def test_it_draws_the_flight_and_nothing_while_nobody_looks(
     rig.wait(lambda: rig.visualizer.diagnostics.rate('drawn').count > count, rig.fly)
 
 
-class Heard:
+class Published:
     """Stands in for a publisher of transforms; ``sent`` are the messages."""
 
     def __init__(self) -> None:
@@ -181,33 +181,33 @@ class Heard:
 
 
 @pytest.fixture
-def tf(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Node, dict[str, Heard]]]:
+def tf(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Node, dict[str, Published]]]:
     """Give a node for which tf2_msgs is installed, and what it publishes."""
     module = ModuleType('tf2_msgs.msg')
     module.TFMessage = lambda transforms: SimpleNamespace(transforms=transforms)
     monkeypatch.setitem(sys.modules, 'tf2_msgs', ModuleType('tf2_msgs'))
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
     node = Node('visualizer')
-    heard: dict[str, Heard] = {}
+    received: dict[str, Published] = {}
     monkeypatch.setattr(node, 'create_subscription', lambda *_, **__: None)
     monkeypatch.setattr(node, 'create_publisher',
-                        lambda _, topic, __: heard.setdefault(topic, Heard()))
-    yield node, heard
+                        lambda _, topic, __: received.setdefault(topic, Published()))
+    yield node, received
     node.destroy_node()
 
 
-def test_a_transform_is_told_once_for_a_stamp(tf: tuple[Node, dict[str, Heard]]) -> None:
-    node, heard = tf
+def test_a_transform_is_told_once_for_a_stamp(tf: tuple[Node, dict[str, Published]]) -> None:
+    node, received = tf
     broadcaster = TransformBroadcaster(node, StaticChild(node), 'auto')
     pose = Transform.from_quaternion([1.0, 2.0, 3.0], quaternion_from_yaw(0.5))
     for stamp in (10**9, 10**9, 2 * 10**9):
         broadcaster.move(stamp, 'odom', 'leader', pose)
     broadcaster.move(10**9, '', 'leader', pose)
-    sent = [one for message in heard['/tf'].sent for one in message.transforms]
+    sent = [one for message in received['/tf'].sent for one in message.transforms]
     assert [one.header.stamp.sec for one in sent] == [1, 2]
     assert (sent[0].header.frame_id, sent[0].child_frame_id) == ('odom', 'leader')
-    told, turn = sent[0].transform.translation, sent[0].transform.rotation
-    assert (told.x, told.y, told.z) == (1.0, 2.0, 3.0)
+    reported, turn = sent[0].transform.translation, sent[0].transform.rotation
+    assert (reported.x, reported.y, reported.z) == (1.0, 2.0, 3.0)
     np.testing.assert_allclose(
         quaternion_to_matrix([turn.x, turn.y, turn.z, turn.w]), pose.rotation)
 
@@ -216,7 +216,7 @@ def test_a_transform_is_told_once_for_a_stamp(tf: tuple[Node, dict[str, Heard]])
     ('auto', [], True), ('auto', ['/vio'], False), ('always', ['/vio'], True),
     ('never', [], False), ('auto', ['/visualizer'], True), ('auto', ['/b/visualizer'], False)])
 def test_odom_to_base_link_is_left_to_the_odometry(
-        tf: tuple[Node, dict[str, Heard]], monkeypatch: pytest.MonkeyPatch, odom_tf: str,
+        tf: tuple[Node, dict[str, Published]], monkeypatch: pytest.MonkeyPatch, odom_tf: str,
         others: list[str], owns: bool) -> None:
     node, _ = tf
     monkeypatch.setattr(node, 'get_publishers_info_by_topic', lambda topic: [
@@ -227,22 +227,22 @@ def test_odom_to_base_link_is_left_to_the_odometry(
 
 
 def test_a_cameras_frame_that_is_told_already_is_left_alone(
-        tf: tuple[Node, dict[str, Heard]]) -> None:
-    node, heard = tf
+        tf: tuple[Node, dict[str, Published]]) -> None:
+    node, received = tf
     static = StaticChild(node)
     broadcaster = TransformBroadcaster(node, static, 'auto')
     pose = Transform(translation=np.array([0.1, 0.0, 0.0]))
     assert broadcaster.fix(0, 'base_link', 'left', pose)
     assert broadcaster.fix(0, 'base_link', 'right', pose)
     assert broadcaster.fix(0, 'base_link', 'right', pose)
-    sent = heard['/tf_static'].sent
+    sent = received['/tf_static'].sent
     assert [[one.child_frame_id for one in message.transforms] for message in sent] == [
         ['left'], ['left', 'right']]
     static.take(sent[0])  # one's own, as it comes back
     assert broadcaster.fix(0, 'base_link', 'left', pose)
-    told = sent[0].transforms[0]
-    told.child_frame_id = 'rear'
-    static.take(SimpleNamespace(transforms=[told]))
+    reported = sent[0].transforms[0]
+    reported.child_frame_id = 'rear'
+    static.take(SimpleNamespace(transforms=[reported]))
     assert not broadcaster.fix(0, 'base_link', 'rear', pose)
 
 

@@ -104,23 +104,23 @@ def test_where_rates_cease_they_are_derived_from_there_on() -> None:
         np.testing.assert_allclose(state.angular_velocity, motion(t)[3], atol=0.05)
 
 
-@pytest.mark.parametrize('told', [0.5, 0.0])
-def test_until_the_readings_differ_nothing_is_decided(told: float) -> None:
+@pytest.mark.parametrize('reported', [0.5, 0.0])
+def test_until_the_readings_differ_nothing_is_decided(reported: float) -> None:
     source = OdometrySource()
     derived = []
     for k in range(1000):
         t = 0.01 * k
         state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
                                      [0.5 * t, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0],
-                                     [told, 0.0, 0.0]), START + round(t * 1e9))
+                                     [reported, 0.0, 0.0]), START + round(t * 1e9))
         assert state is not None
         derived.append(state.derived)
         if t > 0.5:
             np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.02)
-    assert source.twist.found == ('' if told else 'none')
-    assert told == 0.0 or 'not known yet' in source.twist.describe
+    assert source.twist.found == ('' if reported else 'none')
+    assert reported == 0.0 or 'not known yet' in source.twist.describe
     # It is used as soon as the positions could contradict it, and do not; zeros are none.
-    assert derived[20:] == [told == 0.0] * 980
+    assert derived[20:] == [reported == 0.0] * 980
 
 
 def first_second(kind: Source, start: float, rate: float, seconds: float = 1.0, seed: int = 0
@@ -254,9 +254,10 @@ def test_what_is_no_motion_is_dropped_and_told() -> None:
         source.take(nowhere, START)
     assert source.take(message(0.99), START) is None
     assert source.take(message(0.9), START) is None
-    assert [reason for reason, _ in source.told()] == ['odom stamp repeated', 'odom out of order']
+    assert [reason for reason, _ in source.new_events()] == [
+        'odom stamp repeated', 'odom out of order']
     assert source.take(message(0.0), START) is not None  # a bag from its beginning
-    assert source.told() == []
+    assert source.new_events() == []
 
 
 def test_a_jump_of_the_position_is_survived_and_told() -> None:
@@ -267,7 +268,7 @@ def test_a_jump_of_the_position_is_survived_and_told() -> None:
         state = source.take(moved, START + round(0.01e9 * k))
         assert state is not None
         assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.1
-    assert [reason for reason, _ in source.told()] == ['odom jumped']
+    assert [reason for reason, _ in source.new_events()] == ['odom jumped']
 
 
 def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
@@ -289,7 +290,7 @@ def test_another_frame_begins_anew() -> None:
     other = message(3.0)
     other.header.frame_id = 'map'
     assert source.take(other, START) is not None
-    assert [reason for reason, _ in source.told()] == ['odom changed its frames']
+    assert [reason for reason, _ in source.new_events()] == ['odom changed its frames']
 
 
 def test_latency_and_period_are_told() -> None:

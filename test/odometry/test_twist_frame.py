@@ -104,8 +104,8 @@ def contradicted(after: float, speed: float = 0.7, seconds: float = 12.0) -> lis
         t = k / RATE
         velocity = np.array([speed if t < 6.0 else after, 0.0, 0.0])
         place = place + velocity / RATE
-        told = np.array([0.0, 0.0, 1.0]) if 4.0 <= t < 6.0 else velocity
-        watched.take(t, place, told, R.T @ told)  # as the child frame has it, and the header's
+        twist = np.array([0.0, 0.0, 1.0]) if 4.0 <= t < 6.0 else velocity
+        watched.take(t, place, twist, R.T @ twist)  # as the child frame has it, and the header's
         if k % round(RATE) == 0:
             found.append(watched.found)
     return found

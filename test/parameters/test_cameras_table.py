@@ -47,15 +47,15 @@ def test_one_camera_needs_no_name() -> None:
 
 
 def test_several_have_parameters_of_their_own_in_both_nodes() -> None:
-    told = values(**two(image='/left/mono', time_offset=0.01))
+    reported = values(**two(image='/left/mono', time_offset=0.01))
     for node in BOTH:
-        front, left = cameras(told[node])
+        front, left = cameras(reported[node])
         assert (front.name, front.image, front.camera_info) == (
             'front', 'front/image_raw', 'front/camera_info')
         assert (left.image, left.images('compressed')) == ('/left/mono', '/left/mono/compressed')
         assert (left.rpy, left.position, left.time_offset) == (
             [0.0, 0.0, 1.0], [0.1, 0.0, 0.0], 0.01)
-    tracker = relative_pose_table.build(told['relative_pose'])
+    tracker = relative_pose_table.build(reported['relative_pose'])
     assert list(tracker.cameras) == ['front', 'left']
     assert tracker.cameras['left'].time_offset.applied == 0.01
     # What it looks at, and the right of its image, are so on the body.
@@ -117,7 +117,7 @@ def test_relative_pose_and_planner_must_be_told_the_same() -> None:
 
 
 def test_the_example_is_taken_and_holds_all_that_a_camera_has() -> None:
-    told = read_parameters(resource('config/two_cameras.yaml'), TABLE)
+    reported = read_parameters(resource('config/two_cameras.yaml'), TABLE)
     for node, table in BOTH.items():
-        table.build(told[node])
-        assert [camera.name for camera in cameras(told[node])] == ['front', 'left']
+        table.build(reported[node])
+        assert [camera.name for camera in cameras(reported[node])] == ['front', 'left']

@@ -146,7 +146,7 @@ def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -
 PARAMETERS = {'ros__parameters': {'v_max': 0.4}}
 
 
-def told(path: Path, node: str, document: Any) -> str:
+def reported(path: Path, node: str, document: Any) -> str:
     """Return '' for silence, else how it is told and the text."""
     path.write_text(yaml.safe_dump(document, sort_keys=False))
     try:
@@ -166,13 +166,13 @@ def told(path: Path, node: str, document: Any) -> str:
 def test_a_file_passes_in_silence_where_ros_takes_something_from_it(
         tmp_path: Path, section: str, root: bool, drone: bool, node: str) -> None:
     heeded = drone if 'drone' in node else root
-    assert (told(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
+    assert (reported(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
 
 
 def test_namespaces_may_nest(tmp_path: Path) -> None:
     nested = {'drone1': {'planner': PARAMETERS, 'camera': PARAMETERS}}
-    assert told(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
-    assert 'for /drone1/planner, but none for /planner' in told(
+    assert reported(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
+    assert 'for /drone1/planner, but none for /planner' in reported(
         tmp_path / 'x.yaml', '/planner', nested)
 
 
@@ -195,7 +195,7 @@ def test_namespaces_may_nest(tmp_path: Path) -> None:
     ([], '/planner', 'warning: holds no parameters for /planner, only for no node')])
 def test_a_file_that_means_another_node_is_told(
         tmp_path: Path, sections: list[str], node: str, said: str) -> None:
-    assert told(tmp_path / 'x.yaml', node, dict.fromkeys(sections, PARAMETERS)) == said
+    assert reported(tmp_path / 'x.yaml', node, dict.fromkeys(sections, PARAMETERS)) == said
 
 
 @pytest.mark.parametrize('node', ['/relative_pose', '/planner', '/mavlink_bridge'])

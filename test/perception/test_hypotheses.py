@@ -53,7 +53,7 @@ class Course:
         """Take an image of bodies at places (3,), m, the believed first, as Tracker does."""
         self.time += DT
         taken: list[Taken] = []
-        now = self.tracks.believed.newest
+        now = self.tracks.primary.newest
         for place in places if now is None else sorted(
                 places, key=lambda place: float(np.linalg.norm(place - now.position))):
             noisy = place + np.sqrt(np.diag(NOISE)[:3]) * self.rng.standard_normal(3)
@@ -74,8 +74,8 @@ class Course:
                 for taken in self.see(place + (self.time - begin) * rate)]
 
     @property
-    def believed(self) -> Estimate:
-        newest = self.tracks.believed.newest
+    def estimate(self) -> Estimate:
+        newest = self.tracks.primary.newest
         assert newest is not None
         return newest
 
@@ -96,7 +96,7 @@ def test_of_two_at_once_the_first_taken_in_is_believed_and_both_are_tracked() ->
     newest = course.candidate.track.newest
     assert newest is not None
     np.testing.assert_allclose(newest.position, WALL, atol=0.03)
-    np.testing.assert_allclose(course.believed.position, START, atol=0.03)
+    np.testing.assert_allclose(course.estimate.position, START, atol=0.03)
     assert course.candidate.name('leader') == 'leader/duplicate'
 
 
@@ -120,7 +120,7 @@ def test_a_print_is_never_the_leader_that_was_beside_it_and_hardly_one_too_far_o
     assert outcomes(taken) == {UpdateOutcome.OUTLIER}
     back = course.see(course.leader)
     assert back[0].outcome is UpdateOutcome.STARTED
-    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.05)
+    np.testing.assert_allclose(course.estimate.position, course.leader, atol=0.05)
 
 
 def test_what_was_beside_it_is_not_taken_for_it_however_long_it_is_gone() -> None:
@@ -148,7 +148,7 @@ def test_a_restart_that_needs_more_than_its_speed_is_refused(speed: float) -> No
     gone = course.time
     course.time += PARAMS.max_gap + 0.5
     reach = speed * (course.time + DT - gone) + SLACK
-    far = course.believed.position + np.array([0.0, 1.05 * reach, 0.0])
+    far = course.estimate.position + np.array([0.0, 1.05 * reach, 0.0])
     assert outcomes(course.only(2.0, far)) == {UpdateOutcome.OUTLIER}
 
 
@@ -160,8 +160,8 @@ def test_within_reach_the_track_refused_takes_over_after_six_with_its_velocity()
     assert [each.outcome for each in taken] == [UpdateOutcome.OUTLIER] * 5 + [
         UpdateOutcome.STARTED]
     assert course.tracks.candidates == []
-    assert np.linalg.norm(course.believed.velocity - fast) < 0.4
-    assert np.sqrt(course.believed.covariance[4, 4]) < 0.3
+    assert np.linalg.norm(course.estimate.velocity - fast) < 0.4
+    assert np.sqrt(course.estimate.covariance[4, 4]) < 0.3
 
 
 def test_one_that_moves_takes_the_place_of_one_that_never_did() -> None:
@@ -171,7 +171,7 @@ def test_one_that_moves_takes_the_place_of_one_that_never_did() -> None:
     begin = course.time
     for _ in range(120):
         course.see(START, wall + (course.time - begin) * flying)
-    np.testing.assert_allclose(course.believed.position, wall + 4.0 * flying, atol=0.06)
+    np.testing.assert_allclose(course.estimate.position, wall + 4.0 * flying, atol=0.06)
     newest = course.candidate.track.newest
     assert newest is not None
     np.testing.assert_allclose(newest.position, START, atol=0.05)
@@ -184,12 +184,12 @@ def test_a_print_first_seen_within_reach_gives_way_to_the_leader_that_comes_back
     course.watch(2.0)
     course.time += unseen
     course.only(1.0, WALL)  # nothing tells that it is not the leader
-    np.testing.assert_allclose(course.believed.position, WALL, atol=0.05)
+    np.testing.assert_allclose(course.estimate.position, WALL, atol=0.05)
     back = course.watch(0.5, WALL)
     assert UpdateOutcome.STARTED in outcomes(back)
-    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+    np.testing.assert_allclose(course.estimate.position, START, atol=0.05)
     course.watch(2.0, WALL)
-    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+    np.testing.assert_allclose(course.estimate.position, START, atol=0.05)
 
 
 def test_two_that_move_do_not_change_places() -> None:
@@ -198,7 +198,7 @@ def test_two_that_move_do_not_change_places() -> None:
     begin = course.time
     for _ in range(120):
         course.see(course.leader, WALL - (course.time - begin) * np.array([0.0, 0.0, 0.4]))
-        np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
+        np.testing.assert_allclose(course.estimate.position, course.leader, atol=0.06)
 
 
 def test_a_print_seen_in_turns_with_the_leader_does_not_take_its_place() -> None:
@@ -207,7 +207,7 @@ def test_a_print_seen_in_turns_with_the_leader_does_not_take_its_place() -> None
     for _ in range(30):
         course.see(START + np.array([0.0, 0.34, 0.0]))  # within reach
         course.see(START)
-        np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+        np.testing.assert_allclose(course.estimate.position, START, atol=0.05)
 
 
 def test_a_jump_back_in_time_forgets_all() -> None:
@@ -216,4 +216,4 @@ def test_a_jump_back_in_time_forgets_all() -> None:
     course.time = 0.0
     course.see(course.leader)
     assert course.tracks.candidates == []
-    assert course.believed.stamp == DT
+    assert course.estimate.stamp == DT

@@ -55,7 +55,7 @@ class Rig:
         self.time = 0
         self.own, self.leader = np.zeros(3), np.array([2.0, 0.3, 0.2])
         self.velocity = np.zeros(3)
-        self.told: list[tuple[float, float, float]] = []  # time, error of distance, its deviation
+        self.found: list[tuple[float, float, float]] = []  # time, error of distance, its deviation
 
     def fly(self, seconds: float, seen: bool, acceleration: tuple[float, ...] = (0.0, 0.0, 0.0)
             ) -> None:
@@ -83,7 +83,7 @@ class Rig:
             found = outcome.estimate
             sight = found.position - self.own
             along = sight / np.linalg.norm(sight)
-            self.told.append((t, float(np.linalg.norm(sight) - math.dist(self.leader, self.own)),
+            self.found.append((t, float(np.linalg.norm(sight) - math.dist(self.leader, self.own)),
                               math.sqrt(along @ found.covariance[:3, :3] @ along)))
             self.last = found
 
@@ -92,7 +92,7 @@ def test_in_sight_nothing_is_told_the_bias_is_learnt_and_the_filter_untouched() 
     with_ranges, without = Rig(bias=0.25), NeighborFilter()
     with_ranges.fly(10.0, seen=True)
     rng = np.random.default_rng(0)
-    assert with_ranges.told == []
+    assert with_ranges.found == []
     bias = with_ranges.ranging.biases['leader']
     assert bias.value[0] == pytest.approx(0.25, abs=0.06)
     assert without.newest is None and rng is not None
@@ -106,7 +106,7 @@ def test_through_5_s_out_of_sight_the_distance_stays_known(seed: int) -> None:
     rig.fly(1.0, True, (0.3, 0.1, 0.0))
     rig.fly(2.0, False, (-0.4, 0.2, 0.0))  # turns back unseen
     rig.fly(3.0, False)
-    errors = np.array(rig.told)
+    errors = np.array(rig.found)
     assert errors[0, 0] == pytest.approx(11.0 + UNSEEN, abs=0.1)
     assert len(errors) > 75  # most of 20 Hz over 4.5 s
     assert np.abs(errors[-1, 1]) < 0.2
@@ -181,8 +181,8 @@ def test_a_range_waits_for_its_odometry() -> None:
     for t in (2.02, 2.04):
         rig.odometry.add(OdometrySample(t, rig.own, quaternion_from_yaw(0.0), np.zeros(3),
                                         np.zeros(3)))
-    told = list(rig.ranging.due(lambda _, t: t))
-    assert [outcome.stamp for outcome in told if isinstance(outcome, Ranged)] == [2_030_000_000]
+    found = list(rig.ranging.due(lambda _, t: t))
+    assert [outcome.stamp for outcome in found if isinstance(outcome, Ranged)] == [2_030_000_000]
 
 
 def test_a_distance_corrects_what_is_along_the_line_only() -> None:

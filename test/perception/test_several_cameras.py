@@ -103,7 +103,7 @@ def flown(pose: Transform, stamp: float, velocity: Array) -> Transform:
     return Transform(pose.rotation, pose.translation + stamp * velocity)
 
 
-class Told(NamedTuple):
+class Report(NamedTuple):
     stamp: float
     camera: str
     off: Array  # m, from where it is
@@ -117,7 +117,7 @@ def test_a_neighbour_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
     drone, start = Drone(front=FRONT, left=LEFT), Transform.from_quaternion(
         ahead(2.3, -0.5, 0.4).translation, quaternion_from_yaw(-0.25))
     velocity = FLYING + np.array([0.0, 0.9, 0.0])
-    told: list[Told] = []
+    reported: list[Report] = []
     for k in range(60):
         found = set()
         for camera, stamp in (('front', 0.05 * k), ('left', 0.05 * k + later)):
@@ -126,14 +126,14 @@ def test_a_neighbour_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
             assert sighting.rejections == []
             for estimate in sighting.estimates.values():
                 found.add(camera)
-                told.append(Told(stamp, camera, estimate.position - leader.translation,
+                reported.append(Report(stamp, camera, estimate.position - leader.translation,
                                  estimate.velocity))
         assert found, f'nobody in sight at {0.05 * k:.2f} s'
-    cameras = [one.camera for one in told]
+    cameras = [one.camera for one in reported]
     assert cameras[:5] == ['front'] * 5 and cameras[-5:] == ['left'] * 5
     both = sum(a != b for a, b in pairwise(cameras))
     assert both > 4, 'in the overlap both see it'
-    settled = [one for one in told if one.stamp > 0.7]
+    settled = [one for one in reported if one.stamp > 0.7]
     assert max(np.abs(one.off).max() for one in settled) < 0.008
     assert max(np.abs(one.velocity - velocity).max() for one in settled) < 0.06
     for a, b in pairwise(settled):

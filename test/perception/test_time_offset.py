@@ -153,4 +153,4 @@ def test_what_is_known_and_applied_is_told_in_words() -> None:
     flown(0.02, 4.0, found)
     assert found.describe.startswith(('19.', '20.'))
     assert found.describe.endswith(' ms, applied')
-    assert TimeOffset(0.012, fixed=True).describe == '12.0 ms, as told'
+    assert TimeOffset(0.012, fixed=True).describe == '12.0 ms, as configured'

@@ -60,9 +60,9 @@ CASES.update({name: case._replace(recall=0.95, velocity=0.075) for name, case in
 def evaluated(case: Case, folder: Path) -> tuple[Evaluation, dict[str, Any]]:
     bag = rewritten_bag(BAG, folder / 'bag', case.source, case.offset, case.jitter)
     values = read_parameters(resource('config/follower.yaml'), TABLE)
-    told = parse_parameters({'/**': {'ros__parameters': case.source.parameters}}, TABLE)
+    reported = parse_parameters({'/**': {'ros__parameters': case.source.parameters}}, TABLE)
     for node in values:
-        values[node].update({name: told[node][name] for name in case.source.parameters})
+        values[node].update({name: reported[node][name] for name in case.source.parameters})
     evaluation = evaluate(bag, values, folder / 'result.mcap')
     return evaluation, evaluation_figures(evaluation)
 

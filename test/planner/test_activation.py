@@ -35,14 +35,14 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory, NONE
 from flock_follower.planner.modes import (
     ACTIVE,
-    believed,
+    BRIDGE_STATES,
     BridgeState,
+    effective_state,
     INACTIVE,
     NO_AUTOPILOT,
     parse,
     SILENCE,
     State,
-    WORDS,
 )
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
@@ -52,7 +52,7 @@ START = 1_700_000_000 * 10**9  # ns
 TICK = 100_000_000  # ns
 
 
-@pytest.mark.parametrize(('text', 'word', 'reason'), [
+@pytest.mark.parametrize(('text', 'name', 'reason'), [
     ('ACTIVE', 'ACTIVE', ''),
     ('ACTIVE: ', 'ACTIVE', ''),
     ('ACTIVE:flying', 'ACTIVE', 'flying'),
@@ -61,8 +61,8 @@ TICK = 100_000_000  # ns
     ('NO_AUTOPILOT\n: none\theard\n', 'NO_AUTOPILOT', 'none heard'),
     ('INACTIVE: ' + 'x' * 999, 'INACTIVE', 'x' * 200),
 ])
-def test_a_word_and_its_reason_are_read(text: str, word: str, reason: str) -> None:
-    assert parse(text) == BridgeState(word, reason)
+def test_a_word_and_its_reason_are_read(text: str, name: str, reason: str) -> None:
+    assert parse(text) == BridgeState(name, reason)
 
 
 @pytest.mark.parametrize('text', [
@@ -70,27 +70,27 @@ def test_a_word_and_its_reason_are_read(text: str, word: str, reason: str) -> No
     'NOT ACTIVE', '\0ACTIVE', 'ÀCTIVE'])
 def test_what_it_does_not_know_counts_as_inactive_and_is_shown(text: str) -> None:
     state = parse(text)
-    assert state.word == INACTIVE
+    assert state.name == INACTIVE
     assert repr(text) in state.reason
 
 
 @given(st.text())
 def test_any_text_is_read_as_one_of_the_words(text: str) -> None:
     state = parse(text)
-    assert state.word in WORDS
+    assert state.name in BRIDGE_STATES
     assert len(str(state).splitlines()) == 1
-    assert (state.word != ACTIVE) or text.split(':')[0].split()[0] == 'ACTIVE'
+    assert (state.name != ACTIVE) or text.split(':')[0].split()[0] == 'ACTIVE'
 
 
-@pytest.mark.parametrize(('said', 'age', 'word'), [
+@pytest.mark.parametrize(('reported', 'age', 'name'), [
     (None, 0.0, NO_AUTOPILOT), (None, math.inf, NO_AUTOPILOT),
     (BridgeState(ACTIVE), 0.0, ACTIVE), (BridgeState(ACTIVE), SILENCE, ACTIVE),
     (BridgeState(ACTIVE), 1.001, NO_AUTOPILOT), (BridgeState(ACTIVE), math.inf, NO_AUTOPILOT),
     (BridgeState(ACTIVE), math.nan, NO_AUTOPILOT),
     (BridgeState('READY', 'x'), 0.5, 'READY'), (BridgeState('READY', 'x'), 1.5, NO_AUTOPILOT)])
-def test_a_bridge_that_is_silent_is_none(said: BridgeState | None, age: float,
-                                         word: str) -> None:
-    assert believed(said, age).word == word
+def test_a_bridge_that_is_silent_is_none(reported: BridgeState | None, age: float,
+                                         name: str) -> None:
+    assert effective_state(reported, age).name == name
 
 
 class Flight:
@@ -125,10 +125,10 @@ class Flight:
                 empty, self.now, 'odom', 'leader', (distance, 0.0, self.height),
                 IDENTITY_QUATERNION, (speed, 0.0, 0.0))))
 
-    def tick(self, hears: bool = True) -> tuple[Decision, Command | None]:
+    def tick(self, receives: bool = True) -> tuple[Decision, Command | None]:
         """Pass a tenth of a second, in which the bridge repeats itself, or falls silent."""
         self.now += TICK
-        self.silent = 0.0 if hears and math.isfinite(self.silent) else self.silent + 0.1
+        self.silent = 0.0 if receives and math.isfinite(self.silent) else self.silent + 0.1
         self.sense()
         return self.loop.tick(self.now, PARAMS, self.silent)
 
@@ -292,15 +292,16 @@ def test_where_no_bridge_is_required_engaging_is_enough(text: str | None) -> Non
 
 EVENTS = st.one_of(
     st.just('tick'), st.just('silence'), st.booleans(),
-    st.sampled_from([*WORDS, 'ACTIVE: x', 'READY: x', '', 'active']).map(lambda word: (word,)),
-    st.sampled_from([*['ACTIVE'] * 3, 'READY']).map(lambda word: (word,)))
+    st.sampled_from([*BRIDGE_STATES, 'ACTIVE: x', 'READY: x', '', 'active']).map(
+        lambda name: (name,)),
+    st.sampled_from([*['ACTIVE'] * 3, 'READY']).map(lambda name: (name,)))
 
 
 @settings(max_examples=200)
 @given(st.lists(EVENTS, max_size=40))
 def test_no_command_comes_unless_engaged_and_active_and_fresh(
         events: list[str | bool | tuple[str]]) -> None:
-    flight, engaged, word, silent = Flight(), False, '', math.inf
+    flight, engaged, name, silent = Flight(), False, '', math.inf
     anew = True
     for event in [*events, 'tick']:
         if isinstance(event, bool):
@@ -308,19 +309,19 @@ def test_no_command_comes_unless_engaged_and_active_and_fresh(
             engaged = event
         elif isinstance(event, tuple):
             flight.bridge(*event)
-            before, word, silent = word, event[0].split(':')[0], 0.0
-            engaged &= word != 'TAKEN_OVER' or before == 'TAKEN_OVER'
+            before, name, silent = name, event[0].split(':')[0], 0.0
+            engaged &= name != 'TAKEN_OVER' or before == 'TAKEN_OVER'
         elif event == 'silence':
             flight.silent += 0.7
             silent += 0.7
         else:
             silent += 0.1
-            decision, command = flight.tick(hears=False)
-            active = engaged and word == 'ACTIVE' and silent <= SILENCE
+            decision, command = flight.tick(receives=False)
+            active = engaged and name == 'ACTIVE' and silent <= SILENCE
             assert (command is not None) == active == (decision.state is not State.IDLE)
             if active and anew:
                 assert flight.held == flight.height
             anew = False
-        if not (engaged and word == 'ACTIVE' and silent <= SILENCE):
+        if not (engaged and name == 'ACTIVE' and silent <= SILENCE):
             anew = True
             flight.height += 0.01

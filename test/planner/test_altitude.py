@@ -27,7 +27,12 @@ import pytest
 
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.vertical_yaw import Altitude, CLIMB_ACCELERATION, INSIDE, LIFT_MAX
+from flock_follower.planner.vertical_yaw import (
+    Altitude,
+    CLIMB_ACCELERATION,
+    INSIDE,
+    THRUST_BIAS_MAX,
+)
 
 PARAMS = PlannerParams()
 PERIOD = PARAMS.period
@@ -37,10 +42,10 @@ def me(z: float, climb: float = 0.0) -> OwnState:
     return OwnState(0.0, np.array([0.0, 0.0, z]), np.array([0.0, 0.0, climb]), 0.0)
 
 
-def leader(z: float, climb: float = 0.0, lift: float | None = None) -> Neighbor:
+def leader(z: float, climb: float = 0.0, rising: float | None = None) -> Neighbor:
     return Neighbor(
         'leader', 0.0, np.array([2.0, 0.0, z]), np.array([0.0, 0.0, climb]),
-        acceleration=None if lift is None else np.array([0.0, 0.0, lift]))
+        acceleration=None if rising is None else np.array([0.0, 0.0, rising]))
 
 
 def followed(altitude: Altitude, it: Neighbor | None, seconds: float,
@@ -177,22 +182,22 @@ def test_the_integral_does_not_wind_up_on_a_long_way() -> None:
 
 
 def test_the_thrust_correction_is_bounded_and_does_not_wind_up() -> None:
-    for height, lift in ((1.6, 1.2), (9.0, 0.0)):  # near, and so far off that limits act
+    for height, thrust_bias in ((1.6, 1.2), (9.0, 0.0)):  # near, and so far off that limits act
         altitude = Altitude(2.0, 0.0, 10.0)
         for _ in range(100):
             altitude, _ = altitude.controlled(me(height), PARAMS, PERIOD)
-        assert altitude.lift == lift
+        assert altitude.thrust_bias == thrust_bias
 
 
 @given(st.floats(-1e308, 1e308), st.floats(-50.0, 50.0), st.floats(-1e308, 1e308),
        st.floats(-1.0, 1.0), st.floats(0.0, 0.2))
 def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held: float,
-                                                    lift: float, elapsed: float) -> None:
-    altitude, vertical = Altitude(held, 0.0, 10.0, 0.3, lift).controlled(
+                                                    thrust_bias: float, elapsed: float) -> None:
+    altitude, vertical = Altitude(held, 0.0, 10.0, 0.3, thrust_bias).controlled(
         me(z, climb), PARAMS, elapsed)
-    assert abs(vertical) <= PARAMS.max_vertical_acceleration + LIFT_MAX
+    assert abs(vertical) <= PARAMS.max_vertical_acceleration + THRUST_BIAS_MAX
     assert abs(vertical) <= PARAMS.a_max
-    assert abs(altitude.lift) <= LIFT_MAX
+    assert abs(altitude.thrust_bias) <= THRUST_BIAS_MAX
 
 
 @pytest.mark.parametrize('count', [2, 12])

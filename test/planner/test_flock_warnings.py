@@ -26,33 +26,33 @@ from flock_follower.planner.step import step
 FOUR = {'leader': Member(), 'a': Member('follower'), 'b': Member('follower'),
         'tower': Member('avoid')}
 PARAMS = PlannerParams(vehicles=FOUR)
-NOT_KEPT_CLEAR = ' neither seen nor heard of, and not kept clear of'
-CAMERA = ': not a formation for what its cameras see; more of them, or words, would help'
+NOT_KEPT_CLEAR = ' neither seen nor received, not kept clear of'
+CAMERA = ': more cameras or flock messages are needed for this formation'
 PLACES = {'leader': (2.0, 0.0, 2.0), 'a': (1.0, 1.8, 2.0), 'b': (0.0, -2.1, 2.0)}
 
 
-def told(memory: Memory, now: float, seen: str = '', heard: str = '',
+def reported(memory: Memory, now: float, seen: str = '', received: str = '',
          params: PlannerParams = PARAMS) -> tuple[Memory, tuple[str, ...]]:
     """Take one step with those seen and heard, by their first letters."""
-    estimates = [Neighbor(name, now, np.array(place), np.zeros(3), heard=name[0] in heard)
-                 for name, place in PLACES.items() if name[0] in seen + heard]
+    estimates = [Neighbor(name, now, np.array(place), np.zeros(3), received=name[0] in received)
+                 for name, place in PLACES.items() if name[0] in seen + received]
     memory, decision = step(memory, now, True, OwnState(now, np.array([0.0, 0.0, 2.0]),
                                                         np.zeros(3), 0.0), estimates, params)
     return memory, decision.warnings
 
 
 def test_who_flies_along_and_is_known_of_by_nothing_is_told() -> None:
-    assert told(Memory(), 0.0, seen='lab')[1] == ()
-    assert told(Memory(), 0.0, seen='l', heard='ab')[1] == ()
-    assert told(Memory(), 0.0, seen='l')[1] == ('a, b' + NOT_KEPT_CLEAR + CAMERA,)
-    assert told(Memory(), 0.0, seen='l', heard='a')[1] == ('b' + NOT_KEPT_CLEAR,)
+    assert reported(Memory(), 0.0, seen='lab')[1] == ()
+    assert reported(Memory(), 0.0, seen='l', received='ab')[1] == ()
+    assert reported(Memory(), 0.0, seen='l')[1] == ('a, b' + NOT_KEPT_CLEAR + CAMERA,)
+    assert reported(Memory(), 0.0, seen='l', received='a')[1] == ('b' + NOT_KEPT_CLEAR,)
 
 
 def test_who_was_there_is_missed_once_it_is_not_kept_clear_of_any_more() -> None:
     params = PlannerParams(resume_timeout=5.0)
-    memory, _ = told(Memory(), 0.0, seen='la', params=params)
+    memory, _ = reported(Memory(), 0.0, seen='la', params=params)
     missed = []
     for tick in range(1, 70):
-        memory, warnings = told(memory, 0.1 * tick, seen='l', params=params)
+        memory, warnings = reported(memory, 0.1 * tick, seen='l', params=params)
         missed.append('a' + NOT_KEPT_CLEAR + CAMERA in warnings)
     assert missed == [False] * 20 + [True] * 30 + [False] * 19

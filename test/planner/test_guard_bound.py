@@ -60,9 +60,9 @@ def least_gap(unknown: float, delay: float, velocity_error: float, range_error: 
     own, least = 0.0, math.inf
     for tick in range(300):
         pending = PERIOD * sum((a[0] for a in queue), 0.0)
-        told = distance + side * range_error
+        reported = distance + side * range_error
         closing = rate + side * velocity_error - pending
-        found = radial_bounds(-told * AHEAD, -closing * AHEAD, BAND, PARAMS)
+        found = radial_bounds(-reported * AHEAD, -closing * AHEAD, BAND, PARAMS)
         queue.append(guard(side * 5.0 * AHEAD, np.zeros(3), ordered(found), 20.0, 90.0,
                            PERIOD).acceleration)
         acceleration = queue.popleft()

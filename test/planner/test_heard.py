@@ -28,10 +28,10 @@ from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 
-def told(stamp: float, x: float = 2.0, heard: bool = True, name: str = 'leader',
+def reported(stamp: float, x: float = 2.0, received: bool = True, name: str = 'leader',
          variance: float = 0.0, speed: float = 0.0) -> Neighbor:
     return seen(stamp, (x, 0.0, 2.0), (speed, 0.0, 0.0), name,
-                position_covariance=variance * np.eye(3), heard=heard)
+                position_covariance=variance * np.eye(3), received=received)
 
 
 def decide(memory: Memory, now: float, *neighbors: Neighbor,
@@ -44,17 +44,17 @@ def place(memory: Memory, name: str = 'leader') -> float:
 
 
 def test_who_is_seen_freshly_is_never_replaced_by_what_is_heard() -> None:
-    memory, _ = decide(Memory(), 0.0, told(0.0, 2.0, heard=False))
-    memory, decision = decide(memory, 0.3, told(0.3, 2.4))
+    memory, _ = decide(Memory(), 0.0, reported(0.0, 2.0, received=False))
+    memory, decision = decide(memory, 0.3, reported(0.3, 2.4))
     assert place(memory) == 2.0 and decision.rejected == ()
-    memory, decision = decide(memory, 0.51, told(0.5, 2.4))
+    memory, decision = decide(memory, 0.51, reported(0.5, 2.4))
     assert place(memory) == 2.4 and decision.state is State.TRACK
 
 
 @pytest.mark.parametrize('x', [2.1, 4.0])  # a little, and a jump
 def test_eyes_beat_words_at_once_even_newer_ones(x: float) -> None:
-    memory, _ = decide(Memory(), 0.1, told(0.1, 2.0))
-    memory, decision = decide(memory, 0.2, told(0.05, x, heard=False))
+    memory, _ = decide(Memory(), 0.1, reported(0.1, 2.0))
+    memory, decision = decide(memory, 0.2, reported(0.05, x, received=False))
     assert place(memory) == x and decision.rejected == ()
     assert set(memory.flock) == {'leader'}  # nobody at the place that was only told
 
@@ -62,25 +62,25 @@ def test_eyes_beat_words_at_once_even_newer_ones(x: float) -> None:
 def test_words_are_used_up_to_their_own_age() -> None:
     memory, states = Memory(), []
     for tick in range(14):
-        memory, decision = decide(memory, 0.1 * tick, *([told(0.0)] if tick == 0 else []))
+        memory, decision = decide(memory, 0.1 * tick, *([reported(0.0)] if tick == 0 else []))
         states.append(decision.state)
     assert states == [State.TRACK] * 11 + [State.COAST] * 3
-    late = decide(Memory(), 1.2, told(0.1))[1]
+    late = decide(Memory(), 1.2, reported(0.1))[1]
     assert late.state is State.SEARCH
     assert [r.reason for r in late.rejected] == ['heard estimate too old']
 
 
-@pytest.mark.parametrize(('seen', 'heard', 'state', 'reason'), [
-    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'nobody seen'),
-    (0.6, 0.9, State.TRACK, 'nobody seen'), (None, 1.1, State.COAST, 'no neighbor seen')])
-def test_the_state_says_whether_somebody_is_seen(seen: float | None, heard: float | None,
+@pytest.mark.parametrize(('seen', 'received', 'state', 'reason'), [
+    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'no neighbor in sight'),
+    (0.6, 0.9, State.TRACK, 'no neighbor in sight'), (None, 1.1, State.COAST, 'no neighbor seen')])
+def test_the_state_says_whether_somebody_is_seen(seen: float | None, received: float | None,
                                                  state: State, reason: str) -> None:
-    now, why = next_state(True, '', seen, 1.1, PARAMS, heard=heard)
+    now, why = next_state(True, '', seen, 1.1, PARAMS, received=received)
     assert now is state and why.startswith(reason) and bool(why) == bool(reason)
 
 
 def command(variance: float) -> Array:
-    decision = decide(Memory(), 0.0, told(0.0, 1.6, variance=variance, speed=-0.1))[1]
+    decision = decide(Memory(), 0.0, reported(0.0, 1.6, variance=variance, speed=-0.1))[1]
     assert decision.acceleration is not None
     return decision.acceleration
 
@@ -89,24 +89,24 @@ def test_the_less_sure_a_word_the_farther_away_it_stays() -> None:
     pushed = [command(variance)[0] for variance in (0.0, 0.02, 0.04, 0.08)]
     assert pushed[0] > -0.3
     assert np.all(np.diff(pushed) < 0.0) and pushed[-1] < -1.0
-    refused = decide(Memory(), 0.0, told(0.0, variance=0.09))[1]
+    refused = decide(Memory(), 0.0, reported(0.0, variance=0.09))[1]
     assert [r.reason for r in refused.rejected] == ['heard estimate too uncertain']
 
 
 def test_one_heard_is_kept_clear_of_beside_one_that_is_seen() -> None:
-    near = seen(0.0, (0.0, 1.1, 2.0), (0.0, -0.2, 0.0), 'follower_2', heard=True)
-    decision = decide(Memory(), 0.0, told(0.0, 2.0, heard=False), near)[1]
+    near = seen(0.0, (0.0, 1.1, 2.0), (0.0, -0.2, 0.0), 'follower_2', received=True)
+    decision = decide(Memory(), 0.0, reported(0.0, 2.0, received=False), near)[1]
     assert decision.acceleration is not None and decision.acceleration[1] < -1.0
     assert 'separation' in decision.limits and decision.reason == ''
     known = {each.name: each for each in decision.known}
-    assert (known['leader'].heard, known['follower_2'].heard) == (False, True)
-    assert (known['leader'].who.role, known['follower_2'].who.role) == ('leader', 'follower')
+    assert (known['leader'].received, known['follower_2'].received) == (False, True)
+    assert (known['leader'].member.role, known['follower_2'].member.role) == ('leader', 'follower')
 
 
 def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
     params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
-    ahead = told(0.0, 2.0, heard=False, name='follower_2')
-    aside = seen(0.0, (0.0, 2.0, 2.0), heard=True)
+    ahead = reported(0.0, 2.0, received=False, name='follower_2')
+    aside = seen(0.0, (0.0, 2.0, 2.0), received=True)
     memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
     assert memory.faced == 'follower_2' and decision.yaw == pytest.approx(0.0)
     memory, decision = decide(Memory(), 0.0, aside, params=params)

@@ -187,7 +187,7 @@ def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
 
 
 def near(position: list[float], velocity: list[float], radius: float = 0.0) -> Neighbor:
-    return seen(0.0, position, velocity, who=Member(radius=radius))
+    return seen(0.0, position, velocity, member=Member(radius=radius))
 
 
 OWN = own(0.0, np.zeros(3))

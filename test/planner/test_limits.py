@@ -173,18 +173,18 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
 
 @given(st.integers(0, 2 ** 32))
 def test_what_keeps_clear_of_a_neighbor_is_cut_last(seed: int) -> None:
-    """No sampled acceleration within the limits keeps more of what is wanted along ``away``."""
+    """No sampled acceleration within the limits keeps more of what is wanted along ``axis``."""
     rng = np.random.default_rng(seed)
-    v, wanted, away = rng.uniform(-0.4, 0.4, 3), rng.uniform(-4.0, 4.0, 3), rng.normal(size=3)
-    away = away / np.linalg.norm(away)
+    v, wanted, axis = rng.uniform(-0.4, 0.4, 3), rng.uniform(-4.0, 4.0, 3), rng.normal(size=3)
+    axis = axis / np.linalg.norm(axis)
     if seed % 4 == 0:
-        v = rng.uniform(-0.6, 0.6) * away  # the centres and the direction on one line
-    a = limit_command(wanted, v, A_MAX, V_MAX, T, away).acceleration
+        v = rng.uniform(-0.6, 0.6) * axis  # the centres and the direction on one line
+    a = limit_command(wanted, v, A_MAX, V_MAX, T, axis).acceleration
     fastest = max(V_MAX, float(np.linalg.norm(v)))
     assert np.linalg.norm(a) <= A_MAX and np.linalg.norm(v + T * a) <= fastest
     samples = np.vstack([rng.uniform(-A_MAX, A_MAX, (3000, 3)),
                          a + 0.1 * rng.normal(size=(3000, 3))])
     inside = samples[(np.linalg.norm(samples, axis=1) <= A_MAX)
                      & (np.linalg.norm(v + T * samples, axis=1) <= fastest)]
-    kept = min(float(away @ wanted), float((inside @ away).max()))
-    assert away @ a >= kept - 1e-5 or away @ wanted <= 0.0
+    kept = min(float(axis @ wanted), float((inside @ axis).max()))
+    assert axis @ a >= kept - 1e-5 or axis @ wanted <= 0.0

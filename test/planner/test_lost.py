@@ -93,13 +93,13 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
     assert spreads == pytest.approx(reached * (np.maximum(blind, 0.0) - 0.5 * reached))
 
 
-@pytest.mark.parametrize(('told', 'least', 'most'), [(0.1, 0.0, 0.001), (0.35, 0.17, 0.18),
+@pytest.mark.parametrize(('reported', 'least', 'most'), [(0.1, 0.0, 0.001), (0.35, 0.17, 0.18),
                                                      (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
-def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(told: float, least: float,
+def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(reported: float, least: float,
                                                                      most: float) -> None:
-    believed = expected(seen(), np.array([0.0, -told, 0.0]), 0.1, PARAMS).acceleration
-    assert least <= -believed[1] <= most
-    assert believed[0] == believed[2] == 0.0
+    estimated = expected(seen(), np.array([0.0, -reported, 0.0]), 0.1, PARAMS).acceleration
+    assert least <= -estimated[1] <= most
+    assert estimated[0] == estimated[2] == 0.0
 
 
 def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> None:

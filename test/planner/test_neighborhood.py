@@ -38,11 +38,11 @@ def own(position: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> OwnState:
     return OwnState(0.0, np.array(position), np.zeros(3), 0.0)
 
 
-def at(name: str, *position: float, heard: bool = False, role: str = '',
+def at(name: str, *position: float, received: bool = False, role: str = '',
        radius: float = 0.0) -> Neighbor:
-    role = role or (FOLLOWER if heard else LEADER)
-    return Neighbor(name, 0.0, np.array(position), np.zeros(3), heard=heard,
-                    who=Member(role, radius))
+    role = role or (FOLLOWER if received else LEADER)
+    return Neighbor(name, 0.0, np.array(position), np.zeros(3), received=received,
+                    member=Member(role, radius))
 
 
 def chosen(places: Array, held: Sequence[set[str]] | None = None) -> list[set[str]]:
@@ -106,7 +106,7 @@ def test_an_edge_goes_when_somebody_is_clearly_nearer_to_both(nearer: float, kep
 
 def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> None:
     leader = at('leader', 3.0, 0.0, 0.0)
-    between = at('follower_2', 1.5, 0.0, 0.0, heard=True)
+    between = at('follower_2', 1.5, 0.0, 0.0, received=True)
     assert edges(set(), own(), [leader, between], PARAMS) == {'leader', 'follower_2'}
     other = at('follower_3', -2.0, 0.0, 0.0, role=FOLLOWER)
     assert edges(set(), own(), [leader, between, other], PARAMS) == {'follower_2', 'follower_3'}

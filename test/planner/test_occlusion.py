@@ -57,8 +57,8 @@ def test_without_a_calibration_or_by_hearsay_nothing_is_occluded() -> None:
     images = frames(0.8, 0.9, 1.0)
     assert occlusion(None, leader(0.7), ME, images, (), 0.0) is None
     assert occlusion(None, None, ME, images, VIEW, 0.0) is None
-    told = seen(0.7, heard=True)
-    assert occlusion(None, told, ME, images, VIEW, 0.0) is None
+    reported = seen(0.7, received=True)
+    assert occlusion(None, reported, ME, images, VIEW, 0.0) is None
 
 
 def test_three_detections_in_a_row_end_it() -> None:

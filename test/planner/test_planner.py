@@ -457,12 +457,12 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, cou
         now += float(rng.choice([0.1] * 15 + [0.7, 3.0, -0.05, -8.0]))
         engaged = rng.random() < 0.95
         me = own(*draw_state(rng, now)) if rng.random() < 0.8 else None
-        around = [leader(*draw_state(rng, now), name, heard=rng.random() < 0.3,
+        around = [leader(*draw_state(rng, now), name, received=rng.random() < 0.3,
                          position_covariance=np.eye(3) * float(rng.choice([0.0, 1e-4, math.nan])))
                   for name in roles if rng.random() < 0.5]
         memory, decision = step(memory, now, engaged, me, around, params)
         assert {*decision.edges} <= {name for name, n in memory.neighbors.items()
-                                     if n.who.role != AVOID}
+                                     if n.member.role != AVOID}
         assert engaged or decision.state is State.IDLE
         if decision.acceleration is None:
             assert decision.yaw is None
@@ -520,13 +520,13 @@ def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clea
     for tick in range(1, 4):
         memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),
                          [leader(0.1 * tick, (2.0 - 0.2 * tick, 0.0, 2.0))], PARAMS)
-    away = (5.0, 0.0, 2.0)
-    memory, decision = step(memory, 0.4, True, own(0.4), [leader(0.4, away)], PARAMS)
+    far = (5.0, 0.0, 2.0)
+    memory, decision = step(memory, 0.4, True, own(0.4), [leader(0.4, far)], PARAMS)
     assert [r.reason for r in decision.rejected] == ['estimate jumped']
     for tick in range(5, 12):  # the old one ages out, the new one is followed
         now = 0.1 * tick
-        memory, decision = step(memory, now, True, own(now), [leader(now, away)], PARAMS)
-    assert memory.neighbors['leader'].position == pytest.approx(away)
+        memory, decision = step(memory, now, True, own(now), [leader(now, far)], PARAMS)
+    assert memory.neighbors['leader'].position == pytest.approx(far)
     assert memory.flock['leader before'].position[0] == pytest.approx(here[0], abs=0.3)
 
 

@@ -88,7 +88,7 @@ def test_the_command_is_short_and_changes_slowly(level, vertical, last):
 
 @pytest.mark.parametrize(('seen', 'own_age', 'reason'), [
     ([leader(5.0, age=0.51)], 0.0, 'no neighbor in sight'), ([], 0.0, 'no neighbor in sight'),
-    ([leader(5.0)._replace(heard=True)], 0.0, 'no neighbor in sight'),
+    ([leader(5.0)._replace(received=True)], 0.0, 'no neighbor in sight'),
     ([leader(5.0, name='leader/duplicate')], 0.0, 'no neighbor in sight'),
     ([leader(5.0)], 0.31, '0.31 s old')])
 def test_without_the_marker_or_the_attitude_nothing_is_commanded(seen, own_age, reason):

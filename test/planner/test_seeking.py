@@ -28,15 +28,15 @@ PARAMS = PlannerParams(resume_timeout=12.0, vehicles={
 PLACES = {'leader': (2.0, 0.0, 2.0), 'behind': (-1.9, 0.0, 2.0), 'ahead': (2.0, 0.0, 2.0)}
 
 
-def fly(seconds: float, in_sight: str, heard: str, follower: Follower | None = None
+def fly(seconds: float, in_sight: str, received: str, follower: Follower | None = None
         ) -> tuple[Follower, list[Decision]]:
     """Hover with those seen and heard around, the nose where it is commanded to be."""
     follower, decisions = follower or Follower(PARAMS), []
     for _ in range(round(seconds / 0.1)):
         follower.position, follower.velocity = np.array([0.0, 0.0, 2.0]), np.zeros(3)
         decisions.append(follower.tick(*(
-            seen(follower.now, PLACES[name], name=name, heard=name in heard.split())
-            for name in (*in_sight.split(), *heard.split()))))
+            seen(follower.now, PLACES[name], name=name, received=name in received.split())
+            for name in (*in_sight.split(), *received.split()))))
     return follower, decisions
 
 
@@ -67,13 +67,14 @@ def test_one_that_comes_into_view_meanwhile_does_not_end_it() -> None:
     assert not follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 0.05
 
 
-@pytest.mark.parametrize(('in_sight', 'heard', 'then_seen', 'then_heard'), [
+@pytest.mark.parametrize(('in_sight', 'received', 'then_seen', 'then_received'), [
     ('leader behind', '', 'behind', ''),  # another one is in view: it stays with that
     ('leader', 'behind', '', 'leader behind'),  # it is heard of
     ('ahead', 'behind', '', 'behind'),  # whoever talks will be heard of again
     ('', 'leader behind', '', 'behind')])  # never seen: others know better where it was
-def test_it_does_not_look_for(in_sight: str, heard: str, then_seen: str, then_heard: str) -> None:
-    follower, _ = fly(1.0, in_sight, heard)
-    follower, decisions = fly(3.0, then_seen, then_heard, follower)
+def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
+                              then_received: str) -> None:
+    follower, _ = fly(1.0, in_sight, received)
+    follower, decisions = fly(3.0, then_seen, then_received, follower)
     assert not follower.memory.looking
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)

@@ -82,7 +82,7 @@ def test_a_camera_that_looks_down_sees_more_below() -> None:
 @pytest.mark.parametrize(('k', 'rpy', 'message'), [
     ([0.0] * 9, [0.0, 0.0, 0.0], 'camera_info: fx = 0, fy = 0, 640 x 480 pixels'),
     (K, [0.0, 0.0, math.pi], 'the camera must look ahead'),
-    (K, [0.0, 0.6, 0.0], 'straight ahead must be in the image'),
+    (K, [0.0, 0.6, 0.0], 'the forward direction must be in the image'),
 ])
 def test_a_camera_that_cannot_follow_is_refused(k: list[float], rpy: list[float],
                                                 message: str) -> None:

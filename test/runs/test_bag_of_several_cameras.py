@@ -94,21 +94,21 @@ def test_a_topic_that_is_missing_is_named_with_its_camera(
     wrong = config(tmp_path / 'wrong.yaml', camera={
         **CAMERAS['camera'], 'left': {'rpy': [0.0, 0.0, 1.2]}})  # type: ignore[dict-item]
     assert main([str(bags[1]), '--output', str(tmp_path / 'out'), '--config', wrong]) == 2
-    told = capsys.readouterr().err
-    assert 'holds no message on /left/image_raw of camera left, only on ' in told
-    assert '/port/mono/compressed' in told
+    reported = capsys.readouterr().err
+    assert 'holds no message on /left/image_raw of camera left, only on ' in reported
+    assert '/port/mono/compressed' in reported
 
 
-@pytest.mark.parametrize(('camera', 'code', 'told'), [
+@pytest.mark.parametrize(('camera', 'code', 'reported'), [
     ('', 0, ['/front/image_raw/compressed, 36 ', 'in 100% of ']),
     ('left', 0, ['/port/mono/compressed, 36 ', '/port/info, 36 ', 'not in sight in ']),
     ('back', 2, ['error: camera back: must be one of front, left'])], ids=str)
 def test_check_looks_at_one_of_them(bags: tuple[Path, Path], tmp_path: Path, camera: str,
-                                    code: int, told: list[str],
+                                    code: int, reported: list[str],
                                     capsys: pytest.CaptureFixture[str]) -> None:
     options = ['--camera', camera] if camera else []
     assert check([str(bags[1]), '--config', config(tmp_path / 'two.yaml'), *options]) == code
     out, err = capsys.readouterr()
     shown = ' '.join((out + err).split())
-    for text in told:
+    for text in reported:
         assert text in shown, shown

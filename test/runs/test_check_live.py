@@ -52,9 +52,9 @@ def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, 
         [sys.executable, '-m', 'flock_follower.check', '--json', *arguments],
         env=environment, capture_output=True, text=True, timeout=DEADLINE)
     assert ended.stderr == ''
-    told = json.loads(ended.stdout)
+    reported = json.loads(ended.stdout)
     found: dict[str, list[Any]] = {}
-    for finding in told['findings']:
+    for finding in reported['findings']:
         found.setdefault(finding['what'], []).append(finding)
     return ended.returncode, found
 
@@ -214,7 +214,7 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
     assert_told(found, 'nodes', '/drone1/mavlink_bridge', 'check --namespace drone1')
     assert_told(found, 'clock', 'planner: use_sim_time is true, but nobody', 'without')
     assert_told(found, 'command/trajectory', '2 publishers', 'end all but one')
-    assert_told(found, 'mavlink_bridge/state QoS', '/planner hears nothing: /stand_in',
+    assert_told(found, 'mavlink_bridge/state QoS', '/planner receives nothing: /stand_in',
                 'QoS of /stand_in')
     assert_told(found, 'odom wiring', 'planner does not listen to /vio/odom',
                 '-r odom:=/vio/odom')
@@ -263,5 +263,5 @@ def test_without_ros_it_says_so() -> None:
     script = ('import sys; sys.modules["rclpy"] = None; '
               'from flock_follower.check import main; sys.exit(main(["--seconds", "1"]))')
     ended = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
-    assert ended.returncode == 2 and 'is ROS 2 there' in ended.stderr
+    assert ended.returncode == 2 and 'source ROS 2' in ended.stderr
     assert ended.stderr.count('\n') == 1

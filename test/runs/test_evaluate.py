@@ -101,12 +101,12 @@ def test_ranges_in_a_bag_are_used_where_the_neighbour_is_not_in_sight(tmp_path: 
                 state = from_odometry(deserialize(m.data, m.msgtype))
                 own.setdefault(state.stamp, []).append(state.position)
     with open_bag(tmp_path / 'out' / 'result.mcap') as result:
-        told = [from_odometry(deserialize(m.data, m.msgtype))
+        reported = [from_odometry(deserialize(m.data, m.msgtype))
                 for m in result.messages(['/neighbors'])]
-    times = np.array([(state.stamp - begin) * 1e-9 for state in told])
+    times = np.array([(state.stamp - begin) * 1e-9 for state in reported])
     assert np.sum((times > 3.05) & (times < 3.4)) == 0
     assert np.sum(times > 3.4) > 80  # of 105
-    for state in told[-30:]:
+    for state in reported[-30:]:
         follower = min(odoms, key=lambda o: abs(o.stamp - state.stamp)).position
         true = float(np.linalg.norm(np.subtract(*own[state.stamp])))
         assert np.linalg.norm(state.position - follower) == pytest.approx(true, abs=0.2)
@@ -140,9 +140,9 @@ def test_a_bag_faster_than_v_max_is_told_first(
     slow = tmp_path / 'slow.yaml'
     slow.write_text('planner: {ros__parameters: {v_max: 0.1}}\n')
     assert main([str(bag), '--config', str(slow), '--output', str(tmp_path / 'slow')]) == 0
-    told = capsys.readouterr().err
-    assert told.startswith('warning: the follower in this bag flies at up to 0.')
-    assert 'above v_max = 0.1 m/s: there the setpoints brake' in told
+    reported = capsys.readouterr().err
+    assert reported.startswith('warning: the follower in this bag flies at up to 0.')
+    assert 'above v_max = 0.1 m/s: there the setpoints brake' in reported
     page = (tmp_path / 'slow' / 'report.html').read_text()
     assert page.index('<p class="warning">The follower in this bag') < page.index('<h2>')
     assert summary(tmp_path / 'slow')['faster_than_v_max_share'] > 0.5

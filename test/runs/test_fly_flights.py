@@ -93,9 +93,9 @@ class HoveringLeader:
                     111_320.0 * math.cos(math.radians(47.397742)))) * 1e7),
                 round((GROUND_AMSL + height) * 1e3), *[0] * 8)]
         self._port, self._ended = port, threading.Event()
-        self._thread = threading.Thread(target=self._tell)
+        self._thread = threading.Thread(target=self._report)
 
-    def _tell(self):
+    def _report(self):
         codec = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             while not self._ended.wait(0.02):
@@ -165,10 +165,10 @@ def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_
     assert summary['duration_s'] < 10.0 and summary['failed_processes'] == 0
     why = summary['external']['ended_early']
     assert why.startswith('TAKEN_OVER: ')
-    told = capfd.readouterr()
-    assert f'the bridge has ended the flight: {why}' in told.out
-    assert f'warning: the flight ended after {summary["duration_s"]:.1f} s: {why}' in told.err
-    assert 'FAILED: duration_s' in told.err
+    reported = capfd.readouterr()
+    assert f'the bridge has ended the flight: {why}' in reported.out
+    assert f'warning: the flight ended after {summary["duration_s"]:.1f} s: {why}' in reported.err
+    assert 'FAILED: duration_s' in reported.err
     assert why in (out / 'report.html').read_text()
 
 

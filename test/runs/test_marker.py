@@ -254,9 +254,9 @@ def test_bad_options_end_in_one_line_and_exit_code_2(
         arguments: list[str], message: str) -> None:
     monkeypatch.chdir(tmp_path)
     assert main([*ISSUE, *arguments] if arguments else []) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith('error: ') and told.err.count('\n') == 1 and not told.out
-    assert re.search(message, told.err)
+    output = capsys.readouterr()
+    assert output.err.startswith('error: ') and output.err.count('\n') == 1 and not output.out
+    assert re.search(message, output.err)
     assert not list(tmp_path.iterdir())
 
 
@@ -268,9 +268,9 @@ def test_the_print_holds_the_markers_where_the_entry_says(
         capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['--panel', '--id', *map(str, ids), '--size', *map(str, sizes), '--output',
                  str(tmp_path / 'm.pdf')]) == 0
-    told = capsys.readouterr()
-    assert f'page {page}, ' in told.err
-    (leader,) = neighbors.parse(yaml.safe_load(told.out)).neighbors
+    output = capsys.readouterr()
+    assert f'page {page}, ' in output.err
+    (leader,) = neighbors.parse(yaml.safe_load(output.out)).neighbors
     assert {m.marker_id: m.side_length for m in leader.markers} == dict(zip(ids, sizes))
 
     drawing = draw(layout('DICT_4X4_50', ids, sizes), page)

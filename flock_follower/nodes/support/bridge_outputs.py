@@ -47,7 +47,7 @@ class BridgeOutputs:
     """
     Publishes in the publisher thread; the setpoint thread calls ``on_messages`` and ``on_cycle``.
 
-    They decide from the bridge's state and submit functions that make a message.
+    Both decide from the bridge's state, and submit functions that create a message.
     """
 
     def __init__(self, node: Node, bridge: Bridge, report: BridgeReport,

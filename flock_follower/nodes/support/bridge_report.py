@@ -218,7 +218,7 @@ class BridgeReport:
         return values
 
     def _log_link(self, now: float) -> None:
-        """Log what was lost and came back."""
+        """Log losses and recoveries."""
         transport, log = self._bridge.link.transport, self._node.get_logger()
         alive, fault, reboots = self._bridge.alive(now), transport.fault, self._reboots
         if fault and not self._fault:
@@ -254,9 +254,9 @@ class BridgeReport:
                 f'{result.answered} parameters of the autopilot are as recommended')
 
     def _log_own_requests(self) -> None:
-        """Log what the bridge itself has requested, and the result."""
+        """Log the bridge's own requests and their results."""
         log = self._node.get_logger()
-        own = ((self._bridge.blind_landing, 'no velocity can be believed'),
+        own = ((self._bridge.blind_landing, 'no valid velocity'),
                (self._bridge.handover, self._bridge.end.why))
         before, self._logged = self._logged, {
             request: request.outcome is not None for request, _ in own if request is not None}
@@ -264,8 +264,8 @@ class BridgeReport:
             if request is not None and request not in before:
                 log.error(f'the bridge requests {request.goal.name}: {why}')
             if request is not None and request.outcome is not None and not before.get(request):
-                tell = log.warning if request.outcome.success else log.error
-                tell(request.outcome.message)
+                write = log.warning if request.outcome.success else log.error
+                write(request.outcome.message)
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
@@ -275,7 +275,7 @@ class BridgeReport:
         if (against := self._bridge.unready(now)) is not None:
             values[NOT_READY] = against
 
-    # Problems; '' or None if there is none.
+    # Problems; '' or None without one.
 
     def _while_alive(self, reason: Callable[[float], str]) -> Callable[[float], str]:
         return lambda now: reason(now) if self._bridge.alive(now) else ''
@@ -283,11 +283,11 @@ class BridgeReport:
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
             return ''
-        transport, heard = self._bridge.link.transport, self._bridge.telemetry.message_time
+        transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
-        if math.isfinite(heard):
-            return f'autopilot lost on {transport.url}, silent for {now - heard:.1f} s'
+        if math.isfinite(received):
+            return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
         if now - self._start < SILENCE:
             return ''
         return f'no autopilot on {transport.url}: {self._bridge.link.silence()}'
@@ -300,7 +300,7 @@ class BridgeReport:
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
                    if newest is None or now - newest.time > SILENCE]
         if missing:
-            return f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+            return f'the autopilot sends no {" and no ".join(missing)}: is its estimator ready?'
         distrusted = self._bridge.distrusted(now)
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)

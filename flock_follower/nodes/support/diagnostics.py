@@ -124,7 +124,7 @@ class Input:
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
         self.heartbeat: Input | None = None
-        """Another topic of the same publisher: while it comes, silence here is no fault."""
+        """Another topic of the publisher: while it arrives, silence of this one is no fault."""
 
     def arrived(self) -> None:
         """Record the arrival of a message."""

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters that other nodes fly with, as a file of parameters that ``evaluate`` takes."""
+"""Writes the parameters of the flying nodes to a parameter file for ``evaluate``."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _NEIGHBORS = 'neighbors_file'
 
 class FlownParameters:
     """
-    Asks nodes for their parameters, again whenever it is told that they have changed.
+    Requests the parameters of nodes, again after each change that they report.
 
     :param nodes: their names, in the namespace of ``node``.
-    :param note: is given the name and the text of a file to keep, whenever there is a new one.
+    :param note: called with the name and the text of each new file.
     """
 
     def __init__(self, node: Node, nodes: Collection[str],
@@ -71,12 +71,12 @@ class FlownParameters:
         values = map(parameter_value_to_python, future.result().values)
         self._values[name] = {key: list(value) if isinstance(value, array) else value
                               for key, value in zip(names, values)}
-        self._tell()
+        self._write()
 
-    def _tell(self) -> None:
+    def _write(self) -> None:
         """Write the files down: the neighbours beside the parameters, which name them there."""
         files: dict[str, str] = {}
-        told = {}
+        by_node = {}
         for name, values in sorted(self._values.items()):
             own = {key: value for key, value in values.items() if value is not None}
             if _NEIGHBORS in own and (own[_NEIGHBORS] or name.endswith('/relative_pose')):
@@ -89,9 +89,9 @@ class FlownParameters:
                     if text not in files.values():
                         files[f'neighbors{len(files) or ""}.yaml'] = text
                     own[_NEIGHBORS] = next(key for key in files if files[key] == text)
-            told[name.rsplit('/', 1)[-1]] = own
+            by_node[name.rsplit('/', 1)[-1]] = own
         for file, text in files.items():
             self._note(file, text)
         self._note(FLOWN, '# The parameters flown, as the nodes had them last.\n' + yaml.safe_dump(
-            {node: {'ros__parameters': values} for node, values in told.items()},
+            {node: {'ros__parameters': values} for node, values in by_node.items()},
             default_flow_style=False, allow_unicode=True))

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""What the nodes that take ``odom`` share: one's own state from it, and what is said of it."""
+"""Shared by the nodes that take ``odom``: the own state from it, and its diagnostics."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from flock_follower.parameters.spec import filled
 
 class OwnOdometry:
     """
-    Reads a node's ``odom``; counts what it drops, and shows how it reads it.
+    Reads a node's ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
-    :param report: counts what was dropped, as (reason, detail).
-    :raises ValueError: where a parameter is out of range.
+    :param report: counts dropped messages, as (reason, detail).
+    :raises ValueError: if a parameter is out of range.
     """
 
     def __init__(self, node: FlockNode, values: Mapping[str, Any],
@@ -48,29 +48,29 @@ class OwnOdometry:
         self._described = ''
         node.diagnostics.checks += [self._problem, self._axes_problem]
         self._child = self._placed = ''
-        told = any(values['odom_child_position']) or any(values['odom_child_rpy'])
-        self._static = None if told else StaticChild(node, self._place)
+        configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
+        self._static = None if configured else StaticChild(node, self._place)
 
     def _place(self) -> None:
-        """Let the source know where its child frame is, where tf_static says so."""
+        """Pass the pose of the child frame from tf_static to the source, if published."""
         pose = self._static.transform(self._child) if self._static and self._child else None
         if pose is not None and self._placed != self._child:
-            self._placed = self._child  # what is static is told once
+            self._placed = self._child  # a static transform is passed once
             self.source.place_child(pose)
             self._node.get_logger().info(
-                f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE}, says '
+                f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE} by '
                 'tf_static')
 
     def take(self, message: Odometry, arrival: int | None = None,
              shift: int = 0) -> OdometryState | None:
         """
-        Return one's own state, of base_link; None where the message repeats one.
+        Return the own state, of base_link; None if the message repeats the last one.
 
         :param arrival: when it came, ns of the node's clock; None: now.
         :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
             ``arrival`` and the stamp returned are on one that goes on evenly
             (``planner.clock_watch``).
-        :raises ValueError: where it is none.
+        :raises ValueError: if the message is invalid.
         """
         source = self.source
         if message.child_frame_id != self._child:
@@ -79,7 +79,7 @@ class OwnOdometry:
         if arrival is None:
             arrival = self._node.get_clock().now().nanoseconds - shift
         state = source.take(message, arrival, shift)
-        for event in source.told():
+        for event in source.new_events():
             self._report(*event)
         described = source.twist.describe
         if described != self._described:

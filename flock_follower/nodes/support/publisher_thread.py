@@ -44,7 +44,7 @@ class PublisherThread:
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
         self.dropped = 0
-        """How many actions were dropped because those before them took too long."""
+        """Number of actions dropped because earlier ones took too long."""
         self._on_error = on_error
         self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='publisher', daemon=True)

@@ -325,9 +325,9 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     """
     Run one node until Ctrl-C, SIGTERM or its own end, and return the process's exit code.
 
-    ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
+    ``factory`` creates the node; a ValueError or OSError it raises (a bad parameter, a missing
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
-    With ``--help`` among ``args``, None being those of the process, it prints that and ends.
+    ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
     """
     arguments = sys.argv if args is None else args
     own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
