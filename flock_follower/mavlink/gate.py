@@ -168,7 +168,7 @@ class Gate:
         if refused := refusal(age, self.limits.planner_timeout):
             return refused
         source = age if source_age is None else source_age
-        if not source <= (setpoint_rules.OLDEST_MARKER if command.relative else OLDEST_SOURCE):
+        if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
         if command.relative and math.isnan(self.relative.lasts(now)):
             return 'relative: not permitted'
