@@ -14,6 +14,7 @@
 
 """Control on the marker alone: relative motion, its bounds, and the change of the odometry."""
 
+from dataclasses import replace
 import math
 
 from hypothesis import given, settings
@@ -93,7 +94,7 @@ def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     ([leader(5.0)], 0.31, '0.31 s old')])
 def test_without_the_marker_or_the_attitude_nothing_is_commanded(seen, own_age, reason):
     memory, _ = tick(Memory(), 5.0 - own_age, [])
-    _, decision = step(memory, 5.0, True, None, seen, PARAMS)
+    _, decision = step(memory, 5.0, True, None, seen, replace(PARAMS, predict_timeout=1.0))
     assert (decision.state, decision.acceleration) == (State.HOLD, None)
     assert reason in decision.reason
 
