@@ -163,6 +163,8 @@ class Memory(NamedTuple):
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
+    disturbance: Any = None
+    """See ``relative.Disturbance``."""
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
 

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,9 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.vertical_yaw import Altitude, facing, turning
 
-#: Largest acceleration, m/s^2; the gate has the same limit.
-ACCELERATION_MAX = 1.0
+#: Largest acceleration, m/s^2; the gate has the same limit. Vertically less: the altitude must not
+#: take what keeps the distance.
+ACCELERATION_MAX, VERTICAL_MAX = 1.0, 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
@@ -52,8 +54,35 @@ GAIN = 0.5
 SPEED = 0.4
 #: Time constant with which the relative velocity is reached, s.
 TIME = 0.6
+#: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
+#: PX4's tilt was seen to err by 1 m/s^2 for 10 s.
+BANDWIDTH, OFFSET_MAX = 0.8, 0.8
 #: Deviation of the gap to another neighbor that closes it no faster than this, s.
 CLOSING = 2.0
+
+
+class Disturbance(NamedTuple):
+    """Relative acceleration that is not commanded: by an error of the tilt, or the leader's."""
+
+    velocity: Array | None = None
+    """Relative velocity, estimated (2,), m/s."""
+    response: Array = np.zeros(2)
+    """Acceleration commanded, as far as it is flown (2,), m/s^2."""
+    acceleration: Array = np.zeros(2)
+    """(2,), m/s^2."""
+
+    def observed(self, velocity: Array, command: Array | None, elapsed: float,
+                 response_time: float) -> Disturbance:
+        """Return it after a relative velocity (2,), m/s, was measured: a Luenberger observer."""
+        if self.velocity is None or command is None:
+            return self._replace(velocity=velocity)
+        response = self.response + (command[:2] - self.response) * -math.expm1(
+            -elapsed / response_time)
+        error = velocity - self.velocity
+        return Disturbance(
+            self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
+            response,
+            limit_norm(self.acceleration + elapsed * BANDWIDTH ** 2 * error, OFFSET_MAX))
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
@@ -81,13 +110,18 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     altitude, vertical = altitude._replace(climb=0.0).controlled(
         me._replace(velocity=rising), params, elapsed)
     others = [n for n in seen.values() if n is not leader]
-    command = limited(level(me, memory.pending, leader, others, params), vertical, memory.command)
+    disturbance = (memory.disturbance or Disturbance()).observed(
+        (me.velocity - there.velocity)[:2], memory.command, elapsed, params.response_time)
+    command = limited(
+        level(me, memory.pending, leader, others, params) - disturbance.acceleration, vertical,
+        memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
-    bias = np.array([0.0, 0.0, altitude.thrust_bias])
+    bias = np.array([*-disturbance.acceleration, altitude.thrust_bias])
     return memory._replace(
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
+        disturbance=disturbance,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
     ), leader, yaw, turning(last, yaw, me, params, elapsed)
 
@@ -109,7 +143,7 @@ def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighb
     middle = math.sqrt(0.5 * (law.d0 + law.d1))
     wanted = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
     relative = wanted + there.velocity[:2] - velocity[:2]
-    result: Array = relative / TIME + there.acceleration[:2]
+    result: Array = relative / TIME
     for n in others:
         other = n.position + (me.stamp - n.stamp) * n.velocity
         gap, towards = _gap(other, me, n, params)
@@ -133,7 +167,7 @@ def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
 
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
-    up = min(max(vertical, -ACCELERATION_MAX), ACCELERATION_MAX)
+    up = min(max(vertical, -VERTICAL_MAX), VERTICAL_MAX)
     flat = limit_norm(horizontal, math.sqrt(ACCELERATION_MAX ** 2 - up * up))
     return without_step(np.array([*flat, up]), last)
 

@@ -27,7 +27,12 @@ from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.relative import ACCELERATION_MAX, limited, STEP_MAX
+from flock_follower.planner.relative import (
+    ACCELERATION_MAX,
+    limited,
+    STEP_MAX,
+    VERTICAL_MAX,
+)
 from flock_follower.planner.step import step
 
 PARAMS = PlannerParams()
@@ -45,7 +50,7 @@ def tick(memory, now, neighbors, velocity=(0.0, 0.0, 0.0), relative=True, positi
     return step(memory, now, True, own, neighbors, PARAMS, **options)
 
 
-def flown(duration, start=2.0, drift=0.0, stops_at=math.inf):
+def flown(duration, start=2.0, drift=0.0, stops_at=math.inf, tilted=0.0):
     """Return the distances behind a leader at 0.4 m/s; all velocities err by a drift, m/s."""
     memory, x, v, lead, distances = Memory(), -start, 0.4, 0.0, []
     a = 0.0
@@ -53,7 +58,7 @@ def flown(duration, start=2.0, drift=0.0, stops_at=math.inf):
         now = 0.1 * k
         speed = 0.4 if now < stops_at else max(0.4 - (now - stops_at), 0.0)
         lead += 0.1 * speed
-        v += 0.1 * a
+        v += 0.1 * (a + tilted)
         x += 0.1 * v
         moved = drift * now
         memory, decision = tick(
@@ -73,6 +78,13 @@ def test_it_is_led_to_the_middle_of_the_band_whatever_the_velocity_that_both_hav
         assert distances[-1] == pytest.approx(math.sqrt(4.5), abs=0.05)
 
 
+@pytest.mark.parametrize('tilted', [0.6, -0.6])
+def test_an_error_of_the_tilt_is_offset(tilted):
+    distances = flown(30.0, tilted=tilted)
+    assert distances.min() > 1.0 and distances.max() < 2.83
+    assert distances[-1] == pytest.approx(math.sqrt(4.5), abs=0.1)
+
+
 def test_a_leader_that_stops_is_not_run_into():
     assert flown(20.0, stops_at=5.0).min() > 1.5
 
@@ -84,6 +96,8 @@ def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     command = limited(np.array(level), vertical, None if last is None else np.array(last))
     before = np.zeros(3) if last is None else last
     assert np.linalg.norm(command) <= ACCELERATION_MAX + 1e-9
+    if last is None:
+        assert abs(command[2]) <= VERTICAL_MAX
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 
 
