@@ -21,8 +21,9 @@ not have it. Only they are used. The speed over the ground is not known and not 
 
 The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
 reached with the time constant TIME. So all relative motion is damped; the motion that both have in
-common is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). Its
-acceleration, as far as it is credible, is added. Other neighbors in sight bound the approach.
+common is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer
+offsets the relative acceleration that nobody commanded: the error of the tilt, which accelerates
+the follower, and the leader's own. Other neighbors in sight bound the approach.
 """
 
 from __future__ import annotations
