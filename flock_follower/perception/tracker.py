@@ -214,7 +214,7 @@ class Tracker:
         if len(measured) < look.sought.number:
             self._detect(image, look, measured, others, sighting)
         if self._schedule.sweep_due(look.camera, stamp):
-            found = search.everywhere(image, self.config.dictionary, thorough=False)
+            found = search.everywhere(image, self.config.dictionary)
             self._locate(found, 'full', image, look, measured, others, sighting)
             look.camera.swept = stamp
         sighting.other_ids = sorted(set(sighting.other_ids))
@@ -368,8 +368,9 @@ class Tracker:
             ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
                 if missing():
-                    found = search.everywhere(image, self.config.dictionary, thorough, [
-                        m for name in missing() for m in self._targets[name].neighbor.markers])
+                    found = search.everywhere(image, self.config.dictionary, [
+                        m for name in missing() for m in self._targets[name].neighbor.markers
+                    ] if thorough else None)
                     self._locate(found, 'full', image, look, measured, others, sighting)
                     camera.thorough = not thorough
             sighting.stage, camera.searched = 'full', look.stamp
