@@ -90,7 +90,7 @@ class LearntNoise:
 
     def take(self, change: Array, expected: Array, sight: Array) -> None:
         """
-        Take the change of a position's innovation: ``Step.change`` and ``Step.expected``.
+        Take the change of a position's innovation: the fields of ``neighbor_filter.Change``.
 
         :param sight: from the own vehicle to the neighbour (3,), m.
         """
