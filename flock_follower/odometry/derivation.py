@@ -249,8 +249,6 @@ SAME: Final[float] = 0.1
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
 SHARE: Final[float] = 0.03
-#: Number of windows that are kept for ``check``: those of 300 s.
-KEPT: Final[int] = 600
 #: A piece: time, s, then m: way (3,), and how much longer it is by either reading (2, 3). In plain
 #: numbers: arrays so small would take several times as long, for every message.
 _NOTHING: Final = (0.0,) * 10
@@ -270,8 +268,10 @@ class TwistFrame:
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
         """Error of the frame in use, m/s, in the window that last contradicted it."""
-        self.windows: deque[Array] = deque(maxlen=KEPT)
-        """Mean velocities (3, 3), m/s, in odom: by the positions, and in the two readings."""
+        self.windows: deque[Array] = deque(maxlen=600)
+        """Mean velocities (3, 3), m/s, in odom, of the last 300 s for ``check``: by the positions,
+        and in the two readings.
+        """
         self._before = ''  # the frame found before the velocity was dropped
         self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
