@@ -69,6 +69,8 @@ Attitude = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
 
 def small(image: GrayImage) -> Array:
     """Return an image reduced to ``WIDTH`` px, the input of :func:`shift`."""
+    while image.shape[1] >= 2 * WIDTH:  # halving is the fastest
+        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     height, width = image.shape
     size = WIDTH, max(round(height * WIDTH / width), 16)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -142,16 +144,17 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
         median[:, 2] >= RESPONSE]
     if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST:
         return None
-    turns = [turn for n, turn in enumerate(_QUARTER_TURNS)
-             if n == 0 or up is None or turn[2].dot(up) > 0.5]
+    turns = np.array([turn for n, turn in enumerate(_QUARTER_TURNS)
+                      if n == 0 or up is None or turn[2].dot(up) > 0.5])
+    to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
     moves = [_turned(rows, attitude, offset) for offset in offsets.tolist()]
-    shares = np.array([_shares(moves, turn.T @ R_base_optical) for turn in turns]).T
+    shares = _shares(moves, to_optical)
     if shares.max() < 0.0:
         return None
     # If several are equal, as when it only turned about one axis, the configured one wins.
     best = 0 if shares[:, 0].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
-    R, curve = turns[best].T @ R_base_optical, shares[:, best]
+    R, curve = to_optical[best], shares[:, best]
     for _ in range(2):  # an error of the mounting looks like an offset, too
         offset = _summit(offsets, curve, int(curve.argmax()))
         turned, known = _turned(rows, attitude, offset)
@@ -218,14 +221,18 @@ def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Arra
 
 
 def _shares(moves: Sequence[tuple[Array, Array]], R_base_optical: Array) -> Array:
-    """Return the shares of the squares of the shifts that rotation explains, to scale, or -1."""
-    shares = np.full(len(moves), -1.0)
+    """
+    Return the shares of the squares of the shifts that rotation explains, to scale, or -1.
+
+    :param R_base_optical: rotation, or rotations, (..., 3, 3).
+    """
+    shares = np.full((len(moves), *R_base_optical.shape[:-2]), -1.0)
     for n, (turned, known) in enumerate(moves):
         if len(known) >= FEW:
-            expected = (turned @ R_base_optical)[:, 1::-1] * [-1.0, 1.0]
-            together = float(np.sum(expected * known[:, 2:4]))
-            shares[n] = together * abs(together) / max(
-                float(np.sum(expected**2) * np.sum(known[:, 2:4]**2)), 1e-30)
+            expected = (turned @ R_base_optical)[..., 1::-1] * [-1.0, 1.0]
+            together = np.sum(expected * known[:, 2:4], axis=(-2, -1))
+            squares = np.sum(expected**2, axis=(-2, -1)) * np.sum(known[:, 2:4]**2)
+            shares[n] = together * np.abs(together) / np.maximum(squares, 1e-30)
     return shares
 
 

@@ -95,7 +95,8 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     yield from _positions(motion.source.twist, motion.states)
     yield _twist(motion)
     yield from _lacking(motion)
-    up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
+    x, y, z, w = np.array([state.quaternion for state in motion.states]).T
+    up = np.mean([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], 1)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
     fit = _fit(seen, motion.states, up if lean >= LYING else None)
@@ -201,7 +202,7 @@ def _twist(motion: OwnMotion) -> Finding:
 
 def _lacking(motion: OwnMotion) -> Iterator[Finding]:
     missing = motion.source.missing
-    fastest = max(float(np.abs(state.angular_velocity).max()) for state in motion.states)
+    fastest = float(np.abs([state.angular_velocity for state in motion.states]).max())
     zero = 'angular velocity' in missing
     yield judged(False, zero, 'odom angular rate', 'always zero' if zero else
                  f'up to {math.degrees(fastest):.0f} deg/s', 'that of the gyroscope',

@@ -38,6 +38,7 @@ from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
@@ -92,16 +93,17 @@ class RecordedSystem:
         if DIAGNOSTICS in self.seen.topics:
             self.topics[DIAGNOSTICS] = DIAGNOSTICS
 
-    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> Any:
+    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
+             ) -> tuple[Any, GrayImage | None]:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        Return its fields if they were read. If the bytes are no message of the type, the bag is
-        reported as incomplete.
+        Return its fields if they were read, and the pixels of an image if decoded. If the bytes
+        are no message of the type, the bag is reported as incomplete.
         """
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
-            return None
+            return None, None
         message: Any = None
         repeated = name == 'camera_info' and data[_AFTER_STAMP:] == self._calibration
         if name in READ and not repeated:
@@ -112,13 +114,12 @@ class RecordedSystem:
                 if name == 'odom' and self._reads:
                     self._own.lost, self._own.last_error = self._own.lost + 1, str(problem)
                 self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
-                return None
+                return None, None
         if name == 'camera_info':
             self._calibration = data[_AFTER_STAMP:]
         elif name == 'odom' and self._reads:
             self._own.take(message, time_ns)
-        self._collector.take(name, topic, message, time_ns / NANOSECONDS)
-        return message
+        return message, self._collector.take(name, topic, message, time_ns / NANOSECONDS)
 
     def findings(self) -> list[Finding]:
         """Return the findings in all messages that were taken."""

@@ -133,10 +133,12 @@ def compute_in_one_thread() -> None:
 
 def decode_image(message: Any) -> GrayImage:
     """
-    Return the pixels of an Image or CompressedImage message, (H, W) uint8.
+    Return the pixels of an Image or CompressedImage message, (H, W) uint8, or those given.
 
     :raises ValueError: if they cannot be decoded.
     """
+    if isinstance(message, np.ndarray):
+        return message
     if hasattr(message, 'format'):
         return decode_compressed(message.data)
     return decode(message.encoding, message.height, message.width, message.step,
