@@ -357,10 +357,10 @@ class TwistFrame:
         :param offs: (n, 2, 3), m: how much longer the ways are by the two readings.
         """
         time = float(times.sum())
-        way, mean = ways.sum(axis=0) / time, offs.sum(axis=0) / time
-        speed = float(np.linalg.norm(way))
+        way, mean = ways.sum(axis=0), offs.sum(axis=0) / time
+        speed = float(np.linalg.norm(way)) / time
         tolerance = 3.0 * (DEVIATION + SHARE * speed)
-        self.windows.append(np.array([way, *(way + mean)]))
+        self.windows.append(np.array([way / time, *(way / time + mean)]))
         means = np.linalg.norm(mean, axis=1)
         # Noise of the positions is least in the mean, and single steps do not show in the median.
         medians = np.linalg.norm(np.median(offs / times[:, None, None], axis=0), axis=1)
