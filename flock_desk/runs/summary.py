@@ -42,8 +42,6 @@ from flock_follower.whole_file import whole_file
 WRONG_ATTITUDE = math.radians(20.0)
 #: A mean NEES of three-dimensional errors that is still consistent; 3 is expected.
 CONSISTENT = (1.5, 6.0)
-#: Keys whose figures are times measured here, and so differ from run to run.
-TIMINGS = ('cpu_ms_per_frame', 'realtime_factor', 'timings')
 BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
 LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
@@ -162,11 +160,6 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
             'wall_time_s': evaluation.wall_time,
             'cpu_ms': {what: _percentiles(cpu.get(what, np.empty(0)))
                        for what in ('decode', *STAGES, 'planner', 'gate')}}})
-
-
-def without_timings(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a summary without its timings: the part that two runs have in common."""
-    return {key: value for key, value in summary.items() if key not in TIMINGS}
 
 
 def flight_figures(flight: FlightRecord,
