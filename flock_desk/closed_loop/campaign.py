@@ -46,7 +46,7 @@ from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import quaternion_from_yaw, Transform
+from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.planner.sight import FieldOfView
 
@@ -79,6 +79,10 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
+            if scenario.flight.relative_flight:
+                attitudes = world.attitudes()
+                world.look_alone([follower.lean(now, matrix_to_quaternion(rotation))
+                                  for follower, rotation in zip(followers, attitudes)], attitudes)
             for row, message in radio.arrived(now):
                 followers[row].receive(now, message)
         if k % PLANNER_STEPS == 0:

@@ -87,6 +87,8 @@ class OwnState(NamedTuple):
     yaw: float
     spans: tuple[Span, ...] = ()
     """Between which ages those before it were the newest, if that is known."""
+    relative: bool = False
+    """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
 
 UNKNOWN: Array = np.zeros((3, 3))
