@@ -110,11 +110,11 @@ def redraw(out: Path) -> list[str]:
     figures = {
         'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
         'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
-        'leaderless_distances': lambda: plots.distances(alone, 10.0, (0.5, 2.0)),
+        'leaderless_distances': lambda: plots.distances(alone, 10.0),
         'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
         'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
         'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
-        'leader_distances': lambda: plots.distances(led, 10.0, (0.0, 4.0), unseen),
+        'leader_distances': lambda: plots.distances(led, 10.0, unseen),
     }
     written = []
     for name, draw in figures.items():

@@ -116,7 +116,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
                  params: FlockingParams) -> Array:
     """
-    Return what the law commands one agent that observes its neighbours: (n,), m/s^2.
+    Return the law's command (n,), m/s^2, for one agent that observes its neighbours.
 
     L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
 

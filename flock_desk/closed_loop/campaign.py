@@ -46,7 +46,7 @@ from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import quaternion_from_yaw, Transform
+from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.planner.sight import FieldOfView
 
@@ -55,7 +55,6 @@ PLANNER_STEPS = 12
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         noise: PerceptionNoise | None = None,
-        progress: Callable[[float], None] | None = None,
         cpu_time: Callable[[], float] = lambda: 0.0,
         law: type[FlockingParams] = FlockingParams) -> Flights:
     """
@@ -63,7 +62,6 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
 
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.
-    :param progress: called with the share that is done, now and then.
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     :param law: the law, or a controller in its place: see ``controllers``.
     """
@@ -81,6 +79,10 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
+            if scenario.flight.relative_flight:
+                attitudes = world.attitudes()
+                world.look_alone([follower.lean(now, matrix_to_quaternion(rotation))
+                                  for follower, rotation in zip(followers, attitudes)], attitudes)
             for row, message in radio.arrived(now):
                 followers[row].receive(now, message)
         if k % PLANNER_STEPS == 0:
@@ -91,8 +93,6 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.outbox = []
             if now >= ENGAGED - 1e-9:
                 log.tick(now, followers)
-            if progress is not None and k % (20 * PLANNER_STEPS) == 0:
-                progress(k / count)
         if failing and flock.fails is not None and now >= flock.fails.at:
             for follower in failing:
                 follower.fail(now)

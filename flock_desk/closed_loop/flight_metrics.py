@@ -36,7 +36,7 @@ FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
 LOST_AFTER = 5.0  # s without following at the end of a flight, and it counts as lost
-STRAYED = 1.25  # times the far edge of the band: with nobody that near it is lost, too
+STRAYED = 1.25  # times the far edge of the band: a follower without a vehicle in it is lost
 
 Measures = dict[str, Array]
 """Figures by name, (n,) each."""
@@ -227,7 +227,7 @@ def _kept(flights: Flights) -> Any:
 
 
 def _strayed(positions: Array, flights: Flights) -> Any:
-    """Return which followers (m,) nobody leads to from the leader; positions (m + 1, 3), m."""
+    """Return which followers (m,) are not connected to the leader; positions (m + 1, 3), m."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
     near &= np.append(True, _kept(flights))  # a failed follower leads no other

@@ -196,7 +196,7 @@ class Print(Part):
 @dataclass(frozen=True)
 class Operation(Part):
     """
-    What somebody does in a flight in lock step: the operator, the pilot, or chance.
+    An action in a lock-step flight: of the operator, of the pilot, or a failure.
 
     'arm', 'takeoff', 'offboard' and 'engage' are calls of the services; 'pilot' takes over by the
     mode switch and climbs; in a 'restart' the bridge dies, and starts again a while later.
@@ -223,6 +223,8 @@ class FlightParams(Part):
         'm above the ground by the odometry, whose height drifts by half a metre in ten minutes.')
     altitude_max: float = parameter(
         PlannerParams.altitude_max, None, 'm above the same.')
+    relative_flight: bool = parameter(
+        False, None, 'Whether the gate admits flight without odometry.')
 
     def planner(self, guard: bool) -> PlannerParams:
         """Return the parameters to plan with."""

@@ -22,8 +22,8 @@ is aligned; until then they are kept, and not used.
 Two frames are related by a vehicle known in both at one time: the sender seen by this vehicle,
 this vehicle seen by the sender, or any vehicle that both see or that sends its own state. The
 relations of an unknown frame are collected until a first fit succeeds; later each updates the
-filter (``alignment``), and one that does not fit is refused. A sender whose relations go on not to
-fit has begun a new frame, which is aligned anew.
+filter (``alignment``), and one that does not fit is refused. If the relations of a
+sender repeatedly do not fit, its frame has changed and is aligned again.
 """
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ class Sharing:
         self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
 
     def _align_all_anew(self, forget_senders: bool) -> None:
-        """Begin anew, as the own frame is another; ``forget_senders``: time is another, too."""
+        """Reset after a change of the own frame; ``forget_senders``: after a jump of time, too."""
         self._seen.clear()
         self._forget_frame(self.name)
         self._pairs.clear()

@@ -59,7 +59,7 @@ def unhurried() -> Iterator[None]:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals: one that comes while the interpreter ends is no failure."""
+    """Ignore further signals: one during the interpreter's exit must not change the exit code."""
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

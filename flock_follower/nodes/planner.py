@@ -22,7 +22,7 @@ steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``plann
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
+disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
 ``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """
@@ -50,6 +50,7 @@ from flock_follower.messages import (
     AccelerationState,
     from_acceleration,
     from_odometry,
+    MOTION_TOPIC,
     NANOSECONDS,
     OdometryState,
     stamp_to_nanoseconds,
@@ -117,6 +118,7 @@ class Planner(FlockNode):
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
+            self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS, required=False),
             self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS),
             self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
                       self._take_acceleration, NEIGHBORS_QOS, required=False),
@@ -194,6 +196,11 @@ class Planner(FlockNode):
             if not self._simulated:
                 state = state._replace(stamp=min(state.stamp, arrival - shift))
             self._loop.take_odometry(state, arrival - shift)
+
+    def _take_motion(self, message: Odometry, arrival: int) -> None:
+        if self._fresh(MOTION_TOPIC, message.header.stamp):
+            self._loop.take_odometry(
+                self._dated(from_odometry(message), arrival), arrival - self._watch.shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -357,8 +364,8 @@ class Planner(FlockNode):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
         if view or self._decision is None or self._decision.state is State.IDLE:
             return None
-        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
-                      'the camera sees')
+        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
+                      'that keep the leader in the image')
 
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:

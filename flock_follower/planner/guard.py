@@ -212,7 +212,7 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
     Without a camera a neighbor seen last may be anywhere: the follower does not back away.
 
     :param velocity: own velocity when the command acts (3,), m/s.
-    :param neighbors: the neighbors at hand in TRACK, else nobody.
+    :param neighbors: the neighbors at hand in TRACK, else none.
     :param blinded: whether no images are processed.
     """
     near = list[Bound]()

@@ -62,7 +62,7 @@ def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | Non
     Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
 
     :param timeout: age at which odometry is not used at all, s.
-    :param before: whether it was too slow up to now.
+    :param before: whether the odometry was too slow before.
     """
     if not spans:
         return None
@@ -87,6 +87,8 @@ class OwnState(NamedTuple):
     yaw: float
     spans: tuple[Span, ...] = ()
     """Between which ages those before it were the newest, if that is known."""
+    relative: bool = False
+    """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
 
 UNKNOWN: Array = np.zeros((3, 3))

@@ -84,7 +84,7 @@ def observed(motions: Mapping[str, SmoothedMotion],
 
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
-NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
+NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
 
 
 class Loss(NamedTuple):
@@ -128,7 +128,7 @@ class Memory(NamedTuple):
     motions: Mapping[str, SmoothedMotion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
-    """See ``Neighborhood``, in the last step that followed somebody; likewise ``edges``."""
+    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
     """The neighbor that it faced then."""
@@ -143,7 +143,7 @@ class Memory(NamedTuple):
     lost: Loss | None = None
     """The loss of the neighbor that it followed, while it lasts."""
     given_up: bool = False
-    """Whether it followed nobody for too long to command anything until it is engaged anew."""
+    """Whether it had no neighbor for too long; then it sends no command until engaged again."""
     begun: float | None = None
     """Time at which it left IDLE, s."""
     home: Array | None = None
@@ -167,6 +167,21 @@ class Memory(NamedTuple):
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
+    disturbance: Any = None
+    """See ``relative.Disturbance``."""
+    switched: float = -math.inf
+    """When odometry was lost or returned last, s: the frame before is another one."""
+
+    def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
+        """Return it in the frame of another odometry: what was known of places is forgotten."""
+        altitude = self.altitude
+        if altitude is not None:
+            altitude = Altitude.begun(own, None, params)._replace(thrust_bias=altitude.thrust_bias)
+        return Memory(
+            now=self.now, own=own, faced=self.faced, followed=self.followed, begun=self.begun,
+            given_up=self.given_up, altitude=altitude, yaw=self.yaw, command=self.command,
+            pending=self.pending, jumped=own.stamp, switched=now)
+
     def begun_afresh(self) -> Memory:
         """Return it without anything of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
@@ -185,6 +200,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         if problem := implausible(own) or untimely(own.stamp, now, params.odom_timeout):
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif me is None or own.stamp >= me.stamp:
+            if me is not None and own.relative is not me.relative:
+                memory, me, jumped = memory.in_frame_of(own, now, params), own, own.stamp
             jump = 0.0 if me is None else math.dist(own.position, at(me, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))

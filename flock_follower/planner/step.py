@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner import relative
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
@@ -132,18 +133,19 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     Return the memory for the next step, and the decision for the time ``now``, s.
 
     :param now: a step back by more than 0.1 s forgets everything.
-    :param engaged: whether commands are wanted.
-    :param own: the newest odometry since the last step, or None.
+    :param engaged: whether commands are wanted; :param own: the newest odometry, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
     :param looked: when the last image was processed, s; None if none was, which is no fault.
     :param waiting: why it may not command although engaged, or what disengaged it, or ''.
-    :param view: fields of view of the cameras; () if unknown.
-    :param ground: height at arming, m, in the frame of the odometry.
+    :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
     :param frames: stamps of the newest processed images, s, in their order.
     """
     last = memory.now
     memory, rejected = ingest(memory, now, own, estimates, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
+    if memory.own is not None and memory.own.relative and engaged and not (
+            waiting or memory.given_up):
+        return _relative(memory, memory.own, now, params, elapsed, rejected)
     memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
     if mode.state is State.IDLE:
         return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
@@ -161,8 +163,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         lost=_loss(memory, flock, me, tracking, leader, params),
         home=me.position if memory.home is None else memory.home)
-    altitude, vertical = _altitude(
-        memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
+    altitude, vertical = _altitude(memory, mode, me, neighbors, ground, coming, params, elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - bias * params.period * UP, params)
@@ -184,6 +185,19 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
         command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params), bias,
         tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+
+
+def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, elapsed: float,
+              rejected: tuple[Rejection, ...]) -> tuple[Memory, Decision]:
+    """Return the memory and the decision while there is no odometry: see ``relative``."""
+    flown = relative.step(memory, own, now, params, elapsed)
+    if isinstance(flown, str):
+        memory = memory._replace(command=None, pending=np.zeros(3))
+        return memory, Decision(State.HOLD, flown, rejected=rejected)
+    memory, leader, yaw, yaw_rate = flown
+    return memory, Decision(
+        State.RELATIVE, 'no odometry: flies by the marker alone', memory.command, yaw, yaw_rate,
+        stamp=leader.stamp, rejected=rejected, known=(leader,))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -282,8 +296,8 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
                 float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
 
 
-def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bool,
-              ground: float | None, coming: float, params: PlannerParams,
+def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
+              ground: float | None, coming: Array, params: PlannerParams,
               elapsed: float) -> tuple[Altitude, float]:
     """Return the altitude to hold, and the vertical acceleration, m/s^2."""
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
@@ -294,15 +308,15 @@ def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bo
         follows and neighbors.peers) else altitude.following(
         neighbors.level if follows else None, params, elapsed)
     if not params.guard:
-        return altitude.controlled(me, params, elapsed, coming=coming)
+        return altitude.controlled(me, params, elapsed, coming=float(coming[2]))
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
                                if me.stamp - n.stamp <= params.coast_timeout]
     raised = altitude
-    if memory.lost is not None and not blinded:
+    if memory.lost is not None and not mode.blinded:
         above = overflight(memory.lost, me.position, altitude.held, params)
         raised = altitude._replace(held=max(altitude.held, min(above, altitude.highest)))
     controlled, vertical = raised.controlled(
-        me, params, elapsed, *climb_range(near, me, params), coming)
+        me, params, elapsed, *climb_range(near, me, params), float(coming[2]))
     # The climb lasts as long as the loss: the next one begins at the altitude held before.
     return controlled._replace(held=altitude.held), vertical
 
@@ -337,7 +351,10 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
                           command.separation_axis)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
-    return command._replace(acceleration=final.acceleration, reason=reason), fading
+    a = final.acceleration
+    if me.stamp - memory.switched < relative.SETTLING:
+        a = relative.without_step(a, memory.command)
+    return command._replace(acceleration=a, reason=reason), fading
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,

@@ -139,7 +139,7 @@ class Altitude(NamedTuple):
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
-        :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
+        :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
             lowest and the highest altitude go before.
         :param coming: vertical velocity, m/s, that is commanded and not yet flown.
         """

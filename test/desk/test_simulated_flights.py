@@ -67,6 +67,18 @@ def speed(flights: Flights) -> Array:
     return np.linalg.norm(flights.velocity, axis=2)
 
 
+def test_without_odometry_it_flies_on_by_the_marker_and_returns_without_a_step() -> None:
+    scenario = load('vio_lost')
+    flown = fly(replace(scenario, duration=28.0, flight=replace(
+        scenario.flight, relative_flight=True)), RUNS, True)
+    alone = in_state(flown, State.RELATIVE)
+    assert alone[:, during(flown, 21.0, 23.9)].all() and not alone[:, flown.times < 20.0].any()
+    assert in_state(flown, State.TRACK)[:, during(flown, 25.0, 28.0)].mean() > 0.95
+    assert not flown.outside.any()
+    steps = np.linalg.norm(np.diff(flown.command, axis=1), axis=2)
+    assert np.nanmax(steps[:, during(flown, 23.0, 25.0)[1:]]) <= 0.3
+
+
 def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
     scenario = replace(load('outdoor'), duration=8.0)
     together, again, alone = (fly(scenario, runs, True)

@@ -172,11 +172,12 @@ class BridgeReport:
         """Return the newest setpoint, and the checks and estimates of the gate."""
         gate, setpoint = self._bridge.gate, self._last.setpoint if self._last else None
         place, altitude = gate.place(now), self._bridge.telemetry.sensor_altitude
-        difference = gate.yaw_difference(now)
+        difference, alone = gate.yaw_difference(now), gate.relative.lasts(now)
         return {
             'setpoint': setpoint.kind if setpoint else 'none',
             'reason': setpoint.reason if setpoint else '',
             'limited_by': setpoint.limited if setpoint else '',
+            'without_odometry_s': '' if math.isnan(alone) else f'{alone:.1f}',
             'setpoints_sent': self._diagnostics.rate('stream').count,
             'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
@@ -340,8 +341,8 @@ class BridgeReport:
             return None
         bridge, setpoint = self._bridge, self._last.setpoint
         if now - self._stuck_since > STUCK:
-            return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
-                           f'{bridge.link.transport.url} takes none')
+            return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
+                           f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not (
             bridge.requests.takeoff_explains_mode(now))
@@ -349,20 +350,20 @@ class BridgeReport:
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if silent else WARN
-            return level, (f'no setpoints are sent: {permission.reason}; the service '
-                           'mavlink_bridge/offboard asks for offboard')
+            return level, (f'no setpoints are sent: {permission.reason}; call '
+                           'mavlink_bridge/offboard to request offboard')
         if setpoint.kind == NONE and not bridge.withheld():
             return ERROR, f'no setpoints are sent: {setpoint.reason}'
         if setpoint.kind in (COMMAND, NONE) or not bridge.gate.flies:
             return None
         if setpoint.kind == LEVEL:
-            return ERROR, f'flying blind and level: {setpoint.reason}, and no other velocity'
+            return ERROR, f'only level setpoints: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
         reason = self._bridge.gate.permission.reason
         if reason.startswith(TWO_COMMAND):
-            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
+            return ERROR, f'{reason}; the bridge brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 
