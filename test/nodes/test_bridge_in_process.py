@@ -360,7 +360,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     bench.node._report._start -= 4.0
     found = bench.problems()
     for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
-                 'mavlink_bridge/offboard asks for offboard'):
+                 'mavlink_bridge/offboard to request offboard'):
         assert part in found
     bench.receive()
     bench.odometry(yaw=0.0)
