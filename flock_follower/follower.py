@@ -207,6 +207,22 @@ class Follower:
         if self.control is not None:
             self.control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
 
+    def attitude(self, time: int, quaternion: Array, rates: Array) -> OdometryState | None:
+        """
+        Take the autopilot's attitude (x, y, z, w), FLU to ENU, and its rates (3,), rad/s, FLU.
+
+        :returns: the motion without odometry, while that is flown on.
+        """
+        self.advance(time)
+        motion = None if self.control is None else self.control.update_attitude(
+            quaternion, rates, self._seconds(), self._seconds())
+        if motion is None:
+            return None
+        motion = motion._replace(stamp=time)
+        self._take_motion(time, motion)
+        self._process_due()
+        return motion
+
     def height(self, time: int, altitude: float, height: float) -> None:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
@@ -231,14 +247,17 @@ class Follower:
         """Take the own state."""
         self.advance(time)
         self._listener.odometry(state)
-        if self.perceiver is not None and self.perceiver.take_odometry(state):
-            self._listener.rejected(*JUMPED)
-        self.planner.take_odometry(state, time)
+        self._take_motion(time, state)
         if self.sharing is not None:
             self.sharing.take_own(state)
         self._gate_odometry, self._gate_received = state, time
         self._odom_frame = state.frame
         self._process_due()
+
+    def _take_motion(self, time: int, state: OdometryState) -> None:
+        if self.perceiver is not None and self.perceiver.take_odometry(state):
+            self._listener.rejected(*JUMPED)
+        self.planner.take_odometry(state, time)
 
     def camera_info(self, time: int, message: Any, camera: str = '') -> None:
         """

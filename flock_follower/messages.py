@@ -50,6 +50,13 @@ STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
 THRUST_BIAS = 'lift'
+#: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
+#: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
+RELATIVE = 'flock_relative'
+#: On this topic the bridge publishes it while that is flown on.
+MOTION_TOPIC = 'mavlink/relative'
+#: s without a message in that frame after which odometry counts again.
+RELATIVE_SILENCE = 0.15
 #: Suffix of a neighbour's name on ``neighbors``: another object with the same marker. The planner
 #: keeps clear of it, and never follows it.
 DUPLICATE = '/duplicate'
@@ -154,6 +161,22 @@ class OdometryState(NamedTuple):
         """Return the covariance (3, 3) of the velocity in the header's frame."""
         turned: Array = self.twist_rotation @ self.twist_covariance[:3, :3] @ self.twist_rotation.T
         return turned
+
+
+class OdometryChoice:
+    """Selects the odometry to use: that in the frame ``RELATIVE`` as long as it comes."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+
+    def takes(self, state: OdometryState) -> bool:
+        """Return whether to use a state."""
+        if state.frame == RELATIVE:
+            self._newest = state.stamp
+        if self._newest is None or state.frame == RELATIVE:
+            return True
+        later = (state.stamp - self._newest) / NANOSECONDS
+        return not -MAX_JUMP <= later <= RELATIVE_SILENCE
 
 
 class RangeState(NamedTuple):
@@ -309,6 +332,8 @@ class Command(NamedTuple):
     ahead: int = 0
     thrust_bias: float = 0.0
     """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
+    relative: bool = False
+    """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
 
     def ages(self, now: int) -> tuple[float, float]:
         """Return the ages of the command and of its image, s, at a time, ns."""
@@ -326,7 +351,7 @@ def trajectory(make: Make, command: Command) -> Any:
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
-    message.header.frame_id = command.frame
+    message.header.frame_id = RELATIVE if command.relative else command.frame
     message.joint_names = ['base_link']
     transform = make('geometry_msgs/msg/Transform')
     velocity, acceleration = make('geometry_msgs/msg/Twist'), make('geometry_msgs/msg/Twist')
@@ -357,10 +382,11 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     """
     Return the command of a MultiDOFJointTrajectory's first point.
 
-    :raises ValueError: if its frame is another than ``odom_frame``, or something is missing.
+    :raises ValueError: if its frame is neither ``odom_frame`` nor ``RELATIVE``, or something
+        is missing.
     """
     frame = message.header.frame_id
-    if frame not in ('', odom_frame):
+    if frame not in ('', odom_frame, RELATIVE):
         raise ValueError(f'frame {frame!r}: must be that of odom, {odom_frame!r}')
     if not (message.points and message.points[0].accelerations
             and message.points[0].transforms):
@@ -375,7 +401,7 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,
         read_stamp(message.header.stamp), read_stamp(point.time_from_start),
-        thrust_bias if math.isfinite(thrust_bias) else 0.0)
+        thrust_bias if math.isfinite(thrust_bias) else 0.0, frame == RELATIVE)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -33,6 +33,7 @@ from flock_follower.messages import (
     from_trajectory,
     Make,
     odometry,
+    RELATIVE,
     SANE,
     stamp_age,
     trajectory,
@@ -156,3 +157,10 @@ def test_a_command_that_cannot_be_used_is_refused(edit: Any, fault: str) -> None
     edit(message)
     with pytest.raises(ValueError, match=fault):
         from_trajectory(message, 'odom')
+
+
+def test_a_command_on_the_marker_alone_is_marked_by_its_frame():
+    message = trajectory(empty, COMMAND._replace(relative=True))
+    assert message.header.frame_id == RELATIVE
+    assert from_trajectory(message, 'odom').relative
+    assert not from_trajectory(trajectory(empty, COMMAND), 'odom').relative

@@ -64,7 +64,7 @@ ROOMS = {
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock follower mavlink messages odometry perception '
+    'closed_loop': ('camera external flock flocking follower mavlink messages odometry perception '
                     'planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '

@@ -45,7 +45,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.messages import duplicate_name
+from flock_follower.messages import duplicate_name, OdometryState
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION, VELOCITY
@@ -120,6 +120,8 @@ class Lookout:
                                             for g in generators])
             self._radios = Radios(scenario.ranges, generators)
             self._series = [RangeSeries(each, _CENTRE) for each in self._filters]
+        self._alone: dict[int, NeighborFilter] = {}
+        """Filters of those rows that fly without odometry."""
         self._sight: Array | None = None
         self._images: list[_Coming[float]] = [[] for _ in rows]
         self._coming: list[_Coming[Sighted]] = [[] for _ in rows]
@@ -174,12 +176,43 @@ class Lookout:
                     position=state.position + correction[i // m],
                     velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
 
-    def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None) -> None:
+    def look_alone(self, k: int, scene: Scene, motions: Sequence[OdometryState | None],
+                   attitudes: Array) -> None:
+        """
+        Take the same images in rows that fly without odometry; of each it sees the leader only.
+
+        :param motions: the motion by attitude of each row, None with odometry.
+        :param attitudes: by the autopilot (rows, 3, 3), FLU to ENU.
+        """
+        image, now, m = k // IMAGE_STEPS, k * STEP, len(self._others)
+        found, offsets = self._visible[image] & self.in_sight.ravel(), scene.offsets.reshape(-1, 3)
+        covariances = self._sensing.noise ** 2 * relative_noise(offsets, self._noise)
+        for row, motion in enumerate(motions):
+            if motion is None:
+                self._alone.pop(row, None)
+                continue
+            i = row * m
+            if not found[i]:
+                continue
+            self.seen[row, 0] = True
+            turn = attitudes[row] @ scene.rotations[:, 1:].reshape(-1, 3, 3)[row].T
+            noise = np.linalg.cholesky(covariances[i]) @ self._drawn[image, i, :3]
+            covariance = YAW_NOISE ** 2 * np.eye(6)
+            covariance[:3, :3] = covariances[i]
+            track = self._alone.setdefault(row, NeighborFilter())
+            outcome = track.update(now, Transform(
+                translation=motion.position + turn @ (offsets[i] + noise)), _CENTRE, covariance)
+            if outcome in _USED and track.newest is not None:
+                self._send(now + self._latency[image, row], i, track.newest,
+                           float(scene.yaws[:, self._others].ravel()[i]), relative=True)
+
+    def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None,
+              relative: bool = False) -> None:
         row, j = divmod(i, len(self._others))
         self._coming[row].append((arrival, Sighted(
             self._names[row][j], state.stamp, state.position, state.velocity, yaw,
             state.covariance[POSITION, POSITION], state.covariance[VELOCITY, VELOCITY],
-            state.acceleration)))
+            state.acceleration, relative)))
 
     def measure_ranges(self, now: float, scene: Scene, vio: Vio, travel: Array,
                        placed: float) -> None:
@@ -251,7 +284,8 @@ class Lookout:
 
         An arrival is the stamp of a processed image, s, or the newest estimate of a vehicle.
         """
-        return [(_due(images, now), [*{each.name: each for each in _due(coming, now)}.values()])
+        return [(_due(images, now), [*{
+            (each.name, each.relative): each for each in _due(coming, now)}.values()])
                 for images, coming in zip(self._images, self._coming)]
 
 
@@ -273,6 +307,8 @@ class Sighted(NamedTuple):
     """(3, 3), m^2/s^2."""
     acceleration: Array
     """(3,), m/s^2."""
+    relative: bool = False
+    """Whether it is in the frame without odometry."""
 
 
 T = TypeVar('T')

@@ -32,6 +32,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
+from flock_follower.flocking import FlockingParams
 from flock_follower.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.geometry import (
     Array,
@@ -46,6 +47,7 @@ from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import (
     AccelerationState,
     OdometryState,
+    RELATIVE,
     to_nanoseconds,
     with_acceleration,
 )
@@ -70,15 +72,16 @@ class SimulatedFollower(Listener):
     :param start: where its vehicle begins (3,), m.
     :param view: field of view of its camera; () if cameras look to all sides.
     :param name: of its vehicle.
-    :param cpu_time: see ``Follower``.
+    :param cpu_time: see ``Follower``; :param law: see ``controllers``.
     """
 
     def __init__(self, scenario: Scenario, guard: bool, run: int, frame: str,
                  T_odom_world: Transform, start: Array, view: View, name: str,
-                 cpu_time: Callable[[], float]) -> None:
+                 cpu_time: Callable[[], float], law: type[FlockingParams]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
-                            height_max=1000.0, radius_max=10000.0)
+                            height_max=1000.0, radius_max=10000.0,
+                            relative_flight=scenario.flight.relative_flight)
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
         def new_control() -> Gate:
@@ -89,7 +92,7 @@ class SimulatedFollower(Listener):
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self.follower = Follower(
-            planner, _params(scenario, guard, name), new_control(), self,
+            planner, _params(scenario, guard, law, name), new_control(), self,
             cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
             sharing=Sharing(name) if scenario.company.words else None)
         self.follower.advance(_AFTER)
@@ -117,6 +120,11 @@ class SimulatedFollower(Listener):
             quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity, _ZERO,
             pose, twist, _LEVEL))
 
+    def lean(self, now: float, quaternion: Array) -> OdometryState | None:
+        """Take the attitude by the autopilot; return the motion without odometry, if flown on."""
+        return None if self.failed else self.follower.attitude(
+            to_nanoseconds(now), quaternion, _ZERO)
+
     def receive(self, now: float, message: OdometryState) -> None:
         """Take a message of another follower."""
         if not self.failed:
@@ -133,15 +141,17 @@ class SimulatedFollower(Listener):
         self.follower.advance(to_nanoseconds(now) + _AFTER)
 
     def _see(self, now: float, n: Sighted) -> None:
-        axes, pose, twist = self._T_odom_world.rotation, np.zeros((6, 6)), np.zeros((6, 6))
+        to_frame = Transform() if n.relative else self._T_odom_world
+        axes, pose, twist = to_frame.rotation, np.zeros((6, 6)), np.zeros((6, 6))
         pose[:3, :3] = axes @ n.position_covariance @ axes.T
         twist[:3, :3] = axes @ n.velocity_covariance @ axes.T
         pose[5, 5] = _ANY_YAW if n.yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
-        quaternion = quaternion_from_yaw((n.yaw or 0.0) + self._turn)
+        quaternion = quaternion_from_yaw((n.yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
         acceleration = quaternion_to_matrix(quaternion).T @ (axes @ n.acceleration)
         stamp = to_nanoseconds(n.stamp)
         self.follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
-            stamp, self._frame, n.name, self._T_odom_world.apply(n.position), quaternion,
+            stamp, RELATIVE if n.relative else self._frame, n.name, to_frame.apply(n.position),
+            quaternion,
             axes @ n.velocity, _ZERO, pose, twist, _LEVEL),
             AccelerationState(stamp, n.name, acceleration)))
 
@@ -178,9 +188,11 @@ class SimulatedFollower(Listener):
             yaw=None if setpoint.yaw is None else setpoint.yaw - self._turn), self._now)
 
 
-def _params(scenario: Scenario, guard: bool, name: str) -> PlannerParams:
+def _params(scenario: Scenario, guard: bool, law: type[FlockingParams],
+            name: str) -> PlannerParams:
     """Return the planner's parameters of a vehicle."""
     params = scenario.flight.planner(guard)
+    params = replace(params, law=law(**vars(params.law)))
     return params if scenario.flock is None else replace(params, vehicles={
         other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)
         for other in scenario.flock.names if other != name})

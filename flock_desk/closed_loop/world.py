@@ -42,9 +42,11 @@ from flock_desk.sensors.vio import Due, GaussMarkov, Vio
 from flock_desk.vehicles.equipment import Barometer
 from flock_desk.vehicles.vehicle import attitude, GRAVITY, Quadrotor
 from flock_follower.geometry import Array
+from flock_follower.messages import OdometryState
 from flock_follower.planner.inputs import OwnState
 
 ODOMETRY_STEPS, GATE_STEPS = 2, 6
+ATTITUDE_ERROR, ATTITUDE_MEMORY = 0.01, 10.0  # rad of tilt, constant and varying; s
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
 
 
@@ -98,6 +100,8 @@ class World:
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n * m, 3))
         self._drift_rng = self._random('dead reckoning')
+        self._tilt = GaussMarkov(self._random('attitude'), 2, ATTITUDE_ERROR, ATTITUDE_MEMORY,
+                                 ODOMETRY_STEPS * STEP, ATTITUDE_ERROR)
         self._barometer = Barometer(self._random('barometer'))
 
     def _random(self, what: str) -> list[np.random.Generator]:
@@ -208,6 +212,19 @@ class World:
                           self._odometry_lost)
         if self.scenario.prints:
             self.lookout.look_at_prints(self.vehicle.position, self.vehicle.rotation, self._vio)
+
+    def attitudes(self) -> Array:
+        """Return the attitudes (rows, 3, 3) by the autopilots, FLU to ENU, with their errors."""
+        tilt = self._tilt.step()
+        x, y = tilt.T
+        error = np.tile(np.eye(3), (len(tilt), 1, 1))
+        error[:, 0, 2], error[:, 2, 0], error[:, 1, 2], error[:, 2, 1] = y, -y, -x, x
+        return error @ self.vehicle.rotation
+
+    def look_alone(self, motions: Sequence[OdometryState | None], attitudes: Array) -> None:
+        """Let rows without odometry look, whose motion by attitude is given; in image steps."""
+        if self._step % IMAGE_STEPS == 0 and any(motions):
+            self.lookout.look_alone(self._step, self._scene(), motions, attitudes)
 
     def odometry(self, now: float) -> list[OwnState | None]:
         """Return the newest odometry that has arrived in each row; None if it is lost."""

@@ -201,7 +201,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     flight = scenario.flight
     limits = [f'a_max:={flight.a_max}', f'v_max:={flight.v_max}']
     # Scenarios judge the planner in open space.
-    envelope = ['height_max:=100.0', 'radius_max:=1000.0']
+    envelope = ['height_max:=100.0', 'radius_max:=1000.0',
+                f'relative_flight:={str(flight.relative_flight).lower()}']
     if external is None:
         port = free_udp_port()
         bridge = [f'connection:=udpin:127.0.0.1:{port}', f'target_system:={system}']

@@ -43,6 +43,7 @@ from flock_follower.messages import (
     from_trajectory,
     NANOSECONDS,
     OdometryState,
+    RELATIVE,
     stamp_to_nanoseconds,
 )
 from flock_follower.odometry.reader import OdometrySource
@@ -287,11 +288,13 @@ def estimates(messages: Sequence[Received]) -> dict[int, dict[str, Estimate]]:
     """
     Return the estimates that messages of ``neighbors`` hold, by stamp, ns, and name.
 
-    What a message does not hold is zero.
+    What a message does not hold is zero. Those of flight without odometry are in no frame of it.
     """
     found: dict[int, dict[str, Estimate]] = {}
     for _, message in messages:
         state = from_odometry(message)
+        if state.frame == RELATIVE:
+            continue
         rotation, covariance = quaternion_to_matrix(state.quaternion), np.zeros((15, 15))
         covariance[:3, :3] = state.pose_covariance[:3, :3]
         covariance[3:6, 3:6] = state.velocity_covariance

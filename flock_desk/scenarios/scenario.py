@@ -223,6 +223,8 @@ class FlightParams(Part):
         'm above the ground by the odometry, whose height drifts by half a metre in ten minutes.')
     altitude_max: float = parameter(
         PlannerParams.altitude_max, None, 'm above the same.')
+    relative_flight: bool = parameter(
+        False, None, 'Whether the gate admits flight without odometry.')
 
     def planner(self, guard: bool) -> PlannerParams:
         """Return the parameters to plan with."""

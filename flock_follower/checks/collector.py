@@ -156,9 +156,11 @@ class Collector:
         except ValueError:
             camera = None  # reported with the calibration
         for picture, pixels in self._kept:
-            found = everywhere(pixels, config.dictionary, False)
-            if not markers.keys() & set(found.ids.tolist()):  # a third of the time
-                found = everywhere(pixels, config.dictionary, True)
+            found = everywhere(pixels, config.dictionary)
+            if not markers.keys() & set(found.ids.tolist()):
+                ours = everywhere(pixels, config.dictionary,
+                                  [of.marker for of in markers.values()])
+                found = ours if len(ours.ids) else found
             picture.markers = _sides(found)
             picture.repeated = sorted(number for number, times in Counter(
                 found.ids.tolist()).items() if times > 1)
@@ -207,7 +209,7 @@ def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]
     known = dictionary_names()
     for name in (dictionary, *(other for other in OTHERS if other in known)):
         count = Counter(number for image in images
-                        for number in _sides(everywhere(image, name, True)))
+                        for number in _sides(everywhere(image, name)))
         if often := sorted(number for number, times in count.items()
                            if times >= min(SEEN_TWICE, len(images))):
             return {name: often}

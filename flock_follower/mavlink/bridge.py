@@ -48,6 +48,7 @@ from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoin
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
+from flock_follower.messages import OdometryState
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
 REST_SPEED: Final[float] = 0.1
@@ -103,6 +104,8 @@ class Bridge:
         self.end = FlightEnd(end)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
+        self.motion: tuple[OdometryState, float] | None = None
+        """While it flies without odometry, the motion by the attitude at a time, s."""
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
         self.ground_station = ground_station
@@ -199,7 +202,11 @@ class Bridge:
                     AUTOPILOT, position.position, now - self._age(position, now),
                     0.0 if gps is None else gps.accuracy)
         if attitude is not None and attitude.time == now:
-            self.gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
+            time = now - self._age(attitude, now)
+            self.gate.update_yaw(AUTOPILOT, attitude.yaw, time)
+            motion = self.gate.update_attitude(
+                attitude.quaternion, attitude.angular_velocity, time, now)
+            self.motion = None if motion is None else (motion, time)
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
                 refused := self.gate.update_height(altitude.altitude, now)):

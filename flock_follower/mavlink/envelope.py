@@ -87,6 +87,12 @@ class GateLimits(Checked):
     radius_max: float = parameter(
         50.0, Range(1.0, 10000.0, 'm'),
         'greatest horizontal distance from the place where the bridge became ACTIVE', live=False)
+    relative_flight: bool = parameter(
+        False, None,
+        'follow the marker without odometry while that is lost or contradicted: without a bound '
+        'of the speed over the ground, see docs/fly.md', live=False)
+    relative_timeout: float = parameter(
+        30.0, Range(1.0, 60.0, 's'), 'longest flight without odometry', live=False)
 
     def __post_init__(self) -> None:
         """Check the fields, and that the heights are in order."""

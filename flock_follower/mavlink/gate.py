@@ -21,7 +21,6 @@ Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import Final
 
@@ -41,7 +40,13 @@ from flock_follower.mavlink.permission import (
     Phase,
     Seen,
 )
-from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
+from flock_follower.mavlink.relative_flight import RelativeFlight
+from flock_follower.mavlink.setpoint_rules import (
+    AcceptedCommand,
+    DisturbanceObserver,
+    Held,
+    Setpoint,
+)
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     displaced,
@@ -55,7 +60,7 @@ from flock_follower.mavlink.velocity_check import (
     VELOCITIES_DISAGREE,
     VelocityComparison,
 )
-from flock_follower.messages import Command, SANE
+from flock_follower.messages import Command, OdometryState, SANE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -68,17 +73,6 @@ HEIGHT_HANDOVER_TIME: Final[float] = 2.0
 #: false one must not remove thrust.
 LANDED_HEIGHT: Final[float] = 0.3
 LANDED_TIME: Final[float] = 1.0
-
-
-@dataclass(frozen=True)
-class AcceptedCommand:
-    """A command that was accepted; times are on the monotonic clock."""
-
-    command: Command
-    time: float
-    """Time at which the command applies, s."""
-    source_time: float
-    """Time of the image that the command is based on, s."""
 
 
 class Gate:
@@ -101,6 +95,8 @@ class Gate:
         self.fused = False
         """Whether the autopilot's estimate rests on our odometry, so that it proves nothing."""
         self.heights = HeightEstimator()
+        self.relative = RelativeFlight(
+            self.limits.relative_timeout if self.limits.relative_flight else 0.0)
         self.new_command = False
         """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
@@ -124,6 +120,7 @@ class Gate:
         self._disturbance = DisturbanceObserver()
         self._flown: Array | None = None
         self._held: Held | None = None
+        self._commanded = False  # whether the last setpoint was a command
         self._last_yaw: float | None = None
 
     def permit(self, event: Event) -> None:
@@ -172,6 +169,8 @@ class Gate:
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
+        if command.relative and math.isnan(self.relative.lasts(now)):
+            return 'relative: not permitted'
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
@@ -202,7 +201,7 @@ class Gate:
         """Take an altitude, m, of the barometer; return '' or why it is refused."""
         known = self._known(now)
         # Also from an invalid source: a constant error is estimated and removed.
-        velocity = known.source_first[0].fresh_velocity(
+        velocity = None if self.relative.reckoning else known.source_first[0].fresh_velocity(
             self.limits) or known.braking_velocity(self.limits)
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now)
@@ -222,6 +221,14 @@ class Gate:
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
         self._sources[source].take_yaw(yaw, time)
+
+    def update_attitude(self, quaternion: Array, rates: Array, time: float,
+                        now: float) -> OdometryState | None:
+        """Take the autopilot's attitude at a time, s; return the motion without odometry."""
+        flown = np.zeros(3) if self._flown is None else self._flown * [0.0, 0.0, 1.0]
+        return self.relative.motion(
+            quaternion, rates, flown + self._disturbance.acceleration, self.heights.height(now),
+            time, now)
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
@@ -276,13 +283,16 @@ class Gate:
         """Return where the vehicle is in its envelope."""
         position = self._sources[self._source()].path.position
         height = self.heights.height(now)
+        if (motion := self.relative.reckoning) is not None:
+            return Location(height, float(motion.velocity[2]))
         return Location(height, self.heights.climb_rate if height is not None else 0.0,
                      None if position is None or self._start is None else (
                          position - self._start)[:2])
 
     def handover(self, now: float) -> str:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        if now - self._displaced_since > velocity_check.HANDOVER_TIME:
+        if now - self._displaced_since > velocity_check.HANDOVER_TIME and math.isnan(
+                self.relative.lasts(now)):
             return self._displaced
         if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
             return 'no height from the autopilot'
@@ -317,17 +327,24 @@ class Gate:
         self._hold(known, place, engaged, now)
         velocity = None if known.contradiction(self.limits) else (
             known.source_first[0].fresh_velocity(self.limits))
-        self._disturbance.step(self._flown, None if velocity is None else velocity.vector, now)
+        usable = velocity is not None and not self._displaced and self._source() == ODOM
+        self.relative.update(active and engaged, self._commanded, usable, place.height, now)
+        self._disturbance.step(self._flown, None if velocity is None or (
+            self.relative.reckoning is not None) else velocity.vector, now)
         command = self._command
         setpoint = setpoint_rules.decide(
             self.limits, full=self.full_limits, known=known,
             command=None if command is None else command.command,
             command_age=math.inf if command is None else now - command.time,
             link_age=link_age, armed=armed, airborne=airborne, withheld=withheld, place=place,
-            unplaced=self.heights.lost(now) or self._displaced, held=self._held or Held(),
+            unplaced=self.heights.lost(now) or (
+                '' if command is not None and command.command.relative else self._displaced),
+            held=self._held or Held(), relative=self.relative.permission(
+                -math.inf if command is None else command.source_time, now),
             wind=self._wind, offset=self._disturbance.offset)
         sends = setpoint.kind != setpoint_rules.NONE
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
+        self._commanded = setpoint.kind == setpoint_rules.COMMAND
         if not sends and not withheld and known.blind(self.limits):
             self.permit(Blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:

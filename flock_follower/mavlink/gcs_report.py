@@ -35,8 +35,9 @@ DISTANCE_PERIOD: Final[float] = 1.0
 LONGEST_TEXT: Final[int] = 50
 #: Name of the NAMED_VALUE_FLOAT, at most 10 bytes.
 DISTANCE_NAME: Final[bytes] = b'flock_dist'
-FOLLOWS: Final[tuple[str, ...]] = ('TRACK', 'COAST')
-SEVERITIES: Final[dict[str, int]] = {'HOLD': mavlink.MAV_SEVERITY_WARNING}
+FOLLOWS: Final[tuple[str, ...]] = ('TRACK', 'COAST', 'RELATIVE')
+SEVERITIES: Final[dict[str, int]] = dict.fromkeys(
+    ('HOLD', 'RELATIVE'), mavlink.MAV_SEVERITY_WARNING)
 
 
 class GroundStationReport:
@@ -50,7 +51,7 @@ class GroundStationReport:
         self._last_text = self._last_distance = -math.inf
 
     def take_state(self, state: str, now: float) -> None:
-        """Take a state of the planner: IDLE, SEARCH, TRACK, COAST or HOLD."""
+        """Take a state of the planner, as ``planner/state`` has it."""
         if state != self._state:
             self._state, self._state_time = state, now
 

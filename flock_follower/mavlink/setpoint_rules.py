@@ -16,7 +16,9 @@
 The setpoint rules: one pure function decides which setpoint may be sent now, if any.
 
 A command passes only if it is fresh and finite, the velocity that it is judged with is fresh, and
-the autopilot is received. Otherwise the setpoint brakes. A stale command is never repeated: an
+the autopilot is received. A command that rests on the marker alone passes only while flight
+without odometry is permitted (``relative_flight``), and with bounds of its own, because its speed
+is not known. Otherwise the setpoint brakes. A stale command is never repeated: an
 autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
 acceleration setpoints lead to, and ArduCopter obeys NaN. Each setpoint keeps these bounds, the
 most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
@@ -46,6 +48,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
+from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command, FASTEST_OWN, SANE
 from flock_follower.planner.limits import (
@@ -54,6 +57,7 @@ from flock_follower.planner.limits import (
     limit_level,
     limit_norm,
     LimitedCommand,
+    SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
 
@@ -167,6 +171,10 @@ class DisturbanceObserver:
         self.excess_since = min(self.excess_since, now) if abs(up) > OFFSET_MAX else math.inf
 
 
+#: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
+RELATIVE_MAX: Final[float] = 1.0
+#: Oldest image that such a command may rest on, s.
+OLDEST_MARKER: Final[float] = 0.5
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'
@@ -174,6 +182,16 @@ COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
 NONE: Final[str] = 'none'
+
+
+class AcceptedCommand(NamedTuple):
+    """A command that was accepted; times are on the monotonic clock."""
+
+    command: Command
+    time: float
+    """When it applies, s."""
+    source_time: float
+    """When the image it rests on was taken, s."""
 
 
 class Setpoint(NamedTuple):
@@ -206,7 +224,7 @@ NOT_HELD: Final[Held] = Held()
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, armed: bool, airborne: bool = True,
            withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
-           held: Held = NOT_HELD,
+           held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
@@ -226,6 +244,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param place: where it is in its envelope.
     :param unplaced: why a height that was known is not any more, or ''.
     :param held: yaw and height to keep without a command.
+    :param relative: whether a command may rest on the marker alone.
     :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
     :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
     """
@@ -236,9 +255,12 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
+    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced,
+                              _refusal(limits, command, relative, place, airborne))
     if admitted is not None:
         command, velocity = admitted
+        if velocity is None:
+            return _relative(full, command, against, place, offset)
         bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
         axis = _direction(command.separation_axis)
         safe = _limited(limits if axis is None else full,
@@ -248,7 +270,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                         safe.reason)
     estimated = known.braking_velocity(limits)
     if estimated is None:
-        kind = NONE if known.blind(limits) else LEVEL
+        kind = NONE if known.blind(limits) and not relative.begins else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
@@ -262,18 +284,28 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
 
 
 def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-           link_age: float, unplaced: str) -> tuple[tuple[Command, Velocity] | None, str]:
-    """Return the command and the velocity to judge it with, or None and why it may not pass."""
+           link_age: float, unplaced: str, without_odometry: str | None,
+           ) -> tuple[tuple[Command, Velocity | None] | None, str]:
+    """
+    Return the command and the velocity to judge it with, or None and why it may not pass.
+
+    :param without_odometry: of a command that rests on the marker alone, which has no velocity,
+        why it may not pass, or ''; of others None.
+    """
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
-    judge, _ = known.source_first
-    velocity = judge.fresh_velocity(limits)
-    if velocity is None:
-        never = math.isinf(judge.velocity_age)
-        source = f'velocity from {known.source}'
-        return None, f'no {source}' if never else f'{source} stale'
-    if disagreement := known.contradiction(limits):
-        return None, disagreement
+    velocity = None
+    if without_odometry is None:
+        judge, _ = known.source_first
+        velocity = judge.fresh_velocity(limits)
+        if velocity is None:
+            never = math.isinf(judge.velocity_age)
+            source = f'velocity from {known.source}'
+            return None, f'no {source}' if never else f'{source} stale'
+        if disagreement := known.contradiction(limits):
+            return None, disagreement
+    elif without_odometry:
+        return None, without_odometry
     if unplaced:
         return None, unplaced
     if command is None:
@@ -283,6 +315,41 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     if not fresh(command_age, limits.planner_timeout):
         return None, 'command stale'
     return (command, velocity), ''
+
+
+def _refusal(limits: GateLimits, command: Command | None, relative: Relative, place: Location,
+             airborne: bool) -> str | None:
+    """Return why a command that rests on the marker alone may not pass, or ''; of others None."""
+    if command is None or not command.relative:
+        return None
+    if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
+        return 'relative command not permitted'
+    if not fresh(relative.marker_age, OLDEST_MARKER):
+        return 'marker lost'
+    if place.height is None or not math.isfinite(place.height + place.climb_rate):
+        return 'no height'
+    return '' if airborne else 'on the ground'
+
+
+def _relative(full: GateLimits, command: Command, against: Array, place: Location,
+              offset: float) -> Setpoint:
+    """
+    Return the setpoint of a command that rests on the marker alone.
+
+    Heights go first, then the limit of the whole acceleration; the speed is not known.
+    """
+    wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
+    least, most = envelope.vertical_range(
+        full, place, place.climb_rate, _bounded(offset), full.speed_horizon)
+    strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
+    within = min(max(float(wanted[2]), least), most)
+    up = min(max(within, -strongest), strongest)
+    level = limit_norm(wanted[:2], math.sqrt(strongest ** 2 - up ** 2))
+    limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
+    if within != wanted[2]:
+        limits.append(ENVELOPE)
+    return Setpoint(COMMAND, '', np.array([*level, up]), wrap_angle(command.yaw),
+                    ', '.join(limits))
 
 
 def _bounded(offset: float) -> float:

@@ -41,6 +41,7 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.checks.observations import OURS
 from flock_follower.checks.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, TYPES
+from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
@@ -78,6 +79,7 @@ RECORDED: Final = {
         'odom', 'ranges', 'neighbors', 'neighbors/frames', 'command/trajectory', 'planner/state',
         'mavlink_bridge/state', 'mavlink/odom', 'truth/odom', 'truth/neighbors')},
     'neighbors/heard': TYPES['neighbors'],
+    MOTION_TOPIC: TYPES['odom'],
     'neighbors/acceleration': 'geometry_msgs/msg/AccelWithCovarianceStamped',
     'mavlink_bridge/armed_at': 'geometry_msgs/msg/PointStamped',
     'mavlink/battery': 'sensor_msgs/msg/BatteryState',

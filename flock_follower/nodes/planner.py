@@ -50,6 +50,7 @@ from flock_follower.messages import (
     AccelerationState,
     from_acceleration,
     from_odometry,
+    MOTION_TOPIC,
     NANOSECONDS,
     OdometryState,
     stamp_to_nanoseconds,
@@ -117,6 +118,7 @@ class Planner(FlockNode):
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
+            self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS, required=False),
             self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS),
             self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
                       self._take_acceleration, NEIGHBORS_QOS, required=False),
@@ -194,6 +196,11 @@ class Planner(FlockNode):
             if not self._simulated:
                 state = state._replace(stamp=min(state.stamp, arrival - shift))
             self._loop.take_odometry(state, arrival - shift)
+
+    def _take_motion(self, message: Odometry, arrival: int) -> None:
+        if self._fresh(MOTION_TOPIC, message.header.stamp):
+            self._loop.take_odometry(
+                self._dated(from_odometry(message), arrival), arrival - self._watch.shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())

@@ -39,7 +39,15 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
-from flock_follower.messages import DUPLICATE, from_range, NANOSECONDS, read_stamp
+from flock_follower.messages import (
+    DUPLICATE,
+    from_odometry,
+    from_range,
+    MOTION_TOPIC,
+    NANOSECONDS,
+    OdometryState,
+    read_stamp,
+)
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -124,8 +132,10 @@ class RelativePose(FlockNode):
 
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
-        self.poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
-                                   awaited=self._awaited)
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
+                                    awaited=self._awaited)
+        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
+                                      required=False, awaited=self._awaited)
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=steady)
         self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
@@ -154,10 +164,20 @@ class RelativePose(FlockNode):
         """Return whether an image, or a range, waits for odometry."""
         return self._perceiver.overdue is not None or self._tracker.ranging.waiting
 
+    def poll_odom(self) -> None:
+        """Take the odometry that waits, and before it the motion that is flown on without it."""
+        self._poll_motion()
+        self._poll_odom()
+
+    def _take_motion(self, message: Odometry, arrival: int) -> None:
+        self._use_odometry(from_odometry(message))
+
     def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
         state = self._own.take(message, arrival)
-        if state is None:
-            return
+        if state is not None:
+            self._use_odometry(state)
+
+    def _use_odometry(self, state: OdometryState) -> None:
         if self._perceiver.take_odometry(state):
             self.diagnostics.reject(*JUMPED)
         self._process_pending()

@@ -237,6 +237,30 @@ class OdometryBuffer:
             return OdometrySample.of_row(self._rows[after].copy())  # a copy, as rows move
         return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
+    def places(self, stamps: Array, points: Array) -> Array | None:
+        """
+        Return points (n, 3) on the body in the smooth frame, (k, n, 3), for stamps (k, n), s.
+
+        Between two samples position and attitude are linear. None if a stamp is not covered.
+        """
+        held = self._stamps[self._first:self._end]
+        if not len(held) or not held[0] <= stamps.min() <= stamps.max() <= held[-1]:
+            return None
+        after = held.searchsorted(stamps).clip(1)
+        span = held[after] - held[after - 1]
+        if span.max() > self.MAX_GAP:
+            return None
+        part = (stamps - held[after - 1]) / span
+        poses = self._rows[self._first:self._end, 10:].T  # travel and attitude
+        before = poses[:, after - 1]
+        px, py, pz, x, y, z, w = before + part * (poses[:, after] - before)
+        u, v, t = points.T
+        # Of the quaternion (r, w), of any length: p + 2 r x (r x p + w p) / (r.r + w w).
+        a, b, c = y * t - z * v + w * u, z * u - x * t + w * v, x * v - y * u + w * t
+        twice = 2.0 / (x * x + y * y + z * z + w * w)
+        return np.stack([px + u + twice * (y * c - z * b), py + v + twice * (z * a - x * c),
+                         pz + t + twice * (x * b - y * a)], axis=-1)
+
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""
         after = self._reaching(stamp, extrapolate)

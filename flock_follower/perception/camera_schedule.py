@@ -222,6 +222,10 @@ class CameraSchedule:
         self._seen[name] = camera, time
         camera.measured[name] = time
 
+    def seen_last_by(self, name: str, camera: MountedCamera) -> bool:
+        """Return whether no other camera saw a neighbour since this one did."""
+        return self._seen.get(name, (camera, 0.0))[0] is camera
+
     def changed(self, camera: MountedCamera) -> None:
         """Note a change of a camera's time offset: its earlier stamps keep their times."""
         offset = camera.time_offset

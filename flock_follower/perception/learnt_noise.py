@@ -140,9 +140,9 @@ class LearntMotion:
         self._share = 0.0  # variance of the means if innovations are white, of variance 1
 
     def scale(self, dt: float) -> list[float]:
-        """Return the factors (3,) of the standard deviations of the process noise over dt, s."""
+        """Return by what to multiply the covariance that dt, s, adds, by axis."""
         least = 0.0 if abs(dt) <= GAP else 1.0
-        return [math.sqrt(max(factor, least)) for factor in self.factors]
+        return [max(factor, least) for factor in self.factors]
 
     def take(self, dt: float, innovation: Array, expected: Array) -> None:
         """
@@ -154,9 +154,9 @@ class LearntMotion:
             self._share, self._means = 0.0, [0.0] * 3
         weight = min(dt / MEAN_TIME, 0.5)
         self._share = (1.0 - weight)**2 * self._share + weight**2
-        normalized = (innovation / np.sqrt(expected.diagonal())).tolist()
-        for k, off in enumerate(normalized):
-            off = min(max(off, -STRONGEST), STRONGEST)
+        variances = expected.diagonal().tolist()
+        for k, (off, variance) in enumerate(zip(innovation.tolist(), variances)):
+            off = min(max(off / math.sqrt(variance), -STRONGEST), STRONGEST)
             if dt <= GAP:
                 self._noises[k] += min(dt / NOISE_TIME, 1.0) * (
                     0.5 * (off - self._before[k])**2 - self._noises[k])

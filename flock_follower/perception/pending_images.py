@@ -26,7 +26,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from flock_follower.messages import acceleration, Make, odometry, OdometryState, RangeState
+from flock_follower.messages import (
+    acceleration,
+    Make,
+    odometry,
+    OdometryChoice,
+    OdometryState,
+    RangeState,
+)
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
@@ -103,6 +110,7 @@ class Perceiver:
     def __init__(self, tracker: Tracker, *, max_wait: float) -> None:
         self.tracker = tracker
         self.frame = ''
+        self._choice = OdometryChoice()
         self._max_wait = max_wait
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self._epoch: int | None = None
@@ -157,6 +165,8 @@ class Perceiver:
 
         Images that were waiting are then forgotten.
         """
+        if not self._choice.takes(state):
+            return False
         if self.frame not in ('', state.frame):
             self.tracker.restart()  # its estimates are in the old frame
         self.frame = state.frame

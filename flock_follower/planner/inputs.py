@@ -87,6 +87,8 @@ class OwnState(NamedTuple):
     yaw: float
     spans: tuple[Span, ...] = ()
     """Between which ages those before it were the newest, if that is known."""
+    relative: bool = False
+    """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
 
 
 UNKNOWN: Array = np.zeros((3, 3))
@@ -184,7 +186,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
 
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
-ACCELERATION_NOISE = 0.35  # m/s^2: an acceleration of a neighbor below this is mostly noise
+ACCELERATION_NOISE = 0.2  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
 FRESH = 0.12  # s up to which the guard's margin covers what else a neighbor may do

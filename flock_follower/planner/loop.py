@@ -23,7 +23,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import Command, OdometryState
+from flock_follower.messages import Command, OdometryChoice, OdometryState, RELATIVE
 from flock_follower.planner.inputs import at, Neighbor, OwnState, Span
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
@@ -32,6 +32,7 @@ from flock_follower.planner.modes import (
     effective_state,
     odometry_fault,
     parse,
+    State,
     TAKEN_OVER,
 )
 from flock_follower.planner.params import PlannerParams
@@ -72,6 +73,7 @@ class PlannerLoop:
         self._bridge: BridgeState | None = None
         self._interrupted = False
         self._frame = ''
+        self._choice = OdometryChoice()
         self._own: OdometryState | None = None
         self._newest = 0, 0
         self._spans: deque[Span] = deque(maxlen=REMEMBERED)
@@ -121,6 +123,8 @@ class PlannerLoop:
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
         """Take the own state at a time, ns; only the newest since the last tick counts."""
+        if not self._choice.takes(state):
+            return
         stamp, arrived = self._newest
         if state.stamp < stamp:
             self._spans.clear()  # the clock jumped back, or another source took over
@@ -201,7 +205,8 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion), tuple(self._spans))
+            yaw_from_quaternion(self._own.quaternion), tuple(self._spans),
+            self._own.frame == RELATIVE)
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance, None if received else n.acceleration, _yaw(n), received)
@@ -225,7 +230,8 @@ class PlannerLoop:
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.separation_axis,
-            self._frame, stamp, nanoseconds - stamp, decision.thrust_bias)
+            self._frame, stamp, nanoseconds - stamp, decision.thrust_bias,
+            decision.state is State.RELATIVE)
 
 
 def _yaw(n: OdometryState) -> float | None:

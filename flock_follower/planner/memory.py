@@ -44,6 +44,7 @@ from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
+SETTLING = 0.2  # s in which an estimated acceleration is followed: two thirds of its noise go
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
@@ -69,13 +70,16 @@ def observed(motions: Mapping[str, SmoothedMotion],
     for n in neighbors:
         last = motions.get(n.name)
         if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
+            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3)
+                                  if n.acceleration is None else n.acceleration)
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
             change = -math.expm1(-elapsed / SMOOTHING) * (n.velocity - last.velocity)
-            last = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
-        updated[n.name] = last if n.acceleration is None else last._replace(
-            acceleration=n.acceleration)
+            acceleration = change / elapsed if n.acceleration is None else (
+                last.acceleration - math.expm1(-elapsed / SETTLING) * (
+                    n.acceleration - last.acceleration))
+            last = SmoothedMotion(n.stamp, last.velocity + change, acceleration)
+        updated[n.name] = last
     return updated
 
 
@@ -163,6 +167,21 @@ class Memory(NamedTuple):
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
+    disturbance: Any = None
+    """See ``relative.Disturbance``."""
+    switched: float = -math.inf
+    """When odometry was lost or returned last, s: the frame before is another one."""
+
+    def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
+        """Return it in the frame of another odometry: what was known of places is forgotten."""
+        altitude = self.altitude
+        if altitude is not None:
+            altitude = Altitude.begun(own, None, params)._replace(thrust_bias=altitude.thrust_bias)
+        return Memory(
+            now=self.now, own=own, faced=self.faced, followed=self.followed, begun=self.begun,
+            given_up=self.given_up, altitude=altitude, yaw=self.yaw, command=self.command,
+            pending=self.pending, jumped=own.stamp, switched=now)
+
     def begun_afresh(self) -> Memory:
         """Return it without anything of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
@@ -181,6 +200,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         if problem := implausible(own) or untimely(own.stamp, now, params.odom_timeout):
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif me is None or own.stamp >= me.stamp:
+            if me is not None and own.relative is not me.relative:
+                memory, me, jumped = memory.in_frame_of(own, now, params), own, own.stamp
             jump = 0.0 if me is None else math.dist(own.position, at(me, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))

@@ -26,6 +26,8 @@ COAST    the last one used at most ``coast_timeout`` old   zero; turn after the 
 HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
          occluded, odometry is overdue, or no image was    lost, then all round
          processed for a while
+RELATIVE odometry lost or contradicted, and the bridge     see ``relative``; without an
+         flies on (``relative_flight``)                    estimate of 0.5 s no command
 =======  ================================================  ===================================
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
@@ -73,6 +75,7 @@ class State(str, enum.Enum):
     TRACK = 'TRACK'
     COAST = 'COAST'
     HOLD = 'HOLD'
+    RELATIVE = 'RELATIVE'
 
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,

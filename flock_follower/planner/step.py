@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner import relative
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
@@ -142,6 +143,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     last = memory.now
     memory, rejected = ingest(memory, now, own, estimates, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
+    if memory.own is not None and memory.own.relative and engaged and not (
+            waiting or memory.given_up):
+        return _relative(memory, memory.own, now, params, elapsed, rejected)
     memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
     if mode.state is State.IDLE:
         return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
@@ -185,6 +189,19 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params),
         float(bias[2]), tuple(sorted(neighbors.edges)),
         tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+
+
+def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, elapsed: float,
+              rejected: tuple[Rejection, ...]) -> tuple[Memory, Decision]:
+    """Return the memory and the decision while there is no odometry: see ``relative``."""
+    flown = relative.step(memory, own, now, params, elapsed)
+    if isinstance(flown, str):
+        memory = memory._replace(command=None, pending=np.zeros(3))
+        return memory, Decision(State.HOLD, flown, rejected=rejected)
+    memory, leader, yaw, yaw_rate = flown
+    return memory, Decision(
+        State.RELATIVE, 'no odometry: flies by the marker alone', memory.command, yaw, yaw_rate,
+        stamp=leader.stamp, rejected=rejected, known=(leader,))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -338,7 +355,10 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
                           command.separation_axis)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
-    return command._replace(acceleration=final.acceleration, reason=reason), fading
+    a = final.acceleration
+    if me.stamp - memory.switched < relative.SETTLING:
+        a = relative.without_step(a, memory.command)
+    return command._replace(acceleration=a, reason=reason), fading
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,

@@ -67,6 +67,18 @@ def speed(flights: Flights) -> Array:
     return np.linalg.norm(flights.velocity, axis=2)
 
 
+def test_without_odometry_it_flies_on_by_the_marker_and_returns_without_a_step() -> None:
+    scenario = load('vio_lost')
+    flown = fly(replace(scenario, duration=28.0, flight=replace(
+        scenario.flight, relative_flight=True)), RUNS, True)
+    alone = in_state(flown, State.RELATIVE)
+    assert alone[:, during(flown, 21.0, 23.9)].all() and not alone[:, flown.times < 20.0].any()
+    assert in_state(flown, State.TRACK)[:, during(flown, 25.0, 28.0)].mean() > 0.95
+    assert not flown.outside.any()
+    steps = np.linalg.norm(np.diff(flown.command, axis=1), axis=2)
+    assert np.nanmax(steps[:, during(flown, 23.0, 25.0)[1:]]) <= 0.3
+
+
 def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
     scenario = replace(load('outdoor'), duration=8.0)
     together, again, alone = (fly(scenario, runs, True)
@@ -181,7 +193,8 @@ def test_the_command_writes_the_same_file_whatever_the_jobs(
     monkeypatch.setattr('flock_desk.flights.CHUNK', 2)
     results = flown_by_the_command(
         tmp_path, 'summary: short\nduration: 4\nleader: {motion: legs}\n')
-    assert set(results) == {'law', 'guard'}
+    assert list(results) == ['law', 'guard', 'pd', 'cucker_smale', 'cucker_dong']
+    assert len({str(values) for values in results.values()}) == 4  # the guard does not act
     for values in results.values():
         assert {'in_band', 'min_separation_m', 'out_of_band_s', 'guard_active'} <= set(values)
     assert 'mine' in capsys.readouterr().out

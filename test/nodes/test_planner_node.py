@@ -36,7 +36,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.messages import stamp_to_nanoseconds, to_array
+from flock_follower.messages import MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.planner import Planner, STATE_QOS
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
@@ -45,9 +45,9 @@ STEP = 20_000_000  # ns
 DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 AHEAD = (2.0, 0.0, 2.0)  # m: where the leader is
 CAMERA = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
-INPUTS = {'odom': Odometry, 'neighbors': Odometry, 'neighbors/heard': Odometry,
-          'neighbors/frames': Header, 'neighbors/acceleration': AccelWithCovarianceStamped,
-          'camera_info': CameraInfo}
+INPUTS = {'odom': Odometry, MOTION_TOPIC: Odometry, 'neighbors': Odometry,
+          'neighbors/heard': Odometry, 'neighbors/frames': Header, 'camera_info': CameraInfo,
+          'neighbors/acceleration': AccelWithCovarianceStamped}
 LATCHED = {'mavlink_bridge/state': String, 'mavlink_bridge/armed_at': PointStamped}
 
 
@@ -367,3 +367,17 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         'neighbors stamped before the system clock was set')} == dict.fromkeys(
             node.diagnostics.counters, 1)
     node.destroy_node()
+
+
+def test_the_motion_without_odometry_is_flown_on_and_marks_the_commands(rig: Rig) -> None:
+    rig.fly()
+    for _ in range(40):
+        rig.send(MOTION_TOPIC, to_odometry(
+            nanoseconds_to_stamp(rig.now + STEP), RELATIVE, 'base_link', (0.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+        rig.run(0.02, frame=RELATIVE)  # with the odometry that is contradicted
+    rig.wait(lambda: rig.states[-1] == 'RELATIVE' and rig.commands)
+    assert rig.commands[-1].header.frame_id == RELATIVE
+    rig.run(0.6)
+    rig.wait(lambda: rig.states[-1] == 'TRACK')
+    assert rig.commands[-1].header.frame_id == 'odom'

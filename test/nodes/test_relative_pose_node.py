@@ -33,7 +33,12 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import from_odometry, stamp_to_nanoseconds
+from flock_follower.messages import (
+    from_odometry,
+    MOTION_TOPIC,
+    RELATIVE,
+    stamp_to_nanoseconds,
+)
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.relative_pose import main
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
@@ -65,7 +70,7 @@ class Rig(PerceptionRig):
     def __init__(self, **parameters: Any) -> None:
         compressed = parameters.get('image_transport') == 'compressed'
         super().__init__({
-            'odom': Odometry, 'camera_info': CameraInfo, 'ranges': Range,
+            'odom': Odometry, MOTION_TOPIC: Odometry, 'camera_info': CameraInfo, 'ranges': Range,
             **({'image_raw/compressed': CompressedImage} if compressed
                else {'image_raw': Image})}, **parameters)
 
@@ -450,3 +455,19 @@ def test_ranges_that_cannot_be_used_are_counted_by_their_reason(
         'range outside min_range and max_range': 1,
         'range stamped as one before, or earlier': 1}
     assert not r.found
+
+
+def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    for k in range(4):
+        r.odom(k / 20)
+        r.send(MOTION_TOPIC, to_odometry(
+            nanoseconds_to_stamp(START + k * 50_000_000), RELATIVE, 'base_link', (9.0, 0.0, 3.0),
+            OWN.quaternion, np.zeros(3)))
+        r.image(k / 20, image)
+    r.wait(lambda: len(r.found) >= 3)
+    assert r.found[-1].header.frame_id == RELATIVE
+    place = from_odometry(r.found[-1]).position - [9.0, 0.0, 3.0]
+    np.testing.assert_allclose(place, LEADER.translation - OWN.translation, atol=0.03)

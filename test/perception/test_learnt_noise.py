@@ -103,8 +103,8 @@ def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise,
         place = place + 0.5 * dt * (before + velocity)
         measured = Transform(np.eye(3), place + rng.normal(0.0, 0.001, 3))
         tracker.update(t, measured, np.zeros(3), noise)
-        if tracker.step is not None and tracker.step.change is not None:
-            learnt.take(tracker.step.change, tracker.step.expected, place)
+        if tracker.change is not None:
+            learnt.take(*tracker.change, place)
         if t > 2.0 and tracker.newest is not None:
             error = tracker.newest.velocity - velocity
             nees.append(error @ np.linalg.solve(tracker.newest.covariance[3:6, 3:6], error))
@@ -112,6 +112,14 @@ def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise,
 
 
 def test_a_manoeuvre_is_no_noise_of_the_measurements() -> None:
+    tracker, noise, changes = NeighborFilter(), np.diag([0.001] * 3 + [0.01] * 3)**2, []
+    for k in range(90):
+        ahead = 2.0 + 1.0 * max(k / 30.0 - 1.0, 0.0)**2  # from 1 s on at 2 m/s^2
+        tracker.update(k / 30.0, Transform(translation=np.array([ahead, 0.0, 0.0])), np.zeros(3),
+                       noise)
+        if tracker.change is not None:
+            changes.append(float(np.abs(tracker.change.difference).max()))
+    assert 0.0 < max(changes) < 0.003  # m; the innovations are up to 0.011
     learnt, _ = flown(2.0, 1)
     assert learnt.attitude < 0.0005
     assert learnt.distance < 0.0005

@@ -32,9 +32,9 @@ from std_msgs.msg import String
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.telemetry import AutopilotEstimate, Battery, estimate
-from flock_follower.messages import OdometryState, set_vector
+from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 
 # Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
@@ -59,6 +59,8 @@ class BridgeOutputs:
         self._mode = ''
         self._last_estimate = -math.inf
         self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
+        self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
+            bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
         self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
         self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', STATE_QOS)
@@ -82,6 +84,10 @@ class BridgeOutputs:
                 self._report.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
                 self._send_estimate(known)
+        motion = self._bridge.motion
+        if motion is not None and attitude is not None and attitude.time == now and self._motions:
+            self._publish(self._motions, lambda: from_state(
+                make, motion[0]._replace(stamp=self._stamp(motion[1]))))
         if battery is not None and battery.time == now:
             self._publish(self._battery, lambda: self._battery_state(battery))
         self._send_arming(now)

@@ -172,11 +172,12 @@ class BridgeReport:
         """Return the newest setpoint, and the checks and estimates of the gate."""
         gate, setpoint = self._bridge.gate, self._last.setpoint if self._last else None
         place, altitude = gate.place(now), self._bridge.telemetry.sensor_altitude
-        difference = gate.yaw_difference(now)
+        difference, alone = gate.yaw_difference(now), gate.relative.lasts(now)
         return {
             'setpoint': setpoint.kind if setpoint else 'none',
             'reason': setpoint.reason if setpoint else '',
             'limited_by': setpoint.limited if setpoint else '',
+            'without_odometry_s': '' if math.isnan(alone) else f'{alone:.1f}',
             'setpoints_sent': self._diagnostics.rate('stream').count,
             'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',

@@ -1,0 +1,168 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Flight without odometry: when it is permitted, and the motion by attitude and acceleration.
+
+It begins while the vehicle flies our commands, if the odometry that they were flown on is lost or
+contradicted, and ends as soon as odometry is usable again for RETURN_TIME, after
+``relative_timeout``, or with the permission. After a takeover, too, it begins only once commands
+were flown on odometry. Time flown without odometry counts until as much was flown with it.
+
+The motion (``Reckoning``) integrates the acceleration that the attitude leads to. Its velocity
+drifts, so it leaks; the marker's relative motion does not depend on that. Vectors are ENU; time
+is an argument.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array, quaternion_to_matrix
+from flock_follower.messages import OdometryState, RELATIVE
+
+GRAVITY: Final[float] = 9.80665
+#: Odometry that is usable for this long, s, is flown on again.
+RETURN_TIME: Final[float] = 1.0
+#: At its beginning the marker's estimate starts anew: for this long, s, the stream goes on level.
+GRACE: Final[float] = 1.0
+#: Time constant of the leak of the velocity, s: a tilt wrong by 1 degree errs it by 0.9 m/s.
+LEAK: Final[float] = 5.0
+#: Of the observer that follows the height, 1/s.
+HEIGHT_BANDWIDTH: Final[float] = 0.7
+#: After a longer gap between two attitudes, s, nothing is integrated.
+LONGEST_STEP: Final[float] = 0.2
+_UNKNOWN: Final[Array] = np.zeros((6, 6))
+
+
+class Relative(NamedTuple):
+    """The permission of a command that rests on the marker alone."""
+
+    lasted: float = math.nan
+    """For how long it has flown without odometry, s; NaN: it may not."""
+    begins: bool = False
+    """Whether that has just begun, so that no command can have come yet."""
+    marker_age: float = math.inf
+    """Age of the image that the command rests on, s."""
+
+
+FORBIDDEN: Final[Relative] = Relative()
+
+
+class Reckoning:
+    """Position and velocity (3,), m and m/s, from where and when it began."""
+
+    def __init__(self, height: float) -> None:
+        self.position: Array = np.array([0.0, 0.0, height])
+        self.velocity: Array = np.zeros(3)
+        self._climb = 0.0
+        self._time: float | None = None
+
+    def step(self, rotation: Array, acceleration: Array, height: float, time: float) -> None:
+        """
+        Integrate up to a time, s.
+
+        :param rotation: attitude (3, 3), FLU to ENU.
+        :param acceleration: vertically that which is flown, m/s^2; horizontally that which the
+            attitude does not show, as by wind (3,).
+        :param height: by barometer or rangefinder, m.
+        """
+        elapsed = 0.0 if self._time is None else time - self._time
+        self._time = time
+        if not 0.0 < elapsed <= LONGEST_STEP:
+            return
+        up = float(acceleration[2])
+        tilted = (GRAVITY + up) / max(float(rotation[2, 2]), 0.5) * rotation[:2, 2]
+        error = height - float(self.position[2])
+        self._climb += elapsed * (up + HEIGHT_BANDWIDTH ** 2 * error)
+        level = self.velocity[:2] + elapsed * (
+            tilted + acceleration[:2] - self.velocity[:2] / LEAK)
+        velocity = np.array([*level, self._climb + 2.0 * HEIGHT_BANDWIDTH * error])
+        # What is compared with the marker's motion moves as its velocity says.
+        self.position = self.position + 0.5 * elapsed * (self.velocity + velocity)
+        self.velocity = velocity
+
+
+class RelativeFlight:
+    """
+    Whether commands without odometry are admitted; times are monotonic, s.
+
+    :param timeout: time for which they are, s; 0: never.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self._timeout = timeout
+        self.reckoning: Reckoning | None = None
+        """The motion while it lasts."""
+        self._begun = math.inf
+        self._spent = 0.0  # s, flown without odometry and not yet made up for
+        self._usable_since = math.inf
+        self._flown = False  # whether commands were flown on odometry in this ACTIVE phase
+        self._time = -math.inf
+
+    def lasts(self, now: float) -> float:
+        """Return for how long it has lasted, earlier times included, s; NaN: not permitted."""
+        lasted = self._spent + min(now, self._usable_since) - self._begun
+        permitted = self.reckoning is not None and 0.0 <= lasted <= self._timeout
+        return lasted if permitted else math.nan
+
+    def permission(self, source_time: float, now: float) -> Relative:
+        """Return the permission; ``source_time``, s, of the image that a command rests on."""
+        lasted = self.lasts(now)
+        return Relative(lasted, not math.isnan(lasted) and now - self._begun <= GRACE,
+                        now - source_time)
+
+    def update(self, active: bool, commanded: bool, usable: bool, height: float | None,
+               now: float) -> None:
+        """
+        Begin or end it.
+
+        :param active: whether the vehicle flies our setpoints by permission.
+        :param commanded: whether the last setpoint was a command.
+        :param usable: whether odometry may be flown on.
+        :param height: by barometer or rangefinder, m; without one it does not begin.
+        """
+        elapsed, self._time = max(now - self._time, 0.0), now
+        self._flown = active and (self._flown or (usable and commanded))
+        self._usable_since = min(self._usable_since, now) if usable else math.inf
+        if self.reckoning is not None:
+            if not active or now - self._usable_since >= RETURN_TIME:
+                self._spent += min(now, self._usable_since) - self._begun
+                self.reckoning, self._begun = None, math.inf
+        elif usable:
+            self._spent = max(self._spent - elapsed, 0.0) if elapsed < math.inf else 0.0
+        elif self._flown and height is not None and self._spent < self._timeout:
+            self.reckoning, self._begun = Reckoning(height), now
+
+    def motion(self, quaternion: Array, rates: Array, acceleration: Array, height: float | None,
+               time: float, now: float) -> OdometryState | None:
+        """
+        Return the motion at an attitude, in the frame ``RELATIVE``; None if none is wanted.
+
+        Its stamp is 0.
+
+        :param quaternion: (x, y, z, w), FLU to ENU, at a time, s; ``rates`` (3,), rad/s, FLU.
+        :param acceleration: see ``Reckoning.step``.
+        :param height: by barometer or rangefinder, m.
+        """
+        if self.reckoning is None or height is None or math.isnan(self.lasts(now)):
+            return None
+        rotation = quaternion_to_matrix(quaternion)
+        self.reckoning.step(rotation, acceleration, height, time)
+        return OdometryState(
+            0, RELATIVE, 'base_link', self.reckoning.position, quaternion,
+            self.reckoning.velocity, rates, _UNKNOWN, _UNKNOWN, rotation)

@@ -1,0 +1,179 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Control without odometry: the distance to the leader, and the relative velocity, by the marker.
+
+Own motion is then the autopilot's attitude and the accelerations flown, integrated; its velocity
+drifts. That drift is the same in the leader's estimate, so that distance and relative velocity do
+not have it. Only they are used. The speed over the ground is not known and not bounded.
+
+The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
+reached with the time constant TIME. So all relative motion is damped; the motion that both have in
+common is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer
+offsets the relative acceleration that nobody commanded: the error of the tilt, which accelerates
+the follower, and the leader's own. Other neighbors in sight bound the approach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, untimely
+from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.vertical_yaw import Altitude, facing, turning
+
+#: Largest acceleration, m/s^2; the gate has the same limit. Vertically less: the altitude must not
+#: take what keeps the distance.
+ACCELERATION_MAX, VERTICAL_MAX = 1.0, 0.6
+#: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
+STEP_MAX = 0.25
+#: For this long after the odometry has returned, s, changes of the command stay as small.
+SETTLING = 1.0
+#: Oldest sight of the marker that is flown on, s.
+OLDEST = 0.5
+#: Relative speed for each metre off the middle of the band, 1/s, and the largest, m/s.
+GAIN = 0.5
+SPEED = 0.4
+#: Time constant with which the relative velocity is reached, s.
+TIME = 0.6
+#: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
+#: PX4's tilt was seen to err by 1 m/s^2 for 10 s.
+BANDWIDTH, OFFSET_MAX = 0.8, 0.8
+#: Deviation of the gap to another neighbor that closes it no faster than this, s.
+CLOSING = 2.0
+
+
+class Disturbance(NamedTuple):
+    """Relative acceleration that is not commanded: by an error of the tilt, or the leader's."""
+
+    velocity: Array | None = None
+    """Relative velocity, estimated (2,), m/s."""
+    response: Array = np.zeros(2)
+    """Acceleration commanded, as far as it is flown (2,), m/s^2."""
+    acceleration: Array = np.zeros(2)
+    """(2,), m/s^2."""
+
+    def observed(self, velocity: Array, command: Array | None, elapsed: float,
+                 response_time: float) -> Disturbance:
+        """Return it after a relative velocity (2,), m/s, was measured: a Luenberger observer."""
+        if self.velocity is None or command is None:
+            return self._replace(velocity=velocity)
+        response = self.response + (command[:2] - self.response) * -math.expm1(
+            -elapsed / response_time)
+        error = velocity - self.velocity
+        return Disturbance(
+            self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
+            response,
+            limit_norm(self.acceleration + elapsed * BANDWIDTH ** 2 * error, OFFSET_MAX))
+
+
+def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
+         elapsed: float) -> tuple[Memory, Neighbor, float, float] | str:
+    """
+    Return the memory with the command, the neighbor followed, and yaw, rad, and yaw rate, rad/s.
+
+    :returns: the reason, if nothing can be commanded.
+    """
+    if fault := untimely(own.stamp, now, params.odom_timeout):
+        return f'no odometry, and the motion by attitude is {fault.detail} old'
+    seen = {name: n for name, n in memory.neighbors.items()
+            if not n.received and now - n.stamp <= OLDEST}
+    leader = seen.get(memory.faced) or max(
+        (n for n in seen.values() if n.member.role != AVOID), key=lambda n: n.stamp, default=None)
+    if leader is None:
+        return 'no odometry, and no neighbor in sight'
+    me, there = at(own, now), at(leader, now)
+    altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
+        lowest=-math.inf, highest=math.inf)
+    rising = me.velocity
+    if params.altitude_mode == 'follow':
+        altitude = altitude._replace(held=float(there.position[2]) + params.altitude_offset)
+        rising = me.velocity - [0.0, 0.0, there.velocity[2]]
+    altitude, vertical = altitude._replace(climb=0.0).controlled(
+        me._replace(velocity=rising), params, elapsed)
+    others = [n for n in seen.values() if n is not leader]
+    disturbance = (memory.disturbance or Disturbance()).observed(
+        (me.velocity - there.velocity)[:2], memory.command, elapsed, params.response_time)
+    command = limited(
+        level(me, memory.pending, leader, others, params) - disturbance.acceleration, vertical,
+        memory.command)
+    last = me.yaw if memory.yaw is None else memory.yaw
+    yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
+    left = math.exp(-elapsed / params.response_time)
+    bias = np.array([*-disturbance.acceleration, altitude.thrust_bias])
+    return memory._replace(
+        faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
+        disturbance=disturbance,
+        pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
+    ), leader, yaw, turning(last, yaw, me, params, elapsed)
+
+
+def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighbor],
+          params: PlannerParams) -> Array:
+    """
+    Return the horizontal acceleration (2,), m/s^2, without limits.
+
+    :param me: own state, now; :param coming: velocity commanded and not flown yet (3,), m/s.
+    :param leader: the neighbor to follow, by its newest estimate, at its stamp.
+    :param others: likewise, those to keep clear of.
+    """
+    law, age = params.law, me.stamp - leader.stamp
+    a = np.zeros(3) if leader.acceleration is None else leader.acceleration
+    there = expected(leader, a, age, params)
+    velocity = me.velocity + coming
+    gap, towards = _gap(there.position, me, leader, params)
+    middle = math.sqrt(0.5 * (law.d0 + law.d1))
+    wanted = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
+    relative = wanted + there.velocity[:2] - velocity[:2]
+    result: Array = relative / TIME
+    for n in others:
+        other = n.position + (me.stamp - n.stamp) * n.velocity
+        gap, towards = _gap(other, me, n, params)
+        closing = float(towards @ (velocity - n.velocity)[:2])
+        most = ((gap - math.sqrt(law.d0) - params.guarding.m) / CLOSING - closing) / TIME
+        result = result - max(float(towards @ result) - most, 0.0) * towards
+    return result
+
+
+def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tuple[float, Array]:
+    """Return the horizontal distance between hulls, m, and the direction (2,) to a place."""
+    x, y, _ = (place - me.position).tolist()
+    distance = math.hypot(x, y)
+    towards = np.array([x, y]) / distance if distance > 1e-6 else np.zeros(2)
+    return distance - params.radius - n.member.radius, towards
+
+
+def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
+    """
+    Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
+
+    :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
+    """
+    up = min(max(vertical, -VERTICAL_MAX), VERTICAL_MAX)
+    flat = limit_norm(horizontal, math.sqrt(ACCELERATION_MAX ** 2 - up * up))
+    return without_step(np.array([*flat, up]), last)
+
+
+def without_step(acceleration: Array, last: Array | None) -> Array:
+    """Return an acceleration (3,), m/s^2, at most STEP_MAX from the last one (None: zero)."""
+    before = np.zeros(3) if last is None else last
+    return before + limit_norm(acceleration - before, STEP_MAX)
