@@ -103,9 +103,9 @@ class LearntNoise:
                     + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
         across, across_variance = u * u + v * v + w * w - along, xx + yy + zz - variance
         self._count = min(self._count + 1, LEARNT)
-        # Two axes across, each off by the noise times the distance.
-        for_attitude = _excess(across, across_variance) / (2.0 * squared * self._count)
-        for_distance = _excess(along, variance) / (squared * self._count)
+        # Two axes across, each off by the noise times the distance, in two innovations.
+        for_attitude = _excess(across, across_variance) / (4.0 * squared * self._count)
+        for_distance = _excess(along, variance) / (2.0 * squared * self._count)
         self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
         self._along = min(max(self._along + for_distance, 0.0), MOST**2)
 
