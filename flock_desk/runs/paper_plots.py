@@ -353,6 +353,28 @@ def distance(flight: LiveRecord) -> Figure:
         return figure
 
 
+def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> Figure:
+    """
+    Return the share of runs that kept the band against the jerk, a panel for each ``v_max``, m/s.
+
+    :param results: by ``v_max``, the jerk, m/s^3, and the share of each controller.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
+        axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
+        for axis, (v_max, points) in zip(axes, results.items()):
+            for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):
+                axis.plot(jerk, 100.0 * share, marker, markersize=5, label=name,
+                          color=COLOURS[1][0] if name == 'law and guard' else INK,
+                          markerfacecolor=None if name == 'law and guard' else 'white')
+            axis.set(title=f'$v_{{max}}$ = {v_max:g} m/s', xlabel='jerk [m/s$^3$]', ylim=(-5, 105))
+            axis.set_xlim(left=0.0)
+        axes[0].set_ylabel('runs in the band [%]')
+        figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                      columnspacing=1.0, handlelength=1.0)
+        return figure
+
+
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
     """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column

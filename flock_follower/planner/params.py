@@ -215,7 +215,7 @@ class PlannerParams(Checked):
         1.0, Range(0.05, 6.0, 'rad/s'),
         'largest rate of the commanded yaw, and of the turn to it', live=True)
     scan_rate: float = parameter(
-        0.5, Range(0.0, 3.0, 'rad/s'),
+        1.0, Range(0.0, 3.0, 'rad/s'),
         'yaw rate of the search for a neighbor; 0: no search', live=True)
 
     radius: float = parameter(

@@ -68,7 +68,7 @@ def flown(offset: float, seconds: float, estimated: TimeOffset, own: Own | None 
             k += 1
         t = stamp + offset
         point = own.at(t).smooth_pose.inverse().apply(leader(t, reversing))
-        estimated.take('leader', stamp, point + rng.normal(0.0, noise, 3), odometry)
+        estimated.take('leader', stamp, point + rng.normal(0.0, noise, 3), Transform(), odometry)
         applied.append(estimated.applied)
     return applied
 
