@@ -171,11 +171,13 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
                    for name, each in results.items() if CONTROLLERS.keys() <= each.keys())
     if not flown:
         return [], [f'controllers: not drawn, {path} does not have them: make flights']
-    means = {v_max: {title: tuple(float(np.mean([results[name][key][figure] for _, name in group]))
-                                  for figure in ('horizontal_jerk_m_s3', 'in_band'))
-                     for key, title in CONTROLLERS.items()}
-             for v_max, group in ((v, list(of_v)) for v, of_v in groupby(
-                 flown, lambda each: each[0]))}
+    means = dict[float, dict[str, tuple[float, float]]]()
+    for v_max, group in groupby(flown, lambda each: each[0]):
+        names = [name for _, name in group]
+        means[v_max] = {title: (
+            float(np.mean([results[name][key]['horizontal_jerk_m_s3'] for name in names])),
+            float(np.mean([results[name][key]['in_band'] for name in names])))
+            for key, title in CONTROLLERS.items()}
     return [plots.save(plots.controllers(means), out / 'controllers')], []
 
 
