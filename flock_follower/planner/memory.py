@@ -44,7 +44,7 @@ from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
-SETTLING = 0.2  # s in which an estimated acceleration is followed: two thirds of its noise go
+SETTLING = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
