@@ -100,12 +100,17 @@ def aruco2(dictionary: str) -> Corners:
     """
     Return the detector of aruco2, with its default parameters.
 
+    The corners that it finds of a tag begin at the bottom right one.
+
     :raises ImportError, OSError: if it is not installed.
     """
     detect, number = import_module('aruco2').detectFiducialMarkers, getattr(cv2.aruco, dictionary)
 
+    turn = 2 if dictionary == TAG else 0
+
     def corners(image: GrayImage) -> Array | None:
-        return next((np.asarray(m.corners) for m in detect(image, number) if m.id == 0), None)
+        return next((np.roll(np.asarray(m.corners), turn, axis=0)
+                     for m in detect(image, number) if m.id == 0), None)
     return corners
 
 

@@ -72,10 +72,10 @@ from flock_follower.geometry import Array, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import decode_image, GrayImage
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
-from flock_follower.perception.tracker import camera_mounting, Tracker
+from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
 
@@ -269,12 +269,12 @@ class Flight:
         else:
             stamp = stamp_to_nanoseconds(message.header.stamp)
             self.perceiver.take_image(message, stamp, now * 1e-9)
-        while (due := self.perceiver.due(now * 1e-9)) is not None:
-            pixels = decode_image(due.message)
-            assert due.model is not None
+        while (ready := self.perceiver.process(now * 1e-9)) is not None:
+            image, pixels = ready.image, ready.pixels
+            assert image.model is not None and pixels is not None
             if not self.images:
-                self.warm_up(pixels, due.model)
-            self.waiting.append((due.stamp_ns, due.stamp, pixels, due.model))
+                self.warm_up(pixels, image.model)
+            self.waiting.append((image.stamp_ns, image.stamp, pixels, image.model))
             self.images += 1
             if len(self.waiting) == TURN:
                 self.race()
@@ -294,7 +294,7 @@ class Flight:
         look = self.looks.get(method)
         start = time.process_time_ns()
         if look is None:
-            sighting = self.perceiver.tracker.process_image(seconds, image, model)
+            sighting = Tracker.process_image(self.perceiver.tracker, seconds, image, model)
             spent = time.process_time_ns() - start
             self.errors[method].frame(stamp, sighting.estimates, sighting.stages)
         else:
@@ -310,8 +310,8 @@ class Flight:
         other.take_camera_info(self.info)
         for state in self.own[-3:]:
             other.take_odometry(state)
-            other.tracker.process_image(
-                1e-9 * (state.stamp - self.own[-3:][0].stamp), image, model)
+            Tracker.process_image(other.tracker, 1e-9 * (state.stamp - self.own[-3:][0].stamp),
+                                  image, model)
         for look in self.looks.values():
             look(image)
         gc.collect()
@@ -393,11 +393,12 @@ class Cameras:
                     one.take_image(message, stamp, now * 1e-9, camera)
             if topic == '/odom':
                 one.take_odometry(from_odometry(message))
-            while (due := one.due(now * 1e-9)) is not None:
-                pixels = decode_image(due.message)
-                if setup == 'two, one sees' and due.camera == '1':
+            while (ready := one.process(now * 1e-9)) is not None:
+                pixels = ready.pixels
+                assert pixels is not None
+                if setup == 'two, one sees' and ready.image.camera == '1':
                     pixels = np.ascontiguousarray(pixels[:, ::-1])  # a marker of nobody
-                self.waiting[setup].append((due, pixels))
+                self.waiting[setup].append((ready.image, pixels))
         if len(self.waiting['one']) >= SHORT_TURN:
             self.race()
 
@@ -410,9 +411,9 @@ class Cameras:
             start = time.process_time_ns()
             for image, pixels in self.waiting[setup]:
                 assert image.model is not None
-                if one.tracker.wanted(image.stamp, image.model, image.camera):
-                    sighting = one.tracker.process_image(
-                        image.stamp, pixels, image.model, image.camera)
+                if Tracker.wanted(one.tracker, image.stamp, image.model, image.camera):
+                    sighting = Tracker.process_image(
+                        one.tracker, image.stamp, pixels, image.model, image.camera)
                     self.found[setup] += len(sighting.estimates)
             self.spent[setup].append((time.process_time_ns() - start) * 1e-6)
             self.waiting[setup].clear()
@@ -429,11 +430,23 @@ class Cameras:
         return {setup: float(np.median(of_one[setup])) for setup in CAMERAS}
 
 
+class Waiting(Tracker):
+    """A tracker whose images are decoded, and processed later, in a turn."""
+
+    def wanted(self, *_: Any) -> bool:
+        """Return that an image is decoded."""
+        return True
+
+    def process_image(self, *_: Any) -> Sighting:
+        """Return nothing yet."""
+        return Sighting()
+
+
 def perceiver(config: neighbors.NeighborConfig,
               mountings: Sequence[Transform] = ()) -> Perceiver:
     """Return what perceives with one camera, or with several, named '0', '1' and so on."""
     several = {str(k): MountedCamera(place) for k, place in enumerate(mountings)}
-    return Perceiver(Tracker(config, several or T_BODY_OPTICAL), max_wait=MAX_WAIT)
+    return Perceiver(Waiting(config, several or T_BODY_OPTICAL), max_wait=MAX_WAIT)
 
 
 def misses(results: dict[str, Figures], bounds: Bounds) -> list[str]:

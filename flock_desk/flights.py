@@ -114,9 +114,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(args)
     try:
-        _COUNTS.check('--runs', options.runs)
-        _COUNTS.check('--jobs', options.jobs)
-        _SEEDS.check('--seed', options.seed)
+        for name, valid in (('runs', _COUNTS), ('jobs', _COUNTS), ('seed', _SEEDS)):
+            valid.check(f'--{name}', getattr(options, name))
     except ValueError as error:
         parser.error(str(error))
     if options.keys:

@@ -175,8 +175,8 @@ def seen_tags(recording: Recording, read: Read,
         outcome = track.update(time, T_odom_tag, np.zeros(3), covariance)
         if outcome is UpdateOutcome.STARTED:
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
-        point = T_base_camera.apply(fitted.pose.translation)
-        if change := offset.take(str(tag.number), time, point, buffer):
+        if change := offset.take(str(tag.number), time, fitted.pose.translation, T_base_camera,
+                                 buffer):
             view = View.of(own, T_base_camera, 0.0)
             for other in filters.values():
                 if other.newest is not None:

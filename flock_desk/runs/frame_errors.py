@@ -26,7 +26,7 @@ to leader and follower in odom, does not count. Their covariances follow from th
   that moves with the integral of v_F, so v_L follows the true velocity plus the error of v_F,
   which cancels as far as v_L has followed it. The lag is in P_v, because the random walk of that
   error is part of the filter's noise (``odometry_noise``). P = R' P_v R; the covariance of the
-  odometry's velocity, added, would count it twice.
+  odometry's velocity, added, would count it twice. Its white noise, as measured, is in P_v.
 
 P_v is the filter's covariance of the velocity in odom. The covariance in the message is that of
 the twist in the leader's body, so it also holds the error of the leader's attitude, of which the

@@ -54,10 +54,13 @@ _QUARTER_TURNS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
                   if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
 
-#: Prior deviations of the mounting, rad, of the ratio of the shifts, and of 1 / depth, 1/m.
-PRIOR = np.array([0.5, 0.5, 0.5, 1.0, 0.5])
-#: Measured errors were up to so many times the deviations. The least deviation of the ratio.
-WIDENED, ZOOM_ERROR = 2.0, 0.03
+#: Prior deviations of the mounting, rad, of the ratio of the shifts, and of 1 / depth of each
+#: part, 1/m.
+PRIOR = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (ROWS * COLUMNS)])
+#: Measured errors were up to so many times the deviations. The least deviation of the ratio. The
+#: deviation of 1 / depth, as a share of it. Turned by hand, the camera moves on an arc, which
+#: near walls looks like a longer focal length, unless it pitches by this share of its yaw.
+WIDENED, ZOOM_ERROR, DEPTHS, BOTH = 2.0, 0.03, 1.0, 0.2
 _PASSES, _FAR = 8, 2.0
 
 #: Returns attitudes (m, 4) at stamps (m,), s, and where they are known (m,).
@@ -159,17 +162,19 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
         solution, covariance = _refined(
             turned @ R, moved @ R, known[:, 4:].reshape(-1, ROWS * COLUMNS, 3), camera)
         curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))
+    rates = np.sqrt(np.mean((turned @ R)[:, :2]**2, axis=0))
+    error = ZOOM_ERROR if rates.min() > BOTH * rates.max() else 1.0
     return AxesFit(
         float(shares[:, 0].max()), float(shares.max()), turns[best], offset, float(curve.max()),
         float(curve[len(offsets) // 2]), R @ solution[:3],
         WIDENED * np.sqrt((R @ covariance[:3, :3] @ R.T).diagonal()), float(solution[3]),
-        math.hypot(WIDENED * math.sqrt(covariance[3, 3]), ZOOM_ERROR))
+        math.hypot(WIDENED * math.sqrt(covariance[3, 3]), error))
 
 
 def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
              ) -> tuple[Array, Array]:
     """
-    Return mounting (3,), rad, zoom and 1 / depth by least squares, and their covariance (5, 5).
+    Return mounting (3,), rad, zoom and each 1 / depth by least squares; covariance of the first 4.
 
     :param turned: rotation vectors (n, 3), rad; :param moved: displacements (n, 3), m, both in
         optical axes as configured. :param parts: their shifts (n, PARTS, 3).
@@ -181,23 +186,27 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
     by_point = camera.linearize(rays)[1] / camera.matrix[0, 0]
     by_turn = by_point @ np.array([skew(ray) for ray in rays])
     seen, good = parts[:, :, :2] / camera.matrix[0, 0], parts[:, :, 2] >= RESPONSE
-    start = solution = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
+    start = solution = (np.arange(len(PRIOR)) == 3).astype(float)
     prior = np.diag(PRIOR**-2)
+    by_depth = (by_point @ moved[:, None, :, None]) * -np.eye(len(rays))[:, None]
     for _ in range(_PASSES):
         vectors = turned @ rotation_vector_to_matrix(solution[:3])
         by_mounting = np.array([skew(vector) for vector in vectors])
-        design = np.concatenate([  # (n, PARTS, 2, 5)
+        design = np.concatenate([  # (n, PARTS, 2, 4 + PARTS)
             solution[3] * by_turn @ by_mounting[:, None],
-            (by_turn @ vectors[:, None, :, None]), -by_point @ moved[:, None, :, None]], axis=3)
+            by_turn @ vectors[:, None, :, None], by_depth], axis=3)
         off = seen - design[..., 3:] @ solution[3:]
         length = np.linalg.norm(off, axis=2)
-        scale = max(_FAR * float(np.median(length[good])), 1e-5)
-        weights = good / (1.0 + (length / scale)**2)**2  # a part that shows the leader has none
+        # A part that shows the leader has no weight.
+        weights = good / (1.0 + (length / (_FAR * np.median(length[good]) + 1e-5))**2)**2
         weights *= 2.0 * weights.sum() / max(float(np.sum(weights * length**2)), 1e-9)
         information = np.einsum('nkim,nk,nkil->ml', design, weights, design) + prior
         moment = np.einsum('nkim,nk,nki->m', design, weights, off + design @ solution)
         solution = np.linalg.solve(information, moment + prior @ start)
-    return solution, np.linalg.inv(information)
+    # In a room the depths change as the camera turns: the effect on the rest of all alike.
+    effect = DEPTHS * float(np.sqrt(np.mean(solution[4:]**2))) * np.linalg.solve(
+        information[:4, :4], information[:4, 4:]).sum(axis=1)
+    return solution, np.linalg.inv(information)[:4, :4] + np.outer(effect, effect)
 
 
 def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:

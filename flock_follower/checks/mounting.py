@@ -55,18 +55,20 @@ def check_mounting(estimates: Sequence[tuple[Array, Array]], rpy: Sequence[float
     turn = np.sum([turn * deviations**-2 for turn, deviations in estimates], axis=0) / information
     margin = SURE / np.sqrt(information)
     wrong = np.abs(turn) > np.maximum(LOOKS, margin)
-    open_axes = [axis for axis, bad, by in zip(_AXES, wrong, margin) if not bad and by > LOOKS]
-    unknown = f'{", ".join(open_axes)} unknown' if open_axes else ''
+    unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
+                        if not bad and by > LOOKS)
     if not wrong.any():
-        return unmeasured(WHAT, f'{unknown}: roll, pitch and yaw it by hand, 30 deg', MOUNTED) if (
-            unknown) else ok(WHAT, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', MOUNTED)
+        return unmeasured(
+            WHAT, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', MOUNTED) if (
+                unknown) else ok(
+                    WHAT, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', MOUNTED)
     looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
                       for way, angle, bad in zip(_WAYS, turn.tolist(), wrong) if bad)
-    fitting = rpy_from_matrix(rotation_vector_to_matrix(np.where(wrong, turn, 0.0))
-                              @ quaternion_to_matrix(quaternion_from_rpy(*rpy)))
-    shown = ','.join(str(round(angle, 3) + 0.0) for angle in fitting.tolist())
+    fitting = ','.join(str(round(angle, 3) + 0.0) for angle in rpy_from_matrix(
+        rotation_vector_to_matrix(np.where(wrong, turn, 0.0))
+        @ quaternion_to_matrix(quaternion_from_rpy(*rpy))).tolist())
     return judged(
         float(np.abs(turn[wrong]).max()) > BAD_LOOKS, True, WHAT,
-        '; '.join(filter(None, [f'camera {looks} than configured', unknown])), MOUNTED,
-        f'camera_rpy:=[{shown}] would fit, in relative_pose and planner; or is the pose of the '
+        f'camera {looks} than configured{f"; {unknown} unknown" if unknown else ""}', MOUNTED,
+        f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose of the '
         'odometry on the body (odom_child_rpy) wrong?')

@@ -270,7 +270,8 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     """Check the focal length; in a fisheye image the flow changes too much within a part."""
     what, wanted = 'focal length', 'images move as far as it says'
     if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
-        return unmeasured(what, 'a fisheye lens' if fisheye else 'turned too little', wanted)
+        return unmeasured(what, 'a fisheye lens' if fisheye else
+                          'turned too little: pitch and yaw it by hand', wanted)
     wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SURE * fit.zoom_deviation)
     return judged(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',

@@ -85,6 +85,7 @@ SUITING = 0.3  # rad/s: angular velocities that differ more from the turn do not
 
 
 _NO_TRAVEL: Array = np.zeros(3)
+_ONES = np.ones(3)
 
 
 class OdometrySample(NamedTuple):
@@ -308,10 +309,10 @@ class OdometryBuffer:
         # Quaternions times this are the state's inverse times them: by how much they are off.
         off = recent[:, _ATTITUDE].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
                                                  [-x, -y, -z, w]]))
-        apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
+        apart = np.copysign(2.0, off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
         if not self._agree(apart, recent[:, _VELOCITY]):
             return state
-        agreeing = (apart * apart).dot(np.ones(3)) < max(self.AGREEMENT**2, 9.0 * self._near)
+        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state

@@ -249,8 +249,6 @@ SAME: Final[float] = 0.1
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
 SHARE: Final[float] = 0.03
-#: Number of windows that are kept for ``check``: those of 300 s.
-KEPT: Final[int] = 600
 #: A piece: time, s, then m: way (3,), and how much longer it is by either reading (2, 3). In plain
 #: numbers: arrays so small would take several times as long, for every message.
 _NOTHING: Final = (0.0,) * 10
@@ -270,8 +268,10 @@ class TwistFrame:
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
         """Error of the frame in use, m/s, in the window that last contradicted it."""
-        self.windows: deque[Array] = deque(maxlen=KEPT)
-        """Mean velocities (3, 3), m/s, in odom: by the positions, and in the two readings."""
+        self.windows: deque[Array] = deque(maxlen=600)
+        """Mean velocities (3, 3), m/s, in odom, of the last 300 s for ``check``: by the positions,
+        and in the two readings.
+        """
         self._before = ''  # the frame found before the velocity was dropped
         self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
@@ -357,10 +357,10 @@ class TwistFrame:
         :param offs: (n, 2, 3), m: how much longer the ways are by the two readings.
         """
         time = float(times.sum())
-        way, mean = ways.sum(axis=0) / time, offs.sum(axis=0) / time
-        speed = float(np.linalg.norm(way))
+        way, mean = ways.sum(axis=0), offs.sum(axis=0) / time
+        speed = float(np.linalg.norm(way)) / time
         tolerance = 3.0 * (DEVIATION + SHARE * speed)
-        self.windows.append(np.array([way, *(way + mean)]))
+        self.windows.append(np.array([way / time, *(way / time + mean)]))
         means = np.linalg.norm(mean, axis=1)
         # Noise of the positions is least in the mean, and single steps do not show in the median.
         medians = np.linalg.norm(np.median(offs / times[:, None, None], axis=0), axis=1)

@@ -90,7 +90,7 @@ class LearntNoise:
 
     def take(self, change: Array, expected: Array, sight: Array) -> None:
         """
-        Take the change of a position's innovation: ``Step.change`` and ``Step.expected``.
+        Take the change of a position's innovation: the fields of ``neighbor_filter.Change``.
 
         :param sight: from the own vehicle to the neighbour (3,), m.
         """
@@ -103,9 +103,9 @@ class LearntNoise:
                     + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
         across, across_variance = u * u + v * v + w * w - along, xx + yy + zz - variance
         self._count = min(self._count + 1, LEARNT)
-        # Two axes across, each off by the noise times the distance.
-        for_attitude = _excess(across, across_variance) / (2.0 * squared * self._count)
-        for_distance = _excess(along, variance) / (squared * self._count)
+        # Two axes across, each off by the noise times the distance, in two innovations.
+        for_attitude = _excess(across, across_variance) / (4.0 * squared * self._count)
+        for_distance = _excess(along, variance) / (2.0 * squared * self._count)
         self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
         self._along = min(max(self._along + for_distance, 0.0), MOST**2)
 
@@ -118,10 +118,7 @@ def _excess(squared: float, expected: float) -> float:
 #: learnt motion.
 MEAN_TIME: Final = 0.25
 NOISE_TIME: Final = 2.0
-MOTION_TIME: Final = 1.0
-#: Target of the squared mean innovation, as share of that of white noise. With 1 the filter would
-#: follow fast errors of the own velocity too slowly for its covariance.
-AIM: Final = 0.85
+MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.05, 16.0)
@@ -162,7 +159,7 @@ class LearntMotion:
                     0.5 * (off - self._before[k])**2 - self._noises[k])
             self._before[k] = off
             self._means[k] += weight * (off - self._means[k])
-            surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - AIM
+            surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - 1.0
             factor = self.factors[k] * math.exp(
                 min(dt, GAP) / MOTION_TIME * min(surplus, STRONGEST))
             self.factors[k] = min(max(factor, FACTORS[0]), FACTORS[1])

@@ -157,7 +157,7 @@ class UpdateOutcome(Enum):
 
 class Change(NamedTuple):
     """
-    The difference of two successive innovations of the position, divided by the root of 2.
+    The difference of two successive innovations of the position.
 
     ``covariance`` (3, 3) is that of ``difference`` (3,), m, if innovations are white.
     """
@@ -315,8 +315,7 @@ class NeighborFilter:
         self._motion.take(dt, innovation, covariance)
         before, self._before = self._before, (innovation, covariance)
         if before is not None and dt <= GAP:
-            self.change = Change(math.sqrt(0.5) * (innovation - before[0]),
-                                 0.5 * (covariance + before[1]))
+            self.change = Change(innovation - before[0], covariance + before[1])
 
     def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
                   covariance: Array) -> tuple[Array, bool, Array, Array, Array]:

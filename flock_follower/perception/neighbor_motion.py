@@ -58,7 +58,8 @@ class Estimate(NamedTuple):
     ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
     ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
     odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
-    what the own odometry errs by, both share.
+    both share the errors of the own odometry, but for the white noise of the own attitude and
+    velocity, which published covariances include.
     """
 
     stamp: float

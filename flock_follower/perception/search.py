@@ -53,8 +53,10 @@ SIDE = 56.0
 LARGE = 1280
 _LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels: what is darker is noise
 _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
-#: px: a narrow one keeps the edge of a shadow narrow, a wide one finds blurred outlines.
-_WINDOWS = (7, 15)
+#: Side of the window for the mean, px, and of the brush that removes what is narrower. A narrow
+#: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
+#: The brush cuts off the dark rim of a shadow that crosses the paper.
+_WINDOWS = ((7, 1), (15, 1), (11, 3))
 _DARKER = 7  # by so much of the logarithm than the mean of the window is what is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
@@ -177,9 +179,10 @@ def quadrilaterals(logarithm: GrayImage) -> Array:
     """Return the quadrilaterals (n, 4, 2), px, clockwise, that may be the outlines of markers."""
     smooth = cv2.blur(logarithm, (3, 3))
     found = []
-    for window in _WINDOWS:
+    for window, brush in _WINDOWS:
         dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C,
                                      cv2.THRESH_BINARY_INV, window, _DARKER)
+        dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((brush, brush), dtype=np.uint8))
         contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         holes = [] if tree is None else (tree[0, :, 3] >= 0).tolist()
         for contour, hole in zip(contours, holes):

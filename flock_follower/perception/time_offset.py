@@ -101,14 +101,15 @@ class TimeOffset:
         known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
         if self._found:
             return f'{known}, applied'
-        return f'{known}, not applied: {1e3 * self.applied:.1f} ms is'
+        return f'{known}, not applied; {1e3 * self.applied:.1f} ms is applied'
 
-    def take(self, name: str, time: float, point: Array, odometry: OdometryBuffer) -> float:
+    def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
+             odometry: OdometryBuffer) -> float:
         """
         Take where a camera saw a neighbour; return by how much the applied offset changed, s.
 
         :param time: of the exposure by the camera's clock, s.
-        :param point: (3,), m, in base_link.
+        :param camera_point: a point of the neighbour, (3,), m, in the optical frame.
         """
         if time < self._resting:
             return 0.0
@@ -116,7 +117,7 @@ class TimeOffset:
         if path and not 0.0 < time - path[-1][0] < 0.5 * BATCH:
             path.clear()
         if not path or time - path[-1][0] > 0.9 * BATCH / MOST_POINTS:
-            path.append((time, point))
+            path.append((time, T_body_camera.apply(camera_point)))
         last = (odometry.newest or time) - self._first - FURTHEST
         if path[0][0] + BATCH > last:
             return 0.0

@@ -70,7 +70,7 @@ from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 MARGIN = 100.0
 #: and otherwise in one of so many.
 MIRRORED_EVERY = 30
-_EYE = np.eye(3)
+_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -277,10 +277,12 @@ class Tracker:
             own = view.own
         # White noise of the own attitude and velocity at the stamp: the filter averages over it.
         attitude, velocity = self._odometry.white_noise
-        sight, covariance = estimate.position - own.travel, estimate.covariance.copy()
-        covariance[POSITION, POSITION] += attitude * (
-            sight.dot(sight) * _EYE - sight[:, None] * sight)
-        covariance[VELOCITY, VELOCITY] += velocity * _EYE
+        x, y, z = (estimate.position - own.travel).tolist()
+        covariance = estimate.covariance.copy()
+        covariance[POSITION, POSITION] += attitude * np.array(
+            [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
+             [-x * z, -y * z, x * x + y * y]])
+        covariance[_VELOCITIES, _VELOCITIES] += velocity
         return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
                                  covariance=covariance)
 
@@ -454,8 +456,8 @@ class Tracker:
         change, estimate = self._filters[name].change, self._filters[name].newest
         if change is not None and estimate is not None:
             camera.noise.take(*change, estimate.position - view.own.travel)
-        point = camera.T_body_camera.apply(measurement.T_camera_body.apply(measurement.reference))
-        shift = camera.time_offset.take(name, time, point, self._odometry)
+        point = measurement.T_camera_body.apply(measurement.reference)
+        shift = camera.time_offset.take(name, time, point, camera.T_body_camera, self._odometry)
         if not shift:
             return
         camera.noise.restart()

@@ -214,7 +214,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        what, before = 'heard estimate' if n.received else 'estimate', kept.get(n.name)
+        what, before = 'received estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped

@@ -34,8 +34,13 @@ def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1
     learnt, rng = LearntNoise(0.0005), np.random.default_rng(seed)
     for _ in range(count):
         true = np.linalg.cholesky(BASE + covariance(attitude, distance))
-        learnt.take(true @ rng.standard_normal(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+        learnt.take(np.sqrt(2.0) * true @ rng.standard_normal(3), expected(learnt), SIGHT)
     return learnt
+
+
+def expected(learnt: LearntNoise) -> Array:
+    """Return the covariance of the difference of two measurements, (3, 3)."""
+    return 2.0 * (BASE + learnt.covariance(SIGHT)[:3, :3])
 
 
 def covariance(attitude: float, distance: float) -> Array:
@@ -59,14 +64,14 @@ def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
 
 def test_a_single_slip_does_not_make_it_large() -> None:
     learnt = fed(0.0005, 0.0)
-    learnt.take(0.5 * ACROSS, BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+    learnt.take(0.5 * ACROSS, expected(learnt), SIGHT)
     assert learnt.attitude < 0.001
 
 
 def test_it_is_forgotten_where_it_ends() -> None:
     learnt = fed(0.005, 0.01)
     for _ in range(5 * LEARNT):
-        learnt.take(np.zeros(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+        learnt.take(np.zeros(3), expected(learnt), SIGHT)
     assert learnt.attitude < 0.001
     assert learnt.distance < 0.001
     learnt.restart()
