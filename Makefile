@@ -1,7 +1,7 @@
 # Try it
 #   make demo      replay the sample bag through the real nodes into an embedded autopilot, and report (build/demo)
 #   make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
-#   make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes on 4 cores)
+#   make flights   fly every scenario 200 times in lock step, with five controllers (build/flights; many minutes)
 #   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # Change it
 #   make test      run the test suite (about six minutes on two cores)

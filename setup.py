@@ -44,13 +44,13 @@ setup(
     description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
     license='Apache-2.0',
     # Not needed in flight: for the figures, and for large flocks.
-    extras_require={'simulation': ['matplotlib', 'mcap', 'scipy'],
+    extras_require={'simulation': ['matplotlib', 'mcap', 'scipy', 'tqdm'],
                     'cluster': ['distributed'],
                     # Where there is no ROS; on a robot apt and rosdep bring all of it.
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
                                 'ros-jazzy-common-interfaces==5.3.6', 'matplotlib', 'numpy>=1.26',
                                 'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags',
-                                'mcap'],
+                                'mcap', 'tqdm'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [

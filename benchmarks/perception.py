@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Measure perception beside OpenCV's marker detector: CPU time, recall, accuracy, consistency.
+Measure perception beside other marker detectors: CPU time, recall, accuracy, consistency.
 
 ``make bench-perception``, or ``python benchmarks/perception.py --flights sample hard``. A flight
 is a bag of images, odometry and truth. Every image goes, in one process on one thread, through
@@ -21,11 +21,13 @@ is a bag of images, odometry and truth. Every image goes, in one process on one 
 - default: ``cv2.aruco.ArucoDetector`` with its default parameters over the whole image, then the
   square's pose by IPPE; velocity from the difference of two positions;
 - subpix: the same with ``CORNER_REFINE_SUBPIX``;
+- aruco2 and apriltag, if their packages are installed: see ``benchmarks/detectors.py``;
 - ours: ``Tracker.process_image`` as the node calls it, fed with the odometry.
 
 They take turns every thirty images, so that a slow moment of the machine is nobody's alone, and
 yet each finds its own code and data in the caches. The measure is this process's CPU time;
-decoding is outside. Exit code 0 only if every bound holds.
+decoding is outside. Exit code 0 only if every bound holds. The flight ``tag36h11`` is the sample
+with a marker that AprilTag and OpenCV both know.
 
 ``--flights cameras`` compares two cameras with one in the same way, on the sample: a second one
 that sees the leader as well, and a second one that looks back and sees nobody.
@@ -34,7 +36,7 @@ that sees the leader as well, and a second one that looks back and sees nobody.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 import gc
 import json
@@ -45,25 +47,35 @@ import time
 from typing import Any, NamedTuple
 
 import cv2
+from detectors import ARUCO, detectors, Look, TAG
 import numpy as np
 
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
+from flock_desk.camera.leader import (
+    leader,
+    marker_print,
+    SIDE_LENGTH,
+    T_BODY_MARKER,
+    T_BODY_OPTICAL,
+)
+from flock_desk.camera.renderer import Renderer
 from flock_desk.runs.frame_errors import FrameErrors
 from flock_desk.sample_bag import (
     IMAGE_RATE,
+    Recording,
     START_NS,
     VARIANTS,
     write,
 )
 from flock_follower.bags.bag import BagError, deserialize, open_bag
-from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
+from flock_follower.bags.writer import BagWriter
+from flock_follower.geometry import Array, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import decode_image, GrayImage
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
-from flock_follower.perception.tracker import camera_mounting, Tracker
+from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
 
@@ -75,8 +87,6 @@ MAX_WAIT = 0.05  # s that an image waits for odometry, as in the node
 WRONG = np.deg2rad(20.0)
 #: A velocity less certain than this, m/s, does not count: the planner does not use it either.
 VELOCITY_STD = PlannerParams().max_velocity_std
-
-Look = Callable[[GrayImage], Transform | None]  # returns T_camera_marker
 
 
 class Bounds(NamedTuple):
@@ -98,6 +108,7 @@ FLIGHTS = {
     'full_hd': Bounds(25.0, 0.004, 0.03, 0.01),
     'hard': Bounds(7.0, 0.015),
     'fisheye': Bounds(7.0),
+    'tag36h11': Bounds(7.0, 0.004, 0.03, 0.01),
 }
 #: Of the normalised estimation error squared (NEES) of position and of velocity: half to twice
 #: their three dimensions.
@@ -135,7 +146,8 @@ class State(NamedTuple):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the flights, print the tables and the bounds missed, and return the exit code."""
-    parser = argparse.ArgumentParser(description='Measure perception beside the default detector.')
+    parser = argparse.ArgumentParser(
+        description='Measure perception beside other marker detectors.')
     choices = [*FLIGHTS, 'cameras']
     parser.add_argument('--flights', nargs='+', choices=choices, default=choices,
                         metavar='NAME', help=f'of {", ".join(choices)} (default: all)')
@@ -157,7 +169,8 @@ def main(args: Sequence[str] | None = None) -> int:
                            if share > CAMERAS[setup]]
                 figures[name] = {'cpu_share': shares}
                 continue
-            results = Flight(flight_bag(name), options.frames).figures()
+            results = Flight(flight_bag(name), options.frames,
+                             TAG if name == 'tag36h11' else ARUCO).figures()
             show(name, results)
             missed += [f'{name}: {text}' for text in misses(results, FLIGHTS[name])]
             figures[name] = {method: f._asdict() for method, f in results.items()}
@@ -179,11 +192,26 @@ def flight_bag(name: str) -> Path:
     whole, short = BAGS / name, BAGS / 'short' / name
     if whole.exists() or short.exists():
         return whole if whole.exists() else short
+    if name == 'tag36h11':
+        write_tagged(short)
+        return short
     variant, bag = VARIANTS[name], whole
     if name in ('hd', 'full_hd'):  # the same flight as the sample: what is new is the time
         variant, bag = replace(variant, duration=SHORT / IMAGE_RATE), short
-    write(variant, 1, bag, os.cpu_count() or 1, sys.stderr)
+    write(variant, 1, bag, os.cpu_count() or 1)
     return bag
+
+
+def write_tagged(bag: Path) -> None:
+    """Write the first images of the sample, with marker 0 of the dictionary TAG on the leader."""
+    variant = replace(VARIANTS['sample'], duration=SHORT / IMAGE_RATE)
+    recording, cells = Recording(variant), neighbors.marker_cells(TAG)
+    code = np.pad(neighbors.draw_marker(TAG, 0, cells) > 127, 1, constant_values=True)
+    recording.renderer = Renderer(variant.camera, variant.sensor, leader(
+        marker_print(code.astype(float), SIDE_LENGTH / cells)))
+    with BagWriter(bag) as writer:
+        for message in recording.messages(map(recording.image, range(SHORT))):
+            writer.write(message.topic, message.msgtype, message.stamp_ns, message.data)
 
 
 class Flight:
@@ -191,11 +219,14 @@ class Flight:
     Plays a bag through every method, turn by turn.
 
     :param count: images to play, 0 for all.
+    :param dictionary: of the leader's marker.
     """
 
-    def __init__(self, bag: Path, count: int) -> None:
-        self.config = neighbors.load(resource('config/neighbors.yaml'))
-        self.methods = ('default', 'subpix', 'ours')
+    def __init__(self, bag: Path, count: int, dictionary: str = ARUCO) -> None:
+        self.config = replace(neighbors.load(resource('config/neighbors.yaml')),
+                              dictionary=dictionary)
+        self.detectors = detectors(dictionary)
+        self.methods = (*self.detectors, 'ours')
         self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
         self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)
                        for m in self.methods}
@@ -233,17 +264,17 @@ class Flight:
             if self.perceiver.take_camera_info(message):
                 model = self.perceiver.model()
                 assert model is not None
-                self.looks = {'default': detector(model, cv2.aruco.CORNER_REFINE_NONE),
-                              'subpix': detector(model, cv2.aruco.CORNER_REFINE_SUBPIX)}
+                self.looks = {name: Look(model, corners, SIDE_LENGTH)
+                              for name, corners in self.detectors.items()}
         else:
             stamp = stamp_to_nanoseconds(message.header.stamp)
             self.perceiver.take_image(message, stamp, now * 1e-9)
-        while (due := self.perceiver.due(now * 1e-9)) is not None:
-            pixels = decode_image(due.message)
-            assert due.model is not None
+        while (ready := self.perceiver.process(now * 1e-9)) is not None:
+            image, pixels = ready.image, ready.pixels
+            assert image.model is not None and pixels is not None
             if not self.images:
-                self.warm_up(pixels, due.model)
-            self.waiting.append((due.stamp_ns, due.stamp, pixels, due.model))
+                self.warm_up(pixels, image.model)
+            self.waiting.append((image.stamp_ns, image.stamp, pixels, image.model))
             self.images += 1
             if len(self.waiting) == TURN:
                 self.race()
@@ -263,7 +294,7 @@ class Flight:
         look = self.looks.get(method)
         start = time.process_time_ns()
         if look is None:
-            sighting = self.perceiver.tracker.process_image(seconds, image, model)
+            sighting = Tracker.process_image(self.perceiver.tracker, seconds, image, model)
             spent = time.process_time_ns() - start
             self.errors[method].frame(stamp, sighting.estimates, sighting.stages)
         else:
@@ -279,8 +310,8 @@ class Flight:
         other.take_camera_info(self.info)
         for state in self.own[-3:]:
             other.take_odometry(state)
-            other.tracker.process_image(
-                1e-9 * (state.stamp - self.own[-3:][0].stamp), image, model)
+            Tracker.process_image(other.tracker, 1e-9 * (state.stamp - self.own[-3:][0].stamp),
+                                  image, model)
         for look in self.looks.values():
             look(image)
         gc.collect()
@@ -362,11 +393,12 @@ class Cameras:
                     one.take_image(message, stamp, now * 1e-9, camera)
             if topic == '/odom':
                 one.take_odometry(from_odometry(message))
-            while (due := one.due(now * 1e-9)) is not None:
-                pixels = decode_image(due.message)
-                if setup == 'two, one sees' and due.camera == '1':
+            while (ready := one.process(now * 1e-9)) is not None:
+                pixels = ready.pixels
+                assert pixels is not None
+                if setup == 'two, one sees' and ready.image.camera == '1':
                     pixels = np.ascontiguousarray(pixels[:, ::-1])  # a marker of nobody
-                self.waiting[setup].append((due, pixels))
+                self.waiting[setup].append((ready.image, pixels))
         if len(self.waiting['one']) >= SHORT_TURN:
             self.race()
 
@@ -379,9 +411,9 @@ class Cameras:
             start = time.process_time_ns()
             for image, pixels in self.waiting[setup]:
                 assert image.model is not None
-                if one.tracker.wanted(image.stamp, image.model, image.camera):
-                    sighting = one.tracker.process_image(
-                        image.stamp, pixels, image.model, image.camera)
+                if Tracker.wanted(one.tracker, image.stamp, image.model, image.camera):
+                    sighting = Tracker.process_image(
+                        one.tracker, image.stamp, pixels, image.model, image.camera)
                     self.found[setup] += len(sighting.estimates)
             self.spent[setup].append((time.process_time_ns() - start) * 1e-6)
             self.waiting[setup].clear()
@@ -398,35 +430,23 @@ class Cameras:
         return {setup: float(np.median(of_one[setup])) for setup in CAMERAS}
 
 
+class Waiting(Tracker):
+    """A tracker whose images are decoded, and processed later, in a turn."""
+
+    def wanted(self, *_: Any) -> bool:
+        """Return that an image is decoded."""
+        return True
+
+    def process_image(self, *_: Any) -> Sighting:
+        """Return nothing yet."""
+        return Sighting()
+
+
 def perceiver(config: neighbors.NeighborConfig,
               mountings: Sequence[Transform] = ()) -> Perceiver:
     """Return what perceives with one camera, or with several, named '0', '1' and so on."""
     several = {str(k): MountedCamera(place) for k, place in enumerate(mountings)}
-    return Perceiver(Tracker(config, several or T_BODY_OPTICAL), max_wait=MAX_WAIT)
-
-
-def detector(camera: CameraModel, refinement: int) -> Look:
-    """Return OpenCV's way from an image to the pose of marker 0."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = refinement
-    aruco = cv2.aruco.ArucoDetector(
-        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
-    h = SIDE_LENGTH / 2
-    square = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
-
-    def look(image: GrayImage) -> Transform | None:
-        corners, ids, _ = aruco.detectMarkers(image)
-        for found, marker_id in zip(corners, [] if ids is None else np.ravel(ids)):
-            if marker_id == 0:
-                points, K, D = found.reshape(-1, 1, 2), camera.matrix, camera.distortion
-                if camera.model == 'equidistant':
-                    points = cv2.fisheye.undistortPoints(points, K, D)
-                    K, D = np.eye(3), np.zeros(4)
-                ok, r, t = cv2.solvePnP(square, points, K, D, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-                return Transform(rotation_vector_to_matrix(r.ravel()), t.ravel()) if ok else None
-        return None
-
-    return look
+    return Perceiver(Waiting(config, several or T_BODY_OPTICAL), max_wait=MAX_WAIT)
 
 
 def misses(results: dict[str, Figures], bounds: Bounds) -> list[str]:
@@ -452,15 +472,15 @@ def misses(results: dict[str, Figures], bounds: Bounds) -> list[str]:
 
 def show(name: str, results: dict[str, Figures]) -> None:
     """Print the table of a flight."""
-    print(f'\n{name:<10}    CPU, ms per image            recall   distance, cm     velocity   '
+    print(f'\n{name:<13}    CPU, ms per image            recall   distance, cm     velocity   '
           'turned     NEES of 3\n'
-          '                mean     p50     p99   ratio           bias     RMS    RMS m/s   '
+          '                   mean     p50     p99   ratio           bias     RMS    RMS m/s   '
           '> 20 deg   position  velocity')
     for method, f in results.items():
         ratio = results['default'].cpu_ms_mean / f.cpu_ms_mean
-        nees = '' if np.isnan(f.nees_position) else (
+        nees = '' if not np.isfinite(f.nees_position) else (
             f'{f.nees_position:11.2f}{f.nees_velocity:10.2f}')
-        print(f'  {method:<10}{f.cpu_ms_mean:8.2f}{f.cpu_ms_p50:8.2f}{f.cpu_ms_p99:8.2f}'
+        print(f'  {method:<13}{f.cpu_ms_mean:8.2f}{f.cpu_ms_p50:8.2f}{f.cpu_ms_p99:8.2f}'
               f'{ratio:8.1f}{f.recall:9.3f}{100 * f.distance_bias_m:8.2f}'
               f'{100 * f.distance_rms_m:8.2f}{f.velocity_rms_m_s:11.3f}{f.turned_share:11.1%}'
               f'{nees}', flush=True)

@@ -17,8 +17,9 @@ The figures of the paper, redrawn: ``python -m flock_desk.figures``.
 
 Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) with curves: those on simulations, and
 a table of what they show, for the law and the models it is compared with; and those on flights,
-from what ``fly`` has recorded of the same scenarios. With ``--agents N`` one larger flock. Each is
-as wide as a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
+from what ``fly`` has recorded of the same scenarios; and the controllers that ``flights``
+compared, runs in the band against jerk. With ``--agents N`` one larger flock. Each is as wide as
+a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
 
 For a scenario that has not been flown yet a line says how to fly it; the exit code stays 0. If a
 flight cannot be read it is 1, after all else has been drawn.
@@ -30,6 +31,8 @@ import argparse
 from collections.abc import Iterable, Sequence
 import csv
 from functools import partial
+from itertools import groupby
+import json
 from pathlib import Path
 import sys
 
@@ -54,6 +57,9 @@ MODELS: dict[Model, str] = {
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
+#: The controllers of ``flights``, by key of flights.json.
+CONTROLLERS = {'law': 'law', 'guard': 'law and guard', 'pd': 'PD servo',
+               'cucker_smale': 'Cucker-Smale', 'cucker_dong': 'Cucker-Dong'}
 #: The scenarios of ``fly`` that the paper shows flights of.
 FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
@@ -73,7 +79,8 @@ def _draw(options: argparse.Namespace) -> int:
     else:
         written = redraw(options.out)
         flown, notes, faults = redraw_flights(options.out, options.flights)
-        written += flown
+        compared, note = redraw_controllers(options.out, options.campaign)
+        written, notes = [*written, *flown, *compared], [*notes, *note]
     print('\n'.join(['', *notes, f'written to {options.out}: {", ".join(written)}']))
     for fault in faults:
         print(f'error: {fault}', file=sys.stderr)
@@ -103,11 +110,11 @@ def redraw(out: Path) -> list[str]:
     figures = {
         'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
         'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
-        'leaderless_distances': lambda: plots.distances(alone, 10.0, (0.5, 2.0)),
+        'leaderless_distances': lambda: plots.distances(alone, 10.0),
         'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
         'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
         'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
-        'leader_distances': lambda: plots.distances(led, 10.0, (0.0, 4.0), unseen),
+        'leader_distances': lambda: plots.distances(led, 10.0, unseen),
     }
     written = []
     for name, draw in figures.items():
@@ -150,6 +157,28 @@ def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list
                     f'{100.0 * flight.time_in_band_share:.1f} % of the time in the band'
                     f'{", flown by an autopilot elsewhere" if flight.external else ""}')
     return written, notes, faults
+
+
+def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
+    """
+    Write the comparison of controllers, and return the names and the note without it.
+
+    :param path: flights.json of ``flights``; only scenarios that all controllers flew count.
+    """
+    from flock_desk.runs import paper_plots as plots
+    results = json.loads(path.read_text()) if path.exists() else {}
+    flown = sorted((round(each['law']['max_speed_m_s'] / each['law']['max_speed_share'], 3), name)
+                   for name, each in results.items() if CONTROLLERS.keys() <= each.keys())
+    if not flown:
+        return [], [f'controllers: not drawn, {path} does not have them: make flights']
+    means = dict[float, dict[str, tuple[float, float]]]()
+    for v_max, group in groupby(flown, lambda each: each[0]):
+        names = [name for _, name in group]
+        means[v_max] = {title: (
+            float(np.mean([results[name][key]['horizontal_jerk_m_s3'] for name in names])),
+            float(np.mean([results[name][key]['in_band'] for name in names])))
+            for key, title in CONTROLLERS.items()}
+    return [plots.save(plots.controllers(means), out / 'controllers')], []
 
 
 def one_flock(options: argparse.Namespace) -> list[str]:
@@ -221,6 +250,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
     parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
                         help='folder of the flights of fly; %(default)s')
+    parser.add_argument('--campaign', type=Path, default=Path('build/flights/flights.json'),
+                        metavar='FILE', help='results of flights; %(default)s')
     flock = parser.add_argument_group('one larger flock')
     flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
     flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')

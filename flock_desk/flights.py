@@ -15,9 +15,9 @@
 """
 Many flights in lock step, without rendering: ``python -m flock_desk.flights``.
 
-Flies every scenario with the law alone and with law and guard, the same draws of chance for both,
-and prints and writes how they went: OUTPUT/flights.json. The same seed gives the same file,
-whatever the number of jobs.
+Flies every scenario with several controllers, with the same random draws for each: the law alone,
+law and guard, and those of ``closed_loop/controllers.py``. Prints and writes the results:
+OUTPUT/flights.json. The same seed gives the same file for any number of jobs.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
+from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
 from flock_desk.closed_loop.flight_metrics import (
     band_exits,
     joined,
@@ -64,7 +65,6 @@ from flock_follower.whole_file import whole_file
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
 MOST_EXITS = 5  # of a scenario that are named
-MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
 COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
@@ -95,7 +95,7 @@ class Task(NamedTuple):
     """Some runs of a scenario."""
 
     scenario: Scenario
-    mode: str
+    controller: str
     runs: range
 
 
@@ -114,9 +114,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(args)
     try:
-        _COUNTS.check('--runs', options.runs)
-        _COUNTS.check('--jobs', options.jobs)
-        _SEEDS.check('--seed', options.seed)
+        for name, valid in (('runs', _COUNTS), ('jobs', _COUNTS), ('seed', _SEEDS)):
+            valid.check(f'--{name}', getattr(options, name))
     except ValueError as error:
         parser.error(str(error))
     if options.keys:
@@ -131,8 +130,8 @@ def _campaign(options: argparse.Namespace) -> int:
         changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
         scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
     options.output.mkdir(parents=True, exist_ok=True)
-    results, cpu, exits = fly_all(scenarios, options.runs, options.jobs, options.seed,
-                                  options.scheduler)
+    results, cpu, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
+                                  options.seed, options.scheduler)
     path = options.output / 'flights.json'
     with whole_file(path) as file:
         file.write((json.dumps(results, indent=2) + '\n').encode())
@@ -171,45 +170,52 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
     return list(scenarios.values())
 
 
-def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
-            scheduler: str = '') -> tuple[Results, dict[str, Array], dict[str, list[str]]]:
+def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int, jobs: int,
+            seed: int, scheduler: str = ''
+            ) -> tuple[Results, dict[str, Array], dict[str, list[str]]]:
     """
     Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
-    Return ``{scenario: {'law' | 'guard': {measure: value}}}``, and of each scenario, with law and
-    guard, the CPU times of all ticks, s, which are never twice the same, and who left the band.
+    Return ``{scenario: {controller: {measure: value}}}``, and of each scenario, with law and guard
+    (without it, with the first controller), the CPU times of all ticks, s, which are never twice
+    the same, and the runs that left the band.
     """
+    def of_scenario(scenario: Scenario) -> list[str]:
+        return [name for name in controllers if scenario.flock is None or name in IN_FLOCKS
+                ] or [*IN_FLOCKS]
+
     first = seed * 1_000_000
-    tasks = [Task(scenario, mode, range(first + k, first + min(k + size, runs)))
+    tasks = [Task(scenario, controller, range(first + k, first + min(k + size, runs)))
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
-             for mode in MODES for k in range(0, runs, size)]
+             for controller in of_scenario(scenario) for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
     progress = Progress(len(scenarios))
     flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
     for name, group in groupby(tasks, lambda task: task.scenario.name):
         progress.start(name)
-        of_scenario = list(group)
-        for number, task in enumerate(of_scenario, start=1):
-            parts.setdefault((name, task.mode), []).append(next(flown))
-            progress.share(number / len(of_scenario))
+        its_tasks = list(group)
+        for number, task in enumerate(its_tasks, start=1):
+            parts.setdefault((name, task.controller), []).append(next(flown))
+            progress.share(number / len(its_tasks))
     progress.finish()
     list(flown)  # ends the generator
-    return ({s.name: {mode: summary(joined([part.runs for part in parts[s.name, mode]]))
-                      for mode in MODES} for s in scenarios},
-            {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])
-             for s in scenarios},
-            {s.name: [line for part in parts[s.name, MODES[-1]] for line in part.exits]
-             for s in scenarios})
+    shown = {s.name: parts[s.name, max(of_scenario(s), key=lambda name: name == 'guard')]
+             for s in scenarios}
+    return ({s.name: {name: summary(joined([part.runs for part in parts[s.name, name]]))
+                      for name in of_scenario(s)} for s in scenarios},
+            {name: np.concatenate([part.cpu for part in flown]) for name, flown in shown.items()},
+            {name: [line for part in flown for line in part.exits]
+             for name, flown in shown.items()})
 
 
 def table(results: Results,
           columns: Mapping[str, tuple[str, str, float, int]] = COLUMNS) -> str:
-    """Return the results as text, two lines per scenario."""
+    """Return the results as text, a line for each scenario and controller."""
     rows = [['scenario', '', *(title for title, *_ in columns.values())],
             ['', '', *(f'[{unit}]' for _, unit, *_ in columns.values())]]
-    for name, modes in results.items():
-        for mode, values in modes.items():
-            rows.append([shorten(name) if mode == MODES[0] else '', mode, *(
+    for name, controllers in results.items():
+        for number, (controller, values) in enumerate(controllers.items()):
+            rows.append(['' if number else shorten(name), controller, *(
                 f'{values[key] * factor:.{digits}f}'
                 for key, (_, _, factor, digits) in columns.items())])
     return '\n'.join(aligned(rows))
@@ -243,7 +249,8 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
 
 
 def _fly(task: Task) -> Flown:
-    flights = fly(task.scenario, task.runs, guard=task.mode == 'guard', cpu_time=time.thread_time)
+    law, guard = CONTROLLERS[task.controller]
+    flights = fly(task.scenario, task.runs, guard, cpu_time=time.thread_time, law=law)
     rows, cpu = measure(flights), flights.cpu.ravel()
     many = task.scenario.company.followers
     exits = []
@@ -256,10 +263,14 @@ def _fly(task: Task) -> Flown:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='flights', description='Fly scenarios many times, law alone and law with guard.')
+        prog='flights', description='Fly scenarios many times, with several controllers.')
     parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
                         help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
                         'the default')
+    parser.add_argument('--controllers', nargs='+', choices=CONTROLLERS,
+                        default=list(CONTROLLERS), metavar='NAME',
+                        help=f'{", ".join(CONTROLLERS)}; a flock flies {" and ".join(IN_FLOCKS)} '
+                        'only (all)')
     parser.add_argument('--keys', action='store_true',
                         help='print every key of a scenario file with its default and range')
     parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',

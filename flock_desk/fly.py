@@ -37,12 +37,13 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from flock_desk.runs.column import column_chapters, column_figures
 from flock_desk.runs.console import guarded
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH
 from flock_desk.runs.judge import FigureBound, Judgement, nearest, scenario_bounds
 from flock_desk.runs.record import clear, LiveRecord, locked, PICTURE, read_flown, set_aside
 from flock_desk.runs.report import announce, Chapter, report
-from flock_desk.runs.summary import column_figures, scenario_figures
+from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
 from flock_follower.ranges import Range
@@ -58,7 +59,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
         prog='fly', description='Fly a scenario on the desk, through the real nodes.',
         epilog=f'scenarios: {", ".join(names())}')
     parser.add_argument('--scenario', default='indoor', metavar='NAME',
-                        help='of a file in config/scenarios, or the path of one (%(default)s)')
+                        help='a name in config/scenarios, or the path of a file (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
     parser.add_argument('--duration', type=float, default=0.0, metavar='S',
                         help='fly no longer than this, s; never longer than the scenario (as '
@@ -146,17 +147,18 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
             folder, f'flock_follower on the desk: {title}', scenario.summary, summary, bounds,
             partial(_pictures, folder, flight), warnings=cautions(summary))
     print()
-    for warning in (warning for each in summaries.values() for warning in cautions(each)):
-        print(f'warning: {warning}', file=sys.stderr)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         judgements = report(
             out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
             scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
-            partial(_column_pictures, scenario, flights), parts=summaries)
+            partial(column_chapters, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
-    return announce(summary, judgements, pages, out)
+    code = announce(summary, judgements, pages, out)
+    for warning in (warning for each in summaries.values() for warning in cautions(each)):
+        print(f'warning: {warning}', file=sys.stderr)
+    return code
 
 
 def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
@@ -164,11 +166,6 @@ def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
     with whole_file(folder / PICTURE) as file:
         file.write(portrait(flight))
     return scenario_chapters(flight)
-
-
-def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import column_chapters
-    return column_chapters(scenario, flights)
 
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:

@@ -51,14 +51,9 @@ def markdown() -> str:
 
 
 def _row(spec: Spec) -> str:
-    if spec.default in ('', ['']):
-        default = 'empty'
-    elif isinstance(spec.default, bool):
-        default = str(spec.default).lower()
-    elif isinstance(spec.default, float):
-        default = f'{spec.default:g}'
-    else:
-        default = str(spec.default)
+    default = ('empty' if spec.default in ('', ['']) else
+               str(spec.default).lower() if isinstance(spec.default, bool) else
+               f'{spec.default:g}' if isinstance(spec.default, float) else str(spec.default))
     live = 'yes' if spec.live else ''
     return f'| `{spec.name}` | {default} | {spec.constraint} | {live} | {spec.meaning} |'
 

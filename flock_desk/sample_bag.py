@@ -48,7 +48,9 @@ from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
 from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
+from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
+from flock_follower.messages import odometry as odometry_message
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
@@ -63,7 +65,7 @@ _INFO, _ODOMETRY = 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry'
 
 @dataclass(frozen=True)
 class Variant:
-    """What distinguishes one bag from another."""
+    """The options of one bag."""
 
     summary: str
     duration: float = 12.0
@@ -256,19 +258,9 @@ def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[Ba
 
 def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,
                       state: Odometry) -> BagMessage:
-    types = typestore().types
-    point, vector = types['geometry_msgs/msg/Point'], types['geometry_msgs/msg/Vector3']
-    message = types[_ODOMETRY](
-        _header(stamp_ns, 'odom'), child,
-        types['geometry_msgs/msg/PoseWithCovariance'](
-            types['geometry_msgs/msg/Pose'](
-                point(*state.position),
-                types['geometry_msgs/msg/Quaternion'](*state.quaternion)),
-            state.pose_covariance.ravel()),
-        types['geometry_msgs/msg/TwistWithCovariance'](
-            types['geometry_msgs/msg/Twist'](vector(*state.linear), vector(*state.angular)),
-            state.twist_covariance.ravel()))
-    return BagMessage(topic, _ODOMETRY, arrival_ns, serialize(message, _ODOMETRY))
+    return BagMessage(topic, _ODOMETRY, arrival_ns, serialize(odometry_message(
+        empty, stamp_ns, 'odom', child, state.position, state.quaternion, state.linear,
+        state.angular, state.pose_covariance, state.twist_covariance), _ODOMETRY))
 
 
 def _header(stamp_ns: int, frame: str) -> Any:

@@ -76,7 +76,7 @@ MESSAGES = 3
 
 SPECS = [
     Spec('scenario', 'indoor',
-         'name of a file in config/scenarios, or the path of a .yaml file'),
+         'a name in config/scenarios, or the path of a .yaml file'),
     Spec('seed', 0, 'seed of all random numbers', SEEDS),
     Spec('duration', 0.0, 'flight time; 0: the duration of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),

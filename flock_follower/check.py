@@ -52,7 +52,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.checks.topic_names import full_name, parse_remaps
 from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
 from flock_follower.resources import resource
@@ -88,7 +88,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
     parser.add_argument('--report', type=Path, metavar='FILE', help='also write a zip file for a '
                         'bug report: versions, findings, parameters, diagnostics, the last minute '
-                        'of BAG or of the newest recording in the default folder')
+                        'of BAG, of the black box that runs, or of the newest recording in the '
+                        'default folder')
     options = parser.parse_args(args)
     if not 1.0 <= options.seconds <= MOST_SECONDS:
         parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
@@ -144,8 +145,10 @@ def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
 
 def _report(options: argparse.Namespace, seen: Observations,
             findings: Sequence[Finding]) -> None:
-    recording = options.bag or newest_recording(folder(
-        {'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace))
+    recorder = seen.statuses.get(full_name('black_box', options.namespace).lstrip('/'))
+    running = Path(recorder.values.get('recording', '')) if recorder else Path()
+    recording = options.bag or (running if running.name and running.exists() else newest_recording(
+        folder({'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace)))
     try:
         write_report(options.report, seen, table(seen, findings), as_json(seen, findings),
                      recording)

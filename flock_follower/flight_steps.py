@@ -37,6 +37,8 @@ SILENCE: Final[float] = 3.0
 DISCOVERY: Final[float] = 8.0
 #: Only reports received so long, s, after an answer show what the request has changed.
 SETTLING: Final[float] = 0.2
+#: The state of a node whose last report is older, s, is shown as old: a report comes each second.
+OLD: Final[float] = 1.5
 #: An older distance is not shown, s.
 SHOWN: Final[float] = 1.0
 INTERRUPTED: Final[int] = 130
@@ -99,13 +101,19 @@ class Reports:
         return next((step for step, done in reached.items() if not done), '')
 
     def line(self, now: float) -> str:
-        """Return the live line: states, distance, battery, reasons."""
+        """Return the live line: states, the age of an old one, distance, battery, reasons."""
         received, distance = self.distance
         word, _, why = self.bridge.partition(': ')
         reasons = '; '.join(filter(None, [why, self.value('planner', 'reason')]))
         return '   '.join(filter(None, [
-            word, self.value('planner', 'state'), distance if now - received <= SHOWN else '',
-            self.battery, reasons]))
+            self._aged(word, 'mavlink_bridge', now),
+            self._aged(self.value('planner', 'state'), 'planner', now),
+            distance if now - received <= SHOWN else '', self.battery, reasons]))
+
+    def _aged(self, state: str, node: str, now: float) -> str:
+        """Return a state with the age of its node's last report if it is old."""
+        age = now - self.nodes[node][0] if node in self.nodes else 0.0
+        return f'{state} ({age:.0f} s ago)' if state and age > OLD else state
 
 
 class Flight:
@@ -151,10 +159,10 @@ class Flight:
         self._question = due
         if self._confirm or not due:
             self.lines.append(f'{reports.bridge}: press {due[0]} for {due}' if due else
-                              'it follows: press l to land; Ctrl-C brakes and hands over')
+                              'the follower flies: press l to land; Ctrl-C brakes and hands over')
             return []
         if due in self._requested:
-            self.lines.append(f'{due} is due again, and --yes requests it once')
+            self.lines.append(f'{due} is due again, but --yes requests each step only once')
             return self.end(1, reports)
         return self._request(due)
 

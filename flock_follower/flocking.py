@@ -81,6 +81,19 @@ class FlockingParams(Checked):
             raise ValueError(f'd1 = {self.d1!r}: must be a number in [d0 + {_NARROWEST_BAND:g}, '
                              f'10000] m^2, where d0 = {self.d0!r}')
 
+    def command(self, offsets: Array, differences: Array) -> Array:
+        """
+        Return the acceleration (n,), m/s^2, of an agent that observes m neighbours.
+
+        A subclass may return that of another controller, to compare the law with.
+
+        :param offsets: neighbours' positions minus the own one, (m, n), m.
+        :param differences: neighbours' velocities minus the own one, (m, n), m/s.
+        """
+        own = np.zeros((1, differences.shape[1]))
+        return _sum_over_neighbors(offsets, differences,
+                                   disagreement(np.vstack([own, differences])), self, 'flocking')
+
 
 def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
                   model: Model = 'flocking') -> Array:
@@ -103,7 +116,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
                  params: FlockingParams) -> Array:
     """
-    Return what the law commands one agent that observes its neighbours: (n,), m/s^2.
+    Return the law's command (n,), m/s^2, for one agent that observes its neighbours.
 
     L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
 
@@ -111,10 +124,8 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
     :param relative_velocities: neighbours' velocities minus the own one, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
-    x, v = checked(relative_positions, relative_velocities,
-                   ('relative_positions', 'relative_velocities'))
-    own = np.zeros((1, v.shape[1]))
-    return _sum_over_neighbors(x, v, disagreement(np.vstack([own, v])), params, 'flocking')
+    return params.command(*checked(relative_positions, relative_velocities,
+                                   ('relative_positions', 'relative_velocities')))
 
 
 def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams) -> float:

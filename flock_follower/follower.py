@@ -312,7 +312,7 @@ class Follower:
             self.sharing.take_message(state, time)
 
     def advance(self, time: int) -> None:
-        """Let everything happen that is due up to a time."""
+        """Process all events that are due up to a time, ns."""
         if self._start is None:
             self._now = self._start = time
             self._next_tick = time + self._period

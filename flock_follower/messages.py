@@ -326,7 +326,7 @@ class Command(NamedTuple):
     """rad/s, anticlockwise."""
     separation_axis: Array | None = None
     """Unit vector (3,) away from a neighbour that would come too near: the part of the
-    acceleration along it is cut last. None if nobody does."""
+    acceleration along it is cut last. None without such a neighbour."""
     frame: str = ''
     stamp: int = 0
     ahead: int = 0

@@ -70,11 +70,11 @@ class Shape(NamedTuple):
     """The name of a constant of ``visualization_msgs/Marker``."""
     color: Color
     size: tuple[float, float, float]
-    """Lengths along the axes; of lines the width first, of text the height last."""
+    """Lengths along the axes; the first is the width of lines, the last the height of text."""
     position: Array = np.zeros(3)
     quaternion: Array = IDENTITY_QUATERNION
     points: Array = np.zeros((0, 3))
-    """Of lines and arrows (n, 3); then position and quaternion are left alone."""
+    """Points of lines and arrows (n, 3); then position and quaternion are not used."""
     text: str = ''
 
 
@@ -99,7 +99,7 @@ def circle(name: str, centre: Array, radius: float, color: Color, width: float) 
 
 def ellipsoid(name: str, centre: Array, covariance: Array, deviations: float,
               color: Color) -> Shape:
-    """Return the ellipsoid of so many standard deviations of a finite covariance (3, 3), m^2."""
+    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``deviations`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]

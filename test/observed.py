@@ -25,6 +25,7 @@ import numpy as np
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import Finding
+from flock_follower.checks.image_motion import COLUMNS, ROWS
 from flock_follower.checks.observations import (
     Machine,
     NodeStatus,
@@ -44,9 +45,11 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
+    rotation_vector_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.perception.camera import CameraModel
 from flock_follower.resources import resource
 
 START = 1_700_000_000.0  # s
@@ -101,13 +104,15 @@ def attitude(time: float) -> Array:
 
 
 def position(time: float) -> Array:
-    """Return where it is, m: it moves ahead and back."""
-    return np.array([0.5 * math.sin(1.5 * time), 0.4 * math.sin(1.1 * time), 1.5])
+    """Return where it is, m: it moves ahead and back, and up and down."""
+    return np.array([0.5 * math.sin(1.5 * time), 0.4 * math.sin(1.1 * time),
+                     1.5 + 0.2 * math.sin(0.9 * time)])
 
 
 def velocity(time: float) -> Array:
     """Return its velocity, m/s, in odom."""
-    return np.array([0.75 * math.cos(1.5 * time), 0.44 * math.cos(1.1 * time), 0.0])
+    return np.array([0.75 * math.cos(1.5 * time), 0.44 * math.cos(1.1 * time),
+                     0.18 * math.cos(0.9 * time)])
 
 
 def between(before: float, after: float) -> Array:
@@ -134,14 +139,28 @@ def odometry_rows(rate: float = 50.0, late: float = 0.01) -> list[list[float]]:
     return rows
 
 
-def shift_rows(rate: float = 30.0, offset: float = 0.0) -> list[list[float]]:
-    """Return how its images moved; their stamps are ``offset`` s too late."""
+def shift_rows(rate: float = 30.0, offset: float = 0.0, mounted: Array | None = None
+               ) -> list[list[float]]:
+    """
+    Return how the parts of its images moved, with a far scene; stamps ``offset`` s too late.
+
+    ``mounted`` as that of :func:`sighting_rows`.
+    """
+    camera = CameraModel.from_calibration(
+        (known := calibration()).k, known.d, known.distortion_model, known.width, known.height)
+    pixels = np.array([[(x + 0.5) * known.width / COLUMNS, (y + 0.5) * known.height / ROWS]
+                       for y in range(ROWS) for x in range(COLUMNS)])
+    rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
+    R_base_optical = (np.eye(3) if mounted is None else mounted) @ R_FLU_OPTICAL
     rows = []
     for n in range(round(SECONDS * rate) - 1):
         before, after = n / rate, (n + 1) / rate
-        turn = R_FLU_OPTICAL.T @ between(before, after)
+        turn = rotation_vector_to_matrix(R_base_optical.T @ between(before, after))
+        # The part that is halfway between both images at its middle moves as that does.
+        half = rotation_vector_to_matrix(0.5 * R_base_optical.T @ between(before, after))
+        moved = camera.project(rays @ turn @ half.T) - camera.project(rays @ half.T)
         rows.append([START + before + offset, START + after + offset,
-                     -FOCAL * float(turn[1]), FOCAL * float(turn[0]), 0.9])
+                     *np.column_stack([moved, np.full(len(moved), 0.9)]).ravel()])
     return rows
 
 

@@ -175,12 +175,12 @@ def seen_tags(recording: Recording, read: Read,
         outcome = track.update(time, T_odom_tag, np.zeros(3), covariance)
         if outcome is UpdateOutcome.STARTED:
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
-        moving = View.of(own, T_base_camera, 0.0).moving(T_odom_tag.translation - own.travel)
-        if track.step is None:
-            offset.begin(str(tag.number), moving)
-        elif change := offset.take(str(tag.number), track.step, moving):
-            for number, other in filters.items():
-                other.shift(change * offset.following(str(number)))
+        if change := offset.take(str(tag.number), time, fitted.pose.translation, T_base_camera,
+                                 buffer):
+            view = View.of(own, T_base_camera, 0.0)
+            for other in filters.values():
+                if other.newest is not None:
+                    other.shift(change * view.moving(other.newest.position - own.travel))
         estimate = track.predict(time)
         if estimate is not None and time - began[tag.number] >= SETTLED:
             found.append(Seen(time, tag.number, visits[tag.number],

@@ -97,7 +97,7 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
     desk.answer('engage')
     desk.engaged = 'True'
     desk.report()
-    assert desk.asked().startswith('it follows') and desk.flight.code is None
+    assert desk.asked().startswith('the follower flies') and desk.flight.code is None
 
 
 def test_only_the_key_of_the_step_that_is_due_does_anything() -> None:
@@ -235,7 +235,7 @@ def test_without_keys_each_step_is_requested_once() -> None:
     assert requested == ['check', 'arm', 'takeoff', 'offboard', 'engage']
     desk.answer('engage')
     desk.engaged = 'True'
-    assert desk.report() == [] and desk.asked().startswith('it follows')
+    assert desk.report() == [] and desk.asked().startswith('the follower flies')
     desk.engaged = 'False'
     assert desk.report(bridge='TAKEN_OVER: offboard was left') == []
     assert 'offboard is due again' in desk.asked() and desk.flight.code == 1
@@ -290,11 +290,20 @@ def test_while_the_autopilot_is_not_received_nothing_is_due() -> None:
 
 def test_the_live_line_shows_states_distance_battery_and_reasons() -> None:
     reports = Reports(bridge='READY: waiting for offboard mode', battery='battery 87 %')
-    reports.nodes['planner'] = 0.0, {'state': 'IDLE', 'reason': 'not engaged'}
+    reports.nodes['planner'] = 9.5, {'state': 'IDLE', 'reason': 'not engaged'}
     reports.distance = 10.0, 'leader 1.92 m'
     assert reports.line(10.5) == ('READY   IDLE   leader 1.92 m   battery 87 %   '
                                   'waiting for offboard mode; not engaged')
     assert 'leader' not in reports.line(12.0)
+
+
+def test_the_state_of_a_silent_node_is_shown_with_its_age() -> None:
+    reports = Reports(bridge='ACTIVE')  # latched: it stays when the bridge is killed
+    for node in ('planner', 'mavlink_bridge'):
+        reports.nodes[node] = 10.0, {'state': 'TRACK'}
+    assert reports.line(11.4).startswith('ACTIVE   TRACK')
+    reports.nodes['planner'] = 11.5, {'state': 'TRACK'}
+    assert reports.line(11.6).startswith('ACTIVE (2 s ago)   TRACK')
 
 
 @pytest.mark.parametrize(('connection', 'own'), [

@@ -64,18 +64,18 @@ ROOMS = {
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock follower mavlink messages odometry perception '
+    'closed_loop': ('camera external flock flocking follower mavlink messages odometry perception '
                     'planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
              'parameters perception planner scenarios sensors',
-             'PIL cv2 distributed matplotlib mpl_toolkits numpy yaml'),
+             'PIL cv2 distributed matplotlib mpl_toolkits numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
                    'mavlink messages nodes parameters perception planner runs scenarios '
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
-HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy'}  # not installed on a drone
+HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy', 'tqdm'}  # not on a drone
 IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')
 
 

@@ -45,6 +45,7 @@ from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
+from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.planner.sight import FieldOfView
@@ -54,18 +55,18 @@ PLANNER_STEPS = 12
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
         noise: PerceptionNoise | None = None,
-        progress: Callable[[float], None] | None = None,
-        cpu_time: Callable[[], float] = lambda: 0.0) -> Flights:
+        cpu_time: Callable[[], float] = lambda: 0.0,
+        law: type[FlockingParams] = FlockingParams) -> Flights:
     """
     Fly some runs of a scenario and return their results.
 
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.
-    :param progress: called with the share that is done, now and then.
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
+    :param law: the law, or a controller in its place: see ``controllers``.
     """
     world = World(scenario, runs, noise or _noise(scenario))
-    followers = _followers(scenario, runs, guard, world, cpu_time)
+    followers = _followers(scenario, runs, guard, world, cpu_time, law)
     flock, radio = scenario.company, _radio(scenario, runs)
     failing = [] if flock.fails is None else followers[
         flock.fails.follower - 1::flock.followers]
@@ -92,8 +93,6 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.outbox = []
             if now >= ENGAGED - 1e-9:
                 log.tick(now, followers)
-            if progress is not None and k % (20 * PLANNER_STEPS) == 0:
-                progress(k / count)
         if failing and flock.fails is not None and now >= flock.fails.at:
             for follower in failing:
                 follower.fail(now)
@@ -114,7 +113,8 @@ def _noise(scenario: Scenario) -> PerceptionNoise:
 
 
 def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: World,
-               cpu_time: Callable[[], float]) -> list[SimulatedFollower]:
+               cpu_time: Callable[[], float],
+               law: type[FlockingParams]) -> list[SimulatedFollower]:
     """Return the follower of every row."""
     flock = scenario.company
     aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
@@ -129,7 +129,7 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
                 start * [1.0, 1.0, 0.0], quaternion_from_yaw(yaw)))
         followers.append(SimulatedFollower(
             scenario, guard, runs[row // flock.followers], frame, T_world_odom.inverse(), start,
-            view, name, cpu_time))
+            view, name, cpu_time, law))
     return followers
 
 

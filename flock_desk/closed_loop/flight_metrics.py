@@ -36,7 +36,7 @@ FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
 LOST_AFTER = 5.0  # s without following at the end of a flight, and it counts as lost
-STRAYED = 1.25  # times the far edge of the band: with nobody that near it is lost, too
+STRAYED = 1.25  # times the far edge of the band: a follower without a vehicle in it is lost
 
 Measures = dict[str, Array]
 """Figures by name, (n,) each."""
@@ -67,6 +67,7 @@ FIGURES = {
     'longest_out_of_sight_s': Figure('out_of_sight', np.max, np.max),
     'guard_active': Figure('guard_active', np.mean),  # share of ticks with an altered command
     'jerk_m_s3': Figure('jerk', np.mean),  # RMS of the command's change from tick to tick
+    'horizontal_jerk_m_s3': Figure('horizontal_jerk', np.mean),
     'tracking_error_m': Figure('tracking_error', np.mean),  # RMS of r - sqrt((d0 + d1) / 2)
     'velocity_error_m_s': Figure('velocity_error', np.mean),  # RMS of |v_F - v_L|
     # Without an image that showed the leader, in whole ticks.
@@ -101,7 +102,8 @@ def measure(flights: Flights) -> Measures:
     handovers = np.array([_handovers(*run) for run in zip(
         flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])])
     fastest = (np.linalg.norm(flights.velocity, axis=2) * flights.obeying).max(axis=1)
-    steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
+    steps, level = (np.linalg.norm(np.diff(flights.command[..., :axes], axis=1), axis=2) / period
+                    for axes in (3, 2))
     outside = flights.outside.sum(axis=1)
     return {
         'in_band': (outside == 0.0).astype(float),
@@ -111,6 +113,7 @@ def measure(flights: Flights) -> Measures:
         'time_in_band': 1.0 - outside / (period * len(flights.times)),
         'guard_active': flights.guarded.mean(axis=1),
         'jerk': np.sqrt(np.nanmean(steps ** 2, axis=1)),
+        'horizontal_jerk': np.sqrt(np.nanmean(level ** 2, axis=1)),
         'tracking_error': _rms(distance - middle, axis=1),
         'velocity_error': _rms(np.linalg.norm(
             flights.velocity - flights.leader_velocity, axis=2), axis=1),
@@ -224,7 +227,7 @@ def _kept(flights: Flights) -> Any:
 
 
 def _strayed(positions: Array, flights: Flights) -> Any:
-    """Return which followers (m,) nobody leads to from the leader; positions (m + 1, 3), m."""
+    """Return which followers (m,) are not connected to the leader; positions (m + 1, 3), m."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     near = apart < STRAYED * math.sqrt(flights.scenario.flight.d1)
     near &= np.append(True, _kept(flights))  # a failed follower leads no other

@@ -61,9 +61,9 @@ class Flights:
     nearest: Array
     """(n, k), least distance to any vehicle up to the next tick, m."""
     farthest: Array
-    """(n, k), greatest distance to a vehicle that it follows, up to the next tick, m."""
+    """(n, k), greatest distance to a followed vehicle up to the next tick, m."""
     outside: Array
-    """(n, k), time out of the band up to the next tick, mean over those that it follows, s."""
+    """(n, k), time out of the band up to the next tick, s; mean over the followed vehicles."""
     command: Array
     """(n, k, 3), commanded acceleration, m/s^2; NaN without one."""
     state: Any
@@ -71,7 +71,7 @@ class Flights:
     guarded: Any
     """(n, k), whether the guard altered the command."""
     seen: Any
-    """(n, k), whether an image since the last tick showed one that it follows."""
+    """(n, k), whether an image since the last tick showed a followed vehicle."""
     in_sight: Any
     """(n, k), the same of the newest image, outages and missed detections left out."""
     obeying: Any
@@ -89,7 +89,7 @@ class Flights:
 
 
 class FlightsLog:
-    """Collects what the flights in a world do."""
+    """Records the flights in a world."""
 
     def __init__(self, world: World) -> None:
         self._world = world

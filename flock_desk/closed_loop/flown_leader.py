@@ -91,7 +91,7 @@ class ExternalLeader:
         self._motion, self._start_ns, self._origin = motion, start_ns, origin
 
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Do nothing: it flies by itself."""
+        """Do nothing: the leader flies by itself."""
 
     def pose(self, time_ns: int, time: float) -> Transform | None:
         """Return the reported pose; of a future moment, the newest one."""
@@ -100,7 +100,7 @@ class ExternalLeader:
             quaternion_to_matrix(leader.quaternion), leader.position)
 
     def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the reported motion, likewise; None once its poses stall."""
+        """Return the reported motion at a time; None once its poses stall."""
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > LONGEST_GAP:
             return None

@@ -32,6 +32,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
+from flock_follower.flocking import FlockingParams
 from flock_follower.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.geometry import (
     Array,
@@ -71,12 +72,12 @@ class SimulatedFollower(Listener):
     :param start: where its vehicle begins (3,), m.
     :param view: field of view of its camera; () if cameras look to all sides.
     :param name: of its vehicle.
-    :param cpu_time: see ``Follower``.
+    :param cpu_time: see ``Follower``; :param law: see ``controllers``.
     """
 
     def __init__(self, scenario: Scenario, guard: bool, run: int, frame: str,
                  T_odom_world: Transform, start: Array, view: View, name: str,
-                 cpu_time: Callable[[], float]) -> None:
+                 cpu_time: Callable[[], float], law: type[FlockingParams]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
                             height_max=1000.0, radius_max=10000.0,
@@ -91,7 +92,7 @@ class SimulatedFollower(Listener):
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self.follower = Follower(
-            planner, _params(scenario, guard, name), new_control(), self,
+            planner, _params(scenario, guard, law, name), new_control(), self,
             cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
             sharing=Sharing(name) if scenario.company.words else None)
         self.follower.advance(_AFTER)
@@ -187,9 +188,11 @@ class SimulatedFollower(Listener):
             yaw=None if setpoint.yaw is None else setpoint.yaw - self._turn), self._now)
 
 
-def _params(scenario: Scenario, guard: bool, name: str) -> PlannerParams:
+def _params(scenario: Scenario, guard: bool, law: type[FlockingParams],
+            name: str) -> PlannerParams:
     """Return the planner's parameters of a vehicle."""
     params = scenario.flight.planner(guard)
+    params = replace(params, law=law(**vars(params.law)))
     return params if scenario.flock is None else replace(params, vehicles={
         other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)
         for other in scenario.flock.names if other != name})

@@ -48,7 +48,7 @@ class ExternalVehicles:
     The links of a flight; both motions count from the follower's first reported place.
 
     :param follower: to its autopilot.
-    :param leader: likewise; None: the scenario has a leader of its own.
+    :param leader: link of the leader; None: the scenario's own leader.
     """
 
     def __init__(self, follower: ExternalAutopilot, leader: ExternalAutopilot | None) -> None:

@@ -19,10 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import sys
-import time
 
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
-from flock_follower.live_line import LiveLine
+from flock_follower.live_line import LOG_PERIOD, TERMINAL_PERIOD
+
+WIDTH = 100  # characters of a bar
 
 
 def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int:
@@ -63,25 +64,27 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> list[str]:
 
 
 class Progress:
-    """The progress through a number of jobs of equal weight, on stderr: [2/3] NAME: 50 %."""
+    """The progress through a number of jobs of equal weight: a bar on stderr, also in a pipe."""
 
     def __init__(self, jobs: int) -> None:
-        self._jobs, self._number, self._name = jobs, 0, ''
-        self._line = LiveLine(sys.stderr)
+        from tqdm import tqdm
+        period = TERMINAL_PERIOD if sys.stderr.isatty() else LOG_PERIOD
+        self._bar = tqdm(
+            total=jobs, file=sys.stderr, mininterval=period, ncols=WIDTH, desc='begin',
+            bar_format='{desc}: {percentage:3.0f} % |{bar}| {elapsed}<{remaining}')
+        self._done = -1
 
     def start(self, name: str) -> None:
         """Begin the next job, the one before being done."""
-        self._number, self._name = self._number + 1, name
-        self._line.due(time.monotonic())
-        self._line.show(f'[{self._number}/{self._jobs}] {name}')
+        self._done += 1
+        self._bar.set_description_str(name, refresh=False)
+        self.share(0.0)
 
     def share(self, share: float) -> None:
-        """Show that a share, 0 to 1, of the present job is done, if it is time for a line."""
-        if self._line.due(time.monotonic()):
-            percent = 100.0 * (self._number - 1 + share) / self._jobs
-            self._line.show(f'[{self._number}/{self._jobs}] {self._name}: {percent:.0f} %')
+        """Show that a share, 0 to 1, of the present job is done, if it is time for it."""
+        self._bar.update(self._done + share - self._bar.n)
 
     def finish(self) -> None:
         """End the last job."""
-        self._line.show('done')
-        self._line.end()
+        self.share(1.0)
+        self._bar.close()

@@ -299,13 +299,14 @@ def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
     errors, flight = evaluation.errors, evaluation.flight
     for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
-        message = None if system is None else system.take(topic, msgtype, stamp, data)
+        message, pixels = (None, None) if system is None else (
+            system.take(topic, msgtype, stamp, data))
         name, camera = used.get(topic, ('', ''))
         if name == 'odom':
             flight.take_odometry(stamp, data, message)
         elif name == RAW_IMAGES:
             evaluation.images += 1
-            flight.take_image(stamp, msgtype, data, camera)
+            flight.take_image(stamp, msgtype, data, camera, message, pixels)
         elif name == 'camera_info':
             flight.take_camera_info(stamp, data, camera)
         elif name == 'ranges':

@@ -31,14 +31,15 @@ import sys
 import time
 from typing import NamedTuple, TypeVar
 
+from flock_desk.runs.column import spacing
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     SchedulingDelay,
 )
-from flock_desk.runs.summary import spacing
 from flock_desk.scenarios.scenario import Scenario
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.transport import open_transport
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
@@ -221,7 +222,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     return {
         'relative_pose': [],
         'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
-                    f'altitude_min:={flight.altitude_min}'],
+                    # No wider than the gate's, which would be a warning.
+                    f'altitude_min:={max(flight.altitude_min, GateLimits.height_min)}'],
         'mavlink_bridge': [*limits, *envelope, *bridge],
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],

@@ -26,7 +26,7 @@ to leader and follower in odom, does not count. Their covariances follow from th
   that moves with the integral of v_F, so v_L follows the true velocity plus the error of v_F,
   which cancels as far as v_L has followed it. The lag is in P_v, because the random walk of that
   error is part of the filter's noise (``odometry_noise``). P = R' P_v R; the covariance of the
-  odometry's velocity, added, would count it twice.
+  odometry's velocity, added, would count it twice. Its white noise, as measured, is in P_v.
 
 P_v is the filter's covariance of the velocity in odom. The covariance in the message is that of
 the twist in the leader's body, so it also holds the error of the leader's attitude, of which the
@@ -66,6 +66,7 @@ COLUMNS = (
 Table = Mapping[str, Array]
 #: States further apart than this are not interpolated, ns.
 MAX_GAP = NANOSECONDS // 2
+BATCH, LATE = 2000, 200
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
 #: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of what an
@@ -88,7 +89,8 @@ class FrameErrors:
     """
     Collects images, odometry and truth as they arrive; :meth:`table` compares them.
 
-    Memory grows by 0.6 kB per image and neighbour and by 0.1 kB per message of odometry or truth.
+    Memory grows by 0.2 kB per image and neighbour. ``BATCH`` images are compared at a time, except
+    the newest ``LATE``: their odometry and truth may still come.
 
     :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
@@ -144,9 +146,11 @@ class FrameErrors:
                 seen.extend((STAGES.index(stages.get(name, 'full')), *estimate.position,
                              *estimate.velocity, *estimate.rotation.ravel(),
                              *estimate.covariance[:6, :6].ravel()))
+        if len(self._stamps) == BATCH:
+            self._compare(BATCH - LATE)
 
     def _take(self, states: array[float], state: OdometryState) -> None:
-        """Keep states in the order of their stamps; if time jumps back, begin anew."""
+        """Keep states in the order of their stamps; restart if time jumps back."""
         time = state.stamp - self._start
         if states and time <= states[-_STATE]:
             if states[-_STATE] - time <= MAX_GAP:
@@ -156,30 +160,34 @@ class FrameErrors:
         states.extend((time, *state.position, *state.quaternion, *state.velocity,
                        *state.angular_velocity))
 
-    def _compare(self) -> None:
-        """Compare the images since the last call."""
-        if not self._stamps:
+    def _compare(self, count: int | None = None) -> None:
+        """Compare the oldest ``count`` images, or all, and forget the states before the rest."""
+        stamps, cameras = np.array(self._stamps[:count]), np.array(self._cameras[:count])
+        if not len(stamps):
             return
-        stamps = np.array(self._stamps)
         own, true_own = _at(self._own, stamps), _at(self._true_own, stamps)
         for name, neighbor in self._neighbors.items():
             true = _at(self._true[name], stamps)
-            seen = np.array(self._seen[name]).reshape(-1, _SEEN)
+            seen = np.array(self._seen[name]).reshape(-1, _SEEN)[:count]
             estimated = _States(seen[:, 1:4], seen[:, 4:7], seen[:, 7:16].reshape(-1, 3, 3),
                                 seen[:, 16:].reshape(-1, 6, 6))
             columns = {
                 'time': stamps / NANOSECONDS, 'stage': seen[:, 0],
-                'visible': self._visible(neighbor, true, true_own),
+                'visible': self._visible(neighbor, true, true_own, cameras),
                 'own_x': own.position[:, 0], 'own_y': own.position[:, 1],
                 **_errors(estimated, own, true, true_own)}
             self._compared[name].append(np.stack([columns[key] for key in COLUMNS], axis=1))
-            del self._seen[name][:]
-        del self._stamps[:], self._cameras[:]
+            del self._seen[name][:len(stamps) * _SEEN]
+        del self._stamps[:count], self._cameras[:count]
+        for states in (self._own, self._true_own, *self._true.values()):
+            before = np.array(states[::_STATE]) < min(self._stamps, default=-np.inf) - MAX_GAP
+            del states[:_STATE * np.count_nonzero(before)]
 
-    def _visible(self, neighbor: MarkedNeighbor, true: _States, true_own: _States) -> Array:
+    def _visible(self, neighbor: MarkedNeighbor, true: _States, true_own: _States,
+                 cameras: NDArray[np.str_]) -> Array:
         """Return for every image whether a marker is in view, NaN if there is no truth."""
         position, _, rotation = _relative(true, true_own)
-        cameras, visible = np.array(self._cameras), np.zeros(len(position), dtype=bool)
+        visible = np.zeros(len(position), dtype=bool)
         for name, T_camera_body in self._T_camera_body.items():
             if (model := self.models.get(name)) is not None:
                 for marker in neighbor.markers:

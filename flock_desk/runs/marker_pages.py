@@ -77,7 +77,7 @@ class Print(NamedTuple):
 
     @property
     def needed(self) -> tuple[float, float]:
-        """Return width and height, mm, of a page that holds it."""
+        """Return the least width and height of the page, mm."""
         return (max(self.width, CAPTION[0]) + 2.0 * MARGIN,
                 self.height + CAPTION[1] + 2.0 * MARGIN)
 

@@ -68,6 +68,8 @@ Draw = Callable[[Axes, Simulation], None]
 #: in, of the arrow of 1 m/s: on the page, as the scale of the ground is another in each panel.
 _ARROW = 0.3
 _SIDE = 0.8  # in, the room of a panel beside the arrows
+#: The ratio of length to width of paths from which on both axes have a scale of their own.
+SLIM = 5.0
 _TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'butt', 'zorder': 1.8}
 _TIME = 'time [s]'
 
@@ -115,10 +117,16 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
             *x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS], units='inches',
             width=0.022, scale_units='inches', scale=1.0 / _ARROW, headwidth=4.2, headlength=4.5,
             headaxislength=4.0, zorder=6)
-        reach = _ARROW / _SIDE * np.ptp(x, axis=(0, 1)).max()  # m, of the arrow of 1 m/s
-        axis.update_datalim(x[0] + reach * velocities)
+        spans = np.ptp(x, axis=(0, 1))
+        reach = _ARROW / _SIDE * spans  # m, of the arrow of 1 m/s
         axis.margins(0.12)
-        axis.set_aspect('equal', adjustable='datalim')
+        if spans.max() > SLIM * spans.min():  # at one scale the panel would be empty
+            axis.text(0.98, 0.02, 'scales differ', fontsize=7, ha='right',
+                      transform=axis.transAxes)
+        else:
+            reach = reach.max()
+            axis.set_aspect('equal', adjustable='datalim')
+        axis.update_datalim(x[0] + reach * velocities)
         if run is first:  # beside the legend
             axis.quiverkey(arrows, 1.42, -0.07, 0.5, 'initial velocity,\n0.5 m/s', labelpos='E',
                            color=INK, labelsep=0.08)
@@ -133,7 +141,7 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
                    label=f'after {end:g} s'),
             Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
         return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
-                       share=False)
+                       share=(False, False))
 
 
 def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
@@ -150,23 +158,19 @@ def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Fi
         return _panels(runs, draw, _agent_handles(names), _TIME, 'speed [m/s]', note)
 
 
-def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '') -> Figure:
-    """Return the distances between agents up to a time, s, within limits, m, and the bounds."""
+def distances(runs: Runs, end: float, note: str = '') -> Figure:
+    """Return the distances between agents up to a time, s, and the bounds; each to its scale."""
     def draw(axis: Axes, run: Simulation) -> None:
         m = run.metrics
+        last = int(np.searchsorted(m.time, end))
         if run.positions.shape[1] > 2:
-            last = int(np.searchsorted(m.time, end))
             few = slice(0, last + 1, max(1, last // 500))  # of an area a file keeps every point
             axis.fill_between(m.time[few], np.sqrt(m.min_r2[few]), np.sqrt(m.max_r2[few]),
                               color=COLOURS[0][0], alpha=0.35, linewidth=0)
         axis.plot(m.time, m.mean_distance, color=COLOURS[0][0], linewidth=1.1)
         draw_bounds(axis, run.params)
-        axis.set(xlim=(0.0, end), ylim=limits)
-        at_end, top = np.interp(end, m.time, m.mean_distance), limits[1]
-        if at_end > top:
-            leaves = m.time[np.argmax(m.mean_distance > top)]
-            axis.annotate(f'{at_end:.1f} m\nat {end:g} s', (leaves, top), (6, -3), fontsize=7,
-                          textcoords='offset points', va='top', color=COLOURS[0][0])
+        shown = np.sqrt(np.append(m.max_r2[:last + 1], run.params.d1))
+        axis.set(xlim=(0.0, end), ylim=(0.0, 1.1 * float(shown.max())))
 
     with styled():
         several = next(iter(runs.values())).positions.shape[1] > 2
@@ -176,7 +180,7 @@ def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '
             handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
                                  label='least to greatest'))
         handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
-        return _panels(runs, draw, handles, _TIME, 'distance [m]', note)
+        return _panels(runs, draw, handles, _TIME, 'distance [m]', note, share=('all', False))
 
 
 def agreement(runs: Runs, end: float) -> Figure:
@@ -271,10 +275,11 @@ def _draw_paths(axis: Axes, run: Simulation) -> None:
 
 
 def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
-            y_label: str, note: str, height: float = 4.3, share: bool = True) -> Figure:
+            y_label: str, note: str, height: float = 4.3,
+            share: tuple[Any, Any] = ('all', 'all')) -> Figure:
     """Return a panel for each of five runs, the legend in the second place, a note below."""
     figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
-    axes = figure.subplots(3, 2, sharex=share, sharey=share)
+    axes = figure.subplots(3, 2, sharex=share[0], sharey=share[1])
     for letter, axis, (name, run) in zip('abcde', axes.flat[[0, 2, 3, 4, 5]], runs.items()):
         axis.set_title(f'({letter}) {name}'.replace(', ', ',\n'))
         draw(axis, run)
@@ -345,6 +350,28 @@ def distance(flight: LiveRecord) -> Figure:
             handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
         figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
                       columnspacing=1.2, handlelength=1.8)
+        return figure
+
+
+def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> Figure:
+    """
+    Return the share of runs that kept the band against the jerk, a panel for each ``v_max``, m/s.
+
+    :param results: by ``v_max``, the jerk, m/s^3, and the share of each controller.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
+        axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
+        for axis, (v_max, points) in zip(axes, results.items()):
+            for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):
+                axis.plot(jerk, 100.0 * share, marker, markersize=5, label=name,
+                          color=COLOURS[1][0] if name == 'law and guard' else INK,
+                          markerfacecolor=None if name == 'law and guard' else 'white')
+            axis.set(title=f'$v_{{max}}$ = {v_max:g} m/s', xlabel='jerk [m/s$^3$]', ylim=(-5, 105))
+            axis.set_xlim(left=0.0)
+        axes[0].set_ylabel('runs in the band [%]')
+        figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                      columnspacing=1.0, handlelength=1.0)
         return figure
 
 

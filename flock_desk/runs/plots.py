@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import io
-from itertools import cycle
 from typing import NamedTuple
 
 import cv2
@@ -34,24 +33,26 @@ from flock_desk.runs.evaluation import Evaluation
 from flock_desk.runs.frame_errors import STAGES, Table
 from flock_desk.runs.record import FlightRecord, LEADER_NAME, LiveRecord
 from flock_desk.runs.report import Chapter, Illustration
-from flock_desk.runs.summary import column_tracks, consistency, sight_figures
-from flock_desk.scenarios.scenario import Scenario
+from flock_desk.runs.summary import consistency, sight_figures
 from flock_follower.geometry import Array
 from flock_follower.planner.params import PlannerParams
 
 matplotlib.use('Agg')
+matplotlib.rcParams.update({
+    'axes.grid': True, 'grid.alpha': 0.25, 'grid.linewidth': 0.6, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.titlelocation': 'left', 'axes.titlesize': 11})
 
 # Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
-_OTHERS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
+COLOURS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
 _STAGE_COLOURS = {'none': LIMIT, 'track': VEHICLE, 'roi': '#E69F00', 'full': FOLLOWER}
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
 PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
 NARROWEST = 0.35  # of its length, of a map
-_TIME = 'time [s]'
+TIME = 'time [s]'
 
 
 class Curve(NamedTuple):
@@ -107,7 +108,7 @@ class PlottedFlight:
 
 
 def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
-    """Return what the report of ``fly`` shows: plots, and images of the follower's camera."""
+    """Return the pictures of the report of ``fly``: plots, and images of the follower's camera."""
     log, times = flight.log, flight.table['time']
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     return [*chapters(
@@ -171,7 +172,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
         axes['speed'].plot(curve.x, curve.y, color=curve.colour, linewidth=1.1, label=curve.label)
     axes['speed'].set(ylabel='speed [m/s]')
     axes['speed'].set_ylim(bottom=0.0)
-    _key(axes['speed'])
+    add_key(axes['speed'])
     _draw_states(axes['state'], flight)
     if truth:
         figures = sight_figures([flight.table], params.max_velocity_std)
@@ -182,15 +183,15 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
             axes[kind].set(ylabel=f'{kind} error [{unit}]',
                            ylim=(0.0, 1.2 * _usually(errors, 99.5)))
             if rms is not None:
-                _heading(axes[kind], f'error of the relative {kind}: RMS {100 * rms:.2f} {unit}')
+                axes[kind].set_title(f'error of the relative {kind}: RMS {100 * rms:.2f} {unit}')
     for name, axis in axes.items():
         if name != 'above':
             axis.set_xlim(0.0, max(flight.duration, 1e-3))
         if name not in ('above', 'distance'):
             _shade(axis, flight.blind)
     for name in ('state', 'velocity') if truth else ('state',):
-        axes[name].set_xlabel(_TIME)
-    return _encoded(figure, axes.values())
+        axes[name].set_xlabel(TIME)
+    return encoded(figure)
 
 
 def error_picture(flight: PlottedFlight) -> bytes:
@@ -215,13 +216,13 @@ def error_picture(flight: PlottedFlight) -> bytes:
             known.any()) else 0.0
         nees = figures[f'nees_{kind}']
         verdict = '' if nees is None else f'; NEES {nees:.1f}: {consistency(nees)}'
-        _heading(axes[0, column], f'relative {kind}: {100.0 * inside:.0f} % within two deviations'
-                                  f'{verdict}')
-        axes[2, column].set_xlabel(_TIME)
+        axes[0, column].set_title(
+            f'relative {kind}: {100.0 * inside:.0f} % within two deviations{verdict}')
+        axes[2, column].set_xlabel(TIME)
     axes[0, 0].set_xlim(0.0, max(flight.duration, 1e-3))
     for plot in axes.ravel():
         _shade(plot, flight.blind)
-    return _encoded(figure, axes.ravel())
+    return encoded(figure)
 
 
 def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
@@ -234,13 +235,13 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
                         markersize=13, markeredgewidth=1.2)
-    _heading(stages, 'stage that measured the neighbour in each image, and CPU time of perception')
+    stages.set_title('stage that measured the neighbour in each image, and CPU time of perception')
     stages.set(ylabel='stage', ylim=(-0.6, 3.6))
     stages.set_yticks(range(len(STAGES)), STAGES)
     cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
-    cpu.set(ylabel='CPU time [ms]', xlabel=_TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
+    cpu.set(ylabel='CPU time [ms]', xlabel=TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
             xlim=(0.0, max(duration, 1e-3)))
-    return _encoded(figure, (stages, cpu))
+    return encoded(figure)
 
 
 def portrait(record: LiveRecord) -> bytes:
@@ -253,38 +254,11 @@ def portrait(record: LiveRecord) -> bytes:
                                                   height_ratios=[1.3, 1.0])
     axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
     axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
+    axes['seen'].spines[['top', 'right']].set_visible(True)
     _draw_above(axes['above'], flight)
     _draw_distance(axes['distance'], flight, with_gaps(flight.table))
-    axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
-    return _encoded(figure, (axes['above'], axes['distance']), 'jpg')
-
-
-def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> list[Chapter]:
-    """Return what the page of a column shows."""
-    return [Chapter(
-        'The column', 'In the frame of the first follower. Each has a page of its own: '
-        + ', '.join(f'{name}/report.html' for name in flights) + '.',
-        [Illustration(column_picture(scenario, flights),
-                      'tracks from above, and the distances of all pairs')])]
-
-
-def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> bytes:
-    """Return the picture of a column: tracks, and distances of all pairs, PNG."""
-    times, tracks, distances = column_tracks(scenario, flights)
-    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
-    above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
-    for (name, track), colour in zip(tracks.items(), cycle(_OTHERS)):
-        _draw_path(above, Curve(name, colour, *track[:, :2].T))
-    _finish_map(above, 'from above (● start, ■ end)')
-    law = next(iter(flights.values())).params.law
-    apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=LEADER, alpha=0.08, lw=0)
-    for (name, distance), colour in zip(distances.items(), cycle(_OTHERS)):
-        apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
-    apart.set(xlabel=_TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])))
-    apart.set_ylim(bottom=0.0)
-    _heading(apart, 'distances; shaded: the band')
-    _key(apart)
-    return _encoded(figure, (above, apart))
+    axes['distance'].set(xlim=(0.0, flight.duration), xlabel=TIME)
+    return encoded(figure, 'jpg')
 
 
 def with_gaps(table: Table) -> Mapping[str, Array]:
@@ -318,31 +292,27 @@ def _draw_distance(axis: Axes, flight: PlottedFlight, table: Table) -> None:
     shown = shown[np.isfinite(shown)]
     axis.set(ylabel='distance [m]', ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
                                           max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
-    _heading(axis, f'distance to {flight.name}')
+    axis.set_title(f'distance to {flight.name}')
     _shade(axis, flight.blind, 'leader not visible')
-    _key(axis)
+    add_key(axis)
 
 
 def _draw_above(axis: Axes, flight: PlottedFlight) -> None:
-    for path in flight.paths:
-        _draw_path(axis, path)
     times = flight.table['time']
     period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
+    draw_map(axis, flight.paths, f'from above (● start, ■ end; a line every {period:.0f} s)')
     for k in np.searchsorted(times, np.arange(0.0, flight.duration, period)):
         if k < len(times):
             axis.plot([path.x[k] for path in flight.paths], [path.y[k] for path in flight.paths],
                       color=LIMIT, linewidth=0.6, alpha=0.5)
-    _finish_map(axis, f'from above (● start, ■ end; a line every {period:.0f} s)')
 
 
-def _draw_path(axis: Axes, path: Curve) -> None:
-    axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
-    known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
-    for k, marker in zip((*known[:1], *known[-1:]), 'os'):
-        axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
-
-
-def _finish_map(axis: Axes, title: str) -> None:
+def draw_map(axis: Axes, paths: Iterable[Curve], title: str) -> None:
+    for path in paths:
+        axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
+        known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
+        for k, marker in zip((*known[:1], *known[-1:]), 'os'):
+            axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
     axis.set(title=title, xlabel='x [m]', ylabel='y [m]')
     equal_scales(axis)
     axis.set_anchor('N')
@@ -361,9 +331,8 @@ def _draw_acceleration(axis: Axes, flight: PlottedFlight) -> None:
     if (idle := ~flight.commanded).any():
         axis.plot(times[idle], norms[idle], '.', color=_SHADE, markersize=5,
                   label='no command: brake or level')
-    axis.set(ylabel='acceleration [m/s²]')
-    _heading(axis, 'setpoint (odom axes)')
-    _key(axis)
+    axis.set(ylabel='acceleration [m/s²]', title='setpoint (odom axes)')
+    add_key(axis)
 
 
 def _draw_states(axis: Axes, flight: PlottedFlight) -> None:
@@ -390,11 +359,7 @@ def _shade(axis: Axes, spans: Sequence[tuple[float, float]], label: str = '') ->
             label = ''
 
 
-def _heading(axis: Axes, text: str) -> None:
-    axis.set_title(text, loc='left', fontsize=11)
-
-
-def _key(axis: Axes) -> None:
+def add_key(axis: Axes) -> None:
     """Add a legend above the axis, where no data are."""
     axis.legend(loc='lower right', bbox_to_anchor=(1.0, 0.99), ncols=6, frameon=False, fontsize=9,
                 borderaxespad=0.0, columnspacing=1.2)
@@ -419,10 +384,7 @@ def _usually(values: Array, percentile: float) -> float:
     return max(float(np.percentile(finite, percentile)) if len(finite) else 0.0, 1e-3)
 
 
-def _encoded(figure: Figure, axes: Iterable[Axes], kind: str = 'png') -> bytes:
-    for axis in axes:
-        axis.grid(alpha=0.25, linewidth=0.6)
-        axis.spines[['top', 'right']].set_visible(False)
+def encoded(figure: Figure, kind: str = 'png') -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, pil_kwargs={'quality': 88} if kind == 'jpg' else None)
     return buffer.getvalue()

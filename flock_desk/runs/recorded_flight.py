@@ -48,6 +48,7 @@ from flock_follower.parameters import (
 )
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.planner.loop import PlannerLoop
 
@@ -95,7 +96,7 @@ class RecordedFlight:
         try:
             state = self.source.take(message or read_odometry(data), time)
         except ValueError as error:
-            self._listener.rejected(INVALID_ODOMETRY, str(error))
+            self._reject(time, INVALID_ODOMETRY, error)
             return
         for event in self.source.new_events():
             self._listener.rejected(*event)
@@ -113,19 +114,24 @@ class RecordedFlight:
             self.follower.camera_info(
                 time, deserialize(data, 'sensor_msgs/msg/CameraInfo'), camera)
         except ValueError as error:
-            self._listener.rejected('invalid camera_info', str(error))
+            self._reject(time, 'invalid camera_info', error)
 
-    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '') -> None:
-        """Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name."""
+    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '',
+                   message: Any = None, pixels: GrayImage | None = None) -> None:
+        """
+        Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name.
+
+        :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
+        """
         self._begin(time)
         try:
-            image = deserialize(data, msgtype)
+            image = message or deserialize(data, msgtype)
             stamp = read_stamp(image.header.stamp)
         except ValueError as error:
-            self._listener.rejected(INVALID_IMAGE, str(error))
+            self._reject(time, INVALID_IMAGE, error)
             self._listener.image(ImageOutcome(time, camera=camera))
             return
-        self.follower.image(time, image, stamp, camera)
+        self.follower.image(time, image if pixels is None else pixels, stamp, camera)
 
     def take_range(self, time: int, data: bytes) -> None:
         """Take a sensor_msgs/Range of ``ranges``."""
@@ -133,7 +139,7 @@ class RecordedFlight:
         try:
             measured = from_range(deserialize(data, RANGE))
         except ValueError as error:
-            self._listener.rejected('invalid ranges', str(error))
+            self._reject(time, 'invalid ranges', error)
             return
         self.follower.range(time, measured)
 
@@ -141,9 +147,12 @@ class RecordedFlight:
         """Process the images that still wait: no more will come."""
         self.follower.finish()
 
-    def _begin(self, time: int) -> None:
-        """Process all events before a message; the flight begins with the first message."""
+    def _reject(self, time: int, reason: str, error: ValueError) -> None:
         self.follower.advance(time)
+        self._listener.rejected(reason, str(error))
+
+    def _begin(self, time: int) -> None:
+        """Begin the flight with the first message."""
         if not self._began:
             self._began = True
             self.follower.engage(time, True)

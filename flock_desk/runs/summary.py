@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 import json
 import math
 from pathlib import Path
@@ -34,7 +33,7 @@ import numpy as np
 from flock_desk.runs.evaluation import Evaluation, STATES
 from flock_desk.runs.frame_errors import STAGES, Table
 from flock_desk.runs.record import FlightRecord, LiveRecord
-from flock_desk.scenarios.scenario import Outage, Scenario
+from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.geometry import Array
 from flock_follower.whole_file import whole_file
@@ -43,14 +42,11 @@ from flock_follower.whole_file import whole_file
 WRONG_ATTITUDE = math.radians(20.0)
 #: A mean NEES of three-dimensional errors that is still consistent; 3 is expected.
 CONSISTENT = (1.5, 6.0)
-#: Keys whose figures are times measured here, and so differ from run to run.
-TIMINGS = ('cpu_ms_per_frame', 'realtime_factor', 'timings')
 BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
 LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
 OUTRUN = 1.0  # s for which a leader is faster than v_max that outruns; a gust is shorter
 OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
-STEP = 0.02  # s between the times at which the vehicles of a column are compared
 
 
 def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str, Any]:
@@ -164,11 +160,6 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
             'wall_time_s': evaluation.wall_time,
             'cpu_ms': {what: _percentiles(cpu.get(what, np.empty(0)))
                        for what in ('decode', *STAGES, 'planner', 'gate')}}})
-
-
-def without_timings(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a summary without its timings: the part that two runs have in common."""
-    return {key: value for key, value in summary.items() if key not in TIMINGS}
 
 
 def flight_figures(flight: FlightRecord,
@@ -325,53 +316,6 @@ def _longest(times: Array, holds: Any) -> float:
         since = min(since, time) if held else time
         longest = max(longest, time - since)
     return longest
-
-
-def spacing(scenario: Scenario) -> float:
-    """Return the distance between two vehicles of a column at its start, m: the mean one."""
-    return float(np.mean(scenario.start.distance))
-
-
-def column_tracks(scenario: Scenario, flights: Mapping[str, LiveRecord]
-                  ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """
-    Return the motion of a column while all of it flew the scenario, in the first one's frame.
-
-    :returns: times (n,), s; positions (n, 3), m, by vehicle; distances (n,), m, by pair.
-    """
-    logs = {name: flight.log for name, flight in flights.items()}
-    began = max(float(log['began']) for log in logs.values())
-    times = np.arange(began, min(float(log['ended']) for log in logs.values()), STEP)
-    first = next(iter(logs.values()))
-    tracks = {'leader': _at(times, float(first['start']) + (
-        first['image_stamp'] - int(first['epoch_ns'])) * 1e-9, first['leader_position'])}
-    for i, (name, log) in enumerate(logs.items()):
-        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + _at(
-            times, flights[name].velocity_times + float(log['began']), log['position'])
-    return times - began, tracks, {
-        f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
-        for a, b in combinations(tracks, 2)}
-
-
-def _at(times: Array, known: Array, positions: Array) -> Array:
-    """Return positions (n, 3) at times (n,); NaN if they are unknown."""
-    return np.stack([np.interp(times, known, column, np.nan, np.nan)
-                     for column in positions.T], axis=1)
-
-
-def column_figures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> dict[str, Any]:
-    """
-    Return the figures of a column as a whole.
-
-    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
-    """
-    _, _, distances = column_tracks(scenario, flights)
-    pairs = {pair: float(np.nanmin(distance)) for pair, distance in distances.items()}
-    return jsonable({
-        'column_of': scenario.name, 'followers': len(flights),
-        'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
-        'speed_max_m_s': most(np.concatenate(
-            [np.linalg.norm(flight.velocities, axis=1) for flight in flights.values()]))})
 
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:

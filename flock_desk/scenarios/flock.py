@@ -122,11 +122,9 @@ def _line(count: int) -> list[tuple[float, float, int]]:
 
 
 def _wedge(count: int) -> list[tuple[float, float, int]]:
-    found = []
-    for k in range(1, count + 1):
-        row, side = (k + 1) // 2, 1.0 if k % 2 else -1.0
-        found.append((-row * math.cos(ARM), side * row * math.sin(ARM), max(k - 2, 0)))
-    return found
+    return [(-row * math.cos(ARM), side * row * math.sin(ARM), max(k - 2, 0))
+            for k in range(1, count + 1)
+            for row, side in [((k + 1) // 2, 1.0 if k % 2 else -1.0)]]
 
 
 def _ring(count: int) -> list[tuple[float, float, int]]:
@@ -147,12 +145,9 @@ def _ring(count: int) -> list[tuple[float, float, int]]:
 
 def _grid(count: int) -> list[tuple[float, float, int]]:
     columns = math.isqrt(count)
-    found = []
-    for k in range(count):
-        row, column = divmod(k, columns)
-        wide = min(columns, count - row * columns)
-        found.append((-1.0 - row, 0.5 * (wide - 1) - column, max(k + 1 - columns, 0)))
-    return found
+    return [(-1.0 - row, 0.5 * (min(columns, count - row * columns) - 1) - column,
+             max(k + 1 - columns, 0))
+            for k in range(count) for row, column in [divmod(k, columns)]]
 
 
 _SHAPES = {'line': _line, 'wedge': _wedge, 'ring': _ring, 'grid': _grid}

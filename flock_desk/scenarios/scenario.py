@@ -196,7 +196,7 @@ class Print(Part):
 @dataclass(frozen=True)
 class Operation(Part):
     """
-    What somebody does in a flight in lock step: the operator, the pilot, or chance.
+    An action in a lock-step flight: of the operator, of the pilot, or a failure.
 
     'arm', 'takeoff', 'offboard' and 'engage' are calls of the services; 'pilot' takes over by the
     mode switch and climbs; in a 'restart' the bridge dies, and starts again a while later.

@@ -24,6 +24,10 @@ name is the scenario's. A missing key keeps its default::
       motion: legs
       legs:
         - {duration: 60, velocity: [0.4, 0, 0]}
+    variants:
+      faster: {flight: {v_max: 2}}
+
+A variant is a scenario of its own name, which differs in the keys that it has.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, MISSING, replace
 import difflib
+from functools import cache
 import math
 from pathlib import Path
 from types import UnionType
@@ -44,6 +49,7 @@ from flock_desk.scenarios.scenario import Scenario
 from flock_follower.resources import resource
 
 FOLDER = 'config/scenarios'
+_VARIANTS = 'variants'
 _KINDS = {float: 'a number', int: 'an integer', str: 'a text', bool: 'true or false'}
 
 
@@ -53,23 +59,33 @@ class ScenarioError(ValueError):
 
 def names() -> list[str]:
     """Return the names of the scenarios of the package."""
-    return sorted(path.stem for path in resource(FOLDER).glob('*.yaml'))
+    return sorted(_files())
+
+
+@cache
+def _files() -> dict[str, Path]:
+    """Return the file of each scenario of the package, by its name."""
+    return {name: path for path in resource(FOLDER).glob('*.yaml')
+            for name in (path.stem, *_variants(_composed(path.read_text('utf-8'), str(path))))}
 
 
 def load(name: str) -> Scenario:
     """
     Return a scenario of the package by its name, or another one by the path of its file.
 
+    A variant in such a file is FILE.yaml:NAME.
+
     :raises ScenarioError: if it does not exist, or its file is wrong.
     """
-    path = Path(name)
+    file, _, variant = name.partition(':')
+    path = Path(file)
     if path.suffix not in ('.yaml', '.yml'):
-        if name not in names():
+        if name not in _files():
             raise ScenarioError(f'scenario = {name!r}: must be one of {", ".join(names())}, or '
                                 'the path of a .yaml file')
-        path = resource(f'{FOLDER}/{name}.yaml')
+        path, variant = _files()[name], name
     try:
-        return parse(path.read_text(encoding='utf-8'), str(path))
+        return parse(path.read_text(encoding='utf-8'), str(path), variant)
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f'{path}: cannot be read: {error}') from None
 
@@ -91,22 +107,40 @@ def load_for_real_time(name: str) -> Scenario:
     return scenario
 
 
-def parse(text: str, path: str) -> Scenario:
+def parse(text: str, path: str, variant: str = '') -> Scenario:
     """
-    Return the scenario in the text of a file.
+    Return the scenario in the text of a file, or a variant of it.
 
     :raises ScenarioError: naming file, line, key, value and the allowed values.
     """
-    root = _composed(text, path)
+    root, reader, stem = _composed(text, path), _ScenarioReader(path), Path(path).stem
     if root is None:
         raise ScenarioError(f'{path}:1: is empty: must hold summary, leader and so on')
-    scenario: Scenario = _ScenarioReader(path).dataclass(Scenario, root, '', name=Path(path).stem)
+    variants = _variants(root)
+    if isinstance(root, yaml.MappingNode):
+        root.value = [(key, value) for key, value in root.value if key.value != _VARIANTS]
+    scenario: Scenario = reader.dataclass(Scenario, root, '', name=stem)
+    if variant not in ('', stem, *variants):
+        raise ScenarioError(f'{path}: has no variant {variant}, only {", ".join(variants)}')
+    if variant in variants:
+        root = variants[variant]
+        scenario = reader.dataclass(Scenario, root, f'{_VARIANTS}.{variant}.', scenario,
+                                    name=variant)
     try:
         course(scenario, 0)
     except ValueError as error:
         lines = [key.start_mark.line + 1 for key, _ in root.value if key.value == 'leader']
-        raise ScenarioError(f'{path}:{lines[0] if lines else 1}: {error}') from None
+        raise ScenarioError(
+            f'{path}:{lines[0] if lines else root.start_mark.line + 1}: {error}') from None
     return scenario
+
+
+def _variants(root: Any) -> dict[str, Any]:
+    """Return the nodes of the variants in a file, by name."""
+    if not isinstance(root, yaml.MappingNode):
+        return {}
+    return {key.value: value for part, node in root.value if part.value == _VARIANTS
+            for key, value in node.value}
 
 
 def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
@@ -160,7 +194,8 @@ class _ScenarioReader:
                 raise self._error(key, f'{where}{name}: given twice, first in line '
                                        f'{lines[name].start_mark.line + 1}')
             lines[name] = value
-            values[name] = self._value(hints[name], value, f'{where}{name}')
+            values[name] = self._value(hints[name], value, f'{where}{name}',
+                                       getattr(before, name, None))
         for f in fields(kind):
             if before is None and f.name not in values and f.default is MISSING and (
                     f.default_factory is MISSING):
@@ -174,11 +209,11 @@ class _ScenarioReader:
     def _keys(self, kind: Any, given: dict[str, Any]) -> Iterator[str]:
         return (f.name for f in fields(kind) if f.name not in given)
 
-    def _value(self, kind: Any, node: Any, where: str) -> Any:
+    def _value(self, kind: Any, node: Any, where: str, before: Any = None) -> Any:
         if get_origin(kind) is UnionType:  # a part that may be missing
             kind = get_args(kind)[0]
         if is_dataclass(kind):
-            return self.dataclass(kind, node, f'{where}.')
+            return self.dataclass(kind, node, f'{where}.', before)
         if get_origin(kind) is tuple:
             return self._tuple(get_args(kind), node, where)
         value = None

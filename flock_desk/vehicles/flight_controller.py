@@ -119,7 +119,7 @@ class FlightController(ABC):
 
     @property
     def intended_mode(self) -> int:
-        """Return the custom_mode that somebody chose; a failsafe may fly another."""
+        """Return the custom_mode last requested; a failsafe may fly another."""
         return self.custom_mode
 
     @property
@@ -214,7 +214,7 @@ class FlightController(ABC):
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 
     def unfit(self, now: float) -> list[str]:
-        """Return the conditions that keep it from arming."""
+        """Return the conditions that prevent arming."""
         return self.missing(self.mode, now, self.PROFILE.arming)
 
     def command_mode(self, params: tuple[float, ...], now: float) -> list[int]:
@@ -296,7 +296,7 @@ class FlightController(ABC):
         return True
 
     def _choose(self, name: str, now: float) -> None:
-        """Change the mode for somebody on the link."""
+        """Change the mode by a request on the link."""
         if name != self.mode:
             self._enter(name)
 

@@ -89,7 +89,7 @@ CHECKS: Final[Mapping[str, Check]] = {
 
 
 class Event(mavlink.MAVLink_message):  # type: ignore[misc]
-    """EVENT (410), which no pymavlink knows, to everybody, from the autopilot itself."""
+    """EVENT (410), which pymavlink does not define; a broadcast of the autopilot itself."""
 
     def __init__(self, number: int, level: int, arguments: bytes) -> None:
         super().__init__(_EVENT, 'EVENT')
@@ -122,7 +122,7 @@ class Px4(FlightController):
 
     @property
     def intended_mode(self) -> int:
-        """Return the custom_mode of the mode that somebody chose; a failsafe may fly another."""
+        """Return the custom_mode of the mode last requested; a failsafe may fly another."""
         return PX4.modes[self._chosen].number
 
     @property

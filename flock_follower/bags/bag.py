@@ -146,11 +146,11 @@ class Bag:
         :raises BagError: an unknown topic, or data that is corrupt or incomplete.
         """
         names = self.select(topics)
-        connections = [c for name in names for c in self._connections[name]]
         yielded = 0
         with failures(self.path, _UNREADABLE):
             for connection, stamp_ns, raw in self._reader.messages(
-                    connections=connections, start=start_ns, stop=stop_ns):
+                    connections=[c for name in names for c in self._connections[name]],
+                    start=start_ns, stop=stop_ns):
                 topic = self.topics[absolute(connection.topic)]
                 yielded += 1
                 yield BagMessage(topic.name, topic.msgtype, stamp_ns, _cdr(raw, topic, connection))
@@ -234,8 +234,7 @@ def failures(subject: str | Path, what: str) -> Iterator[None]:
 
 def reason_of(error: Exception) -> str:
     """Return what an exception says, in one line."""
-    strerror = error.strerror if isinstance(error, OSError) else None
-    return strerror or ' '.join(str(error).split())
+    return (isinstance(error, OSError) and error.strerror) or ' '.join(str(error).split())
 
 
 def absolute(topic: str) -> str:

@@ -140,7 +140,7 @@ class McapFile:
         """
         Write the summary and close the file.
 
-        :raises OSError: if the summary cannot be written; the file is closed all the same.
+        :raises OSError: if the summary cannot be written; the file is closed in any case.
         """
         try:
             self._append(self._end())

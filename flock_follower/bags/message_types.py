@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -37,21 +38,29 @@ def typestore() -> Typestore:
 
 def empty(msgtype: str) -> Any:
     """Return a message of the type store with every field zero or empty."""
-    fields = typestore().fielddefs[msgtype][1]
-    return typestore().types[msgtype](*[_zero(description) for _, description in fields])
+    return _maker(msgtype)()
 
 
-def _zero(description: Any) -> Any:
+@cache
+def _maker(msgtype: str) -> Callable[[], Any]:
+    """Return a function that makes empty messages of a type."""
+    message, fields = typestore().types[msgtype], [
+        _zero(description) for _, description in typestore().fielddefs[msgtype][1]]
+    return lambda: message(*[make() for make in fields])
+
+
+def _zero(description: Any) -> Callable[[], Any]:
+    """Return a function that makes empty values of a field."""
     kind, detail = description
     if kind == Nodetype.NAME:
-        return empty(detail)
+        return _maker(detail)
     if kind == Nodetype.BASE:
-        return _ZEROS.get(detail[0], 0)
+        return lambda: _ZEROS.get(detail[0], 0)
     element, length = detail
     count = length if kind == Nodetype.ARRAY else 0
     if element[0] == Nodetype.BASE and element[1][0] != 'string':
-        return np.zeros(count, dtype=_BYTES.get(element[1][0], element[1][0]))
-    return [_zero(element) for _ in range(count)]
+        return partial(np.zeros, count, _BYTES.get(element[1][0], element[1][0]))
+    return lambda: [_zero(element)() for _ in range(count)]
 
 
 def ros2_type(msgtype: str) -> str:

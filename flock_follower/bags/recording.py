@@ -127,7 +127,7 @@ class FlightRecording:
             return
         first = min(message.stamp_ns for message in messages)
         ahead, before = max(m.stamp_ns for m in messages) * 1e-9 - now, self._ahead
-        if first < self._last - _STEP or (  # somebody set the clock, back or ahead
+        if first < self._last - _STEP or (  # the clock was set, back or ahead
                 before is not None and ahead - before > _FORWARD):
             self._end()
         self._ahead = ahead
@@ -155,7 +155,7 @@ class FlightRecording:
         """
         Finish the recording under way.
 
-        :raises OSError: if that fails; it can be read all the same.
+        :raises OSError: if that fails; the recording stays readable.
         """
         try:
             self._end()

@@ -31,12 +31,12 @@ from flock_follower.bags.message_types import typestore
 from flock_follower.bags.recording import NAME
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.observations import Observations
+from flock_follower.checks.recorded_system import LAST
 from flock_follower.whole_file import whole_file
 
 PACKAGES: Final[tuple[str, ...]] = (
     'flock_follower', 'numpy', 'opencv-python-headless', 'opencv-python', 'pymavlink', 'rosbags',
     'rclpy', 'ros-jazzy-rclpy')
-LAST: Final[int] = 60_000_000_000  # ns of the recording
 #: Files beside a recording that explain it.
 BESIDE: Final[tuple[str, ...]] = ('parameters.yaml', 'neighbors.yaml')
 
@@ -47,7 +47,8 @@ def write_report(path: Path, seen: Observations, table: str, findings: Mapping[s
     Write a zip file.
 
     :param table: the findings as ``check`` prints them; ``findings``: as JSON.
-    :param recording: of which the last 60 s are included; None: there is none.
+    :param recording: of which the last 60 s are included, and the newest message before of each
+        latched topic; None: there is none.
     :raises OSError: naming the file, if it cannot be written.
     """
     with whole_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
@@ -94,8 +95,12 @@ def _add_recording(archive: zipfile.ZipFile, recording: Path) -> None:
                 problems += [f'{name}: {reason}' for name, reason in bag.skipped.items()]
                 problems += [f'{name}: unknown message type {bag.topics[name].msgtype}'
                              for name in bag.topics.keys() - known]
-                with BagWriter(excerpt, [name for name in known if known[name].latched]) as part:
-                    for message in bag.messages(known, bag.end_ns - LAST, bag.end_ns + 1):
+                latched, start = [name for name in known if known[name].latched], bag.end_ns - LAST
+                with BagWriter(excerpt, latched) as part:
+                    for message in {message.topic: message for message in (  # the newest of each
+                            bag.messages(latched, stop_ns=start) if latched else ())}.values():
+                        part.write(*message._replace(stamp_ns=start))
+                    for message in bag.messages(known, start, bag.end_ns + 1):
                         if message.topic in known:  # without any name the bag yields all
                             part.write(*message)
         except BagError as error:

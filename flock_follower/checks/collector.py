@@ -43,7 +43,7 @@ FEWEST_PICTURES: Final = 20
 MOST_BYTES: Final = 60e6
 #: Time between two images whose shift is measured, s, and the number of pairs.
 PAIR: Final = (0.03, 0.16)
-PAIRS: Final = 60
+PAIRS: Final = 90
 #: Dictionaries to search if no marker of ours is found: the largest of each family.
 OTHERS: Final = ('DICT_4X4_1000', 'DICT_5X5_1000', 'DICT_6X6_1000', 'DICT_7X7_1000',
                  'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_25h9', 'DICT_APRILTAG_36h11')
@@ -65,9 +65,9 @@ class Collector:
         self._next_picture = self._next_pair = -math.inf
         self._small: tuple[float, Array] | None = None
 
-    def take(self, name: str, topic: str, message: Any, arrival: float) -> None:
+    def take(self, name: str, topic: str, message: Any, arrival: float) -> GrayImage | None:
         """
-        Take a message that arrived at a time, s.
+        Take a message that arrived at a time, s; return the pixels of an image if decoded.
 
         :param name: our name of the topic; '' if its content is not used.
         :param message: None if only its arrival counts.
@@ -78,7 +78,7 @@ class Collector:
         known.arrivals.append(arrival)
         known.stamps.append(stamp)
         if message is None:
-            return
+            return None
         if name == 'odom':
             frames = [message.header.frame_id, message.child_frame_id]
             if seen.frames[-1:] != [frames]:
@@ -86,14 +86,15 @@ class Collector:
             if seen.own is None:
                 seen.odometry.append((to_nanoseconds(arrival), message))
         elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
-            self._image(message, arrival, stamp)
-        elif name == 'camera_info':
+            return self._image(message, arrival, stamp)
+        if name == 'camera_info':
             seen.calibration = message
         elif name == 'mavlink/odom':
             q = message.pose.pose.orientation
             seen.autopilot.append((stamp, np.array([q.x, q.y, q.z, q.w])))
         elif name == '/diagnostics':
             self.diagnostics(message)
+        return None
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -103,10 +104,10 @@ class Collector:
                 level[0] if isinstance(level, bytes) else int(level), status.message,
                 {item.key: item.value for item in status.values})
 
-    def _image(self, message: Any, arrival: float, stamp: float) -> None:
-        """Take an Image or CompressedImage; only some are decoded."""
+    def _image(self, message: Any, arrival: float, stamp: float) -> GrayImage | None:
+        """Take an Image or CompressedImage; return its pixels: only some are decoded."""
         if arrival < self._next_pair:
-            return
+            return None
         picture_due = arrival >= self._next_picture  # each image is decoded once
         picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
                           getattr(message, 'encoding', '') or message.format, len(message.data))
@@ -117,7 +118,7 @@ class Collector:
             if picture_due:
                 self._next_picture = arrival + self._picture_period(0)
                 self.observations.pictures.append(picture)
-            return
+            return None
         self._pair(stamp, arrival, pixels)
         if picture_due:
             self._next_picture = arrival + self._picture_period(pixels.size)
@@ -125,9 +126,10 @@ class Collector:
             coarse = pixels[::4, ::4]
             picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
             self._kept.append((picture, pixels))
+        return pixels
 
     def _picture_period(self, size: int) -> float:
-        """Return the time between images of so many bytes that are searched, s."""
+        """Return the period of searched images, s, for images of a size, bytes."""
         count = min(max(int(MOST_BYTES / max(size, 1)), FEWEST_PICTURES), MOST_PICTURES)
         return max(PICTURE_PERIOD, self._duration / count)
 
@@ -140,7 +142,7 @@ class Collector:
             self._small = stamp, reduced
             return
         self.observations.shifts.append(
-            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1])])
+            [before[0], stamp, *shift(before[1], reduced, pixels.shape[1]).ravel()])
         self._small, self._next_pair = None, arrival + self._duration / PAIRS
 
     def finish(self, config: NeighborConfig) -> None:
@@ -154,9 +156,11 @@ class Collector:
         except ValueError:
             camera = None  # reported with the calibration
         for picture, pixels in self._kept:
-            found = everywhere(pixels, config.dictionary, False)
-            if not markers.keys() & set(found.ids.tolist()):  # a third of the time
-                found = everywhere(pixels, config.dictionary, True)
+            found = everywhere(pixels, config.dictionary)
+            if not markers.keys() & set(found.ids.tolist()):
+                ours = everywhere(pixels, config.dictionary,
+                                  [of.marker for of in markers.values()])
+                found = ours if len(ours.ids) else found
             picture.markers = _sides(found)
             picture.repeated = sorted(number for number, times in Counter(
                 found.ids.tolist()).items() if times > 1)
@@ -205,7 +209,7 @@ def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]
     known = dictionary_names()
     for name in (dictionary, *(other for other in OTHERS if other in known)):
         count = Counter(number for image in images
-                        for number in _sides(everywhere(image, name, True)))
+                        for number in _sides(everywhere(image, name)))
         if often := sorted(number for number, times in count.items()
                            if times >= min(SEEN_TWICE, len(images))):
             return {name: often}

@@ -109,7 +109,7 @@ def _needed(seen: Observations, name: str) -> Finding:
     if not topic.arrivals:
         who = ', '.join(sorted({end.node for end in topic.publishers}))
         return error(what, f'{who} publishes {full}, and sends nothing', wanted,
-                     'look at its log; is the sensor plugged in, is it initialised?'
+                     "see the node's log; is the sensor connected and initialised?"
                      if msgtype != INFO else 'calibrate the camera; give its driver the file')
     return ok(what, f'{full}, {len(topic.arrivals)} messages', wanted)
 
@@ -160,7 +160,8 @@ def _wiring(seen: Observations) -> Iterator[Finding]:
                 and at not in listening]
         if deaf and topic.publishers:
             yield error(f'{_images(name)} wiring',
-                        f'{", ".join(deaf)} does not listen to {full}', 'each node listens to it',
+                        f'{", ".join(deaf)} does not subscribe to {full}',
+                        'each node subscribes to the topic',
                         f'start it with --ros-args -r {name}:={full}' if _images(name) == name else
                         'start relative_pose with image_transport:='
                         f'{"compressed" if name == COMPRESSED_IMAGES else "raw"}, or -r '

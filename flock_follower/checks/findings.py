@@ -28,11 +28,12 @@ ESSENTIAL: Final = frozenset({
     'images rate', 'odom rate', 'relative_pose says', 'planner says', 'mavlink_bridge says',
     'ready to arm'})
 _CAMERA: Final = ('images', 'camera_info', 'calibration')
-_AXES: Final = (*_CAMERA, 'odom', 'odom up', 'odom ahead')
+_AXES: Final = (*_CAMERA, 'odom', 'odom positions', 'odom up', 'odom ahead')
 #: The causes of each property: its row is left out if one of them is an error.
 CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
-    'odom ahead': (*_CAMERA, 'odom', 'odom up'),
-    'camera time offset': _AXES, 'marker size': _AXES, 'camera mounting': _AXES,
+    'odom velocity': ('odom positions',), 'odom ahead': (*_CAMERA, 'odom', 'odom up'),
+    'camera time offset': _AXES, 'marker size': (*_AXES, 'focal length'),
+    'focal length': _AXES, 'camera mounting': _AXES,
     'images rate': ('images',), 'odom rate': ('odom',),
     'images processed': (*_CAMERA, 'odom'),
     'relative_pose says': (*_CAMERA, 'odom'),

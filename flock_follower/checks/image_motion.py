@@ -13,31 +13,35 @@
 # limitations under the License.
 
 """
-Comparison of image motion with the odometry's rotation: finds wrong axes and a time offset.
+Comparison of image motion with odometry: finds wrong axes, clock, mounting, and focal length.
 
 A camera that turns by a small rotation vector r (its own axes: x right, y down, z ahead) sees the
-scene move by (-f r_y, f r_x) px, at any distance. The camera's translation adds a shift with a
-smaller mean. So the shift of the middle of the image gives two of the three components of r
+scene move by (-f r_y, f r_x) px, at any distance. A translation d adds (-f d_x, -f d_y) / depth,
+with a smaller mean. So the shift of the image gives two of the three components of r
 for each pair of images. Many pairs give the rotation between body and camera: of the 24 rotations
-that lay three axes onto three others, the one that explains the shifts best.
+that lay three axes onto three others, the one that explains the shifts best. A least-squares fit
+then gives the small rotation that remains, and the ratio of the shifts to those expected from the
+calibration: the error of the focal length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import permutations, product
+import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, rotation_vector_to_matrix, skew
+from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 
 #: Width, px, to which images are scaled for the comparison; rows and columns of parts.
 WIDTH = 192
-ROWS, COLUMNS = 2, 3
+ROWS, COLUMNS = 2, 3  # PARTS in all
 #: Least quality of a match, 0 to 1.
 RESPONSE = 0.05
 #: Number of pairs, and their RMS shift as a share of the focal length, needed for a result.
@@ -50,36 +54,51 @@ _QUARTER_TURNS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
                   if np.linalg.det(matrix := np.diag(signs)[list(p)]) > 0.0]
 
+#: Prior deviations of the mounting, rad, of the ratio of the shifts, and of 1 / depth of each
+#: part, 1/m.
+PRIOR = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (ROWS * COLUMNS)])
+#: Measured errors were up to so many times the deviations. The least deviation of the ratio. The
+#: deviation of 1 / depth, as a share of it. Turned by hand, the camera moves on an arc, which
+#: near walls looks like a longer focal length, unless it pitches by this share of its yaw.
+WIDENED, ZOOM_ERROR, DEPTHS, BOTH = 2.0, 0.03, 1.0, 0.2
+_PASSES, _FAR = 8, 2.0
+
 #: Returns attitudes (m, 4) at stamps (m,), s, and where they are known (m,).
 Attitude = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
 
 
 def small(image: GrayImage) -> Array:
     """Return an image reduced to ``WIDTH`` px, the input of :func:`shift`."""
+    while image.shape[1] >= 2 * WIDTH:  # halving is the fastest
+        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     height, width = image.shape
     size = WIDTH, max(round(height * WIDTH / width), 16)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def shift(before: Array, after: Array, width: int) -> tuple[float, float, float]:
+def shift(before: Array, after: Array, width: int) -> Array:
     """
-    Return the shift of the scene right and down, px of images of that width, and its quality.
+    Return how each part of the scene moved right and down, px of images of that width.
 
-    The shift is the median over the parts of the image: the leader may fill one of them.
+    (PARTS, 3), the last column is the quality. A large shift of two windows at the same place is
+    measured too small, so they are compared again with windows that are that far apart.
     """
+    found = np.zeros((ROWS * COLUMNS, 3))
     if before.shape != after.shape:
-        return 0.0, 0.0, 0.0
+        return found
     height, columns = before.shape[0] // ROWS, WIDTH // COLUMNS
     window = cv2.createHanningWindow((columns, height), cv2.CV_32F)
-    found = []
-    for row, column in product(range(ROWS), range(COLUMNS)):
-        part = np.s_[row * height:(row + 1) * height, column * columns:(column + 1) * columns]
-        (right, down), quality = cv2.phaseCorrelate(
-            before[part] - before[part].mean(), after[part] - after[part].mean(), window)
-        found.append((right, down, quality))
-    right, down, quality = np.median(found, axis=0).tolist()
-    scale = width / WIDTH
-    return right * scale, down * scale, quality
+    last = np.array([WIDTH - columns, before.shape[0] - height])
+    for n, (row, column) in enumerate(product(range(ROWS), range(COLUMNS))):
+        first = np.array([column * columns, row * height])
+        for _ in range(2):
+            second = np.clip(first + np.rint(found[n, :2]).astype(int), 0, last)
+            first = np.clip(second - np.rint(found[n, :2]).astype(int), 0, last)
+            old, new = (image[y:y + height, x:x + columns]
+                        for image, (x, y) in ((before, first), (after, second)))
+            more, quality = cv2.phaseCorrelate(old - old.mean(), new - new.mean(), window)
+            found[n] = *(second - first + more), quality
+    return found * [width / WIDTH, width / WIDTH, 1.0]
 
 
 class AxesFit(NamedTuple):
@@ -88,76 +107,133 @@ class AxesFit(NamedTuple):
 
     ``configured`` is the share with the configured axes, ``best`` that with the best rotation
     ``turn`` (3, 3), R_base_configured, the identity if none is better; each with the time offset
-    that suits it. ``offset``, s, is that of ``best``: the camera's stamps minus those of the
-    odometry; ``together`` is the share without an offset. ``zoom``: ratio of the shifts to those
-    expected from the focal length, ``zoomed`` the share with that ratio.
+    that suits it. ``mounting`` (3,), rad, along base_link's axes: beyond ``turn`` the camera is
+    mounted by exp(mounting) otherwise than configured. With it, ``explained`` is the share at the
+    best ``offset``, s, the camera's stamps minus those of the odometry, ``together`` that without
+    an offset. ``zoom``: ratio of the shifts to those expected from the calibration.
     """
 
     configured: float
     best: float
     turn: Array
     offset: float
+    explained: float
     together: float
+    mounting: Array
+    mounting_deviations: Array
     zoom: float
-    zoomed: float
+    zoom_deviation: float
 
 
-def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float,
-             R_base_optical: Array, up: Array | None = None) -> AxesFit | None:
+def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
+             velocity: Callable[[Array], Array], camera: CameraModel, R_base_optical: Array,
+             up: Array | None = None) -> AxesFit | None:
     """
     Return how the axes fit, or None if the images hardly moved.
 
-    :param shifts: rows of stamp before, stamp after, shift right and down, px, and its quality.
+    :param shifts: rows of stamp before, stamp after, and the numbers of :func:`shift`.
     :param attitude: returns ``q_odom_base``, see :func:`interpolated`.
-    :param focal: focal length, px.
+    :param velocity: returns velocities (m, 3), m/s, along base_link's axes, at stamps (m,), s.
     :param up: (3,), the upward direction in base_link as configured: besides the identity only
         rotations that make it z are tried. None: it is z already, and all rotations are tried.
     """
-    rows = np.array([row for row in shifts if row[4] >= RESPONSE]).reshape(-1, 5)
-    if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST * focal:
+    every = np.array(shifts).reshape(-1, 2 + 3 * ROWS * COLUMNS)
+    # The leader may fill one part, so the median stands for the image.
+    median = np.median(every[:, 2:].reshape(-1, ROWS * COLUMNS, 3), axis=1)
+    rows = np.column_stack([every[:, :2], median[:, :2] / camera.matrix[0, 0], every[:, 2:]])[
+        median[:, 2] >= RESPONSE]
+    if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST:
         return None
-    turns = [turn for n, turn in enumerate(_QUARTER_TURNS)
-             if n == 0 or up is None or turn[2].dot(up) > 0.5]
+    turns = np.array([turn for n, turn in enumerate(_QUARTER_TURNS)
+                      if n == 0 or up is None or turn[2].dot(up) > 0.5])
+    to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
-    shares = np.full((len(offsets), len(turns)), -1.0)
-    for n, offset in enumerate(offsets.tolist()):
-        turned, seen = _turned(rows, attitude, offset)
-        if len(seen) >= FEW:
-            shares[n] = [_share(_expected(turned @ turn.T @ R_base_optical, focal), seen)
-                         for turn in turns]
+    moves = [_turned(rows, attitude, offset) for offset in offsets.tolist()]
+    shares = _shares(moves, to_optical)
     if shares.max() < 0.0:
         return None
     # If several are equal, as when it only turned about one axis, the configured one wins.
     best = 0 if shares[:, 0].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
-    curve = shares[:, best]
-    peak = int(curve.argmax())
-    offset = _summit(offsets, curve, peak)
-    turned, seen = _turned(rows, attitude, offset)
-    expected = _expected(turned @ turns[best].T @ R_base_optical, focal)
-    zoom = float(np.sum(expected * seen) / np.sum(expected**2))
-    return AxesFit(float(shares[:, 0].max()), float(curve[peak]), turns[best], offset,
-                   float(curve[len(offsets) // 2]), zoom, _share(zoom * expected, seen))
+    R, curve = to_optical[best], shares[:, best]
+    for _ in range(2):  # an error of the mounting looks like an offset, too
+        offset = _summit(offsets, curve, int(curve.argmax()))
+        turned, known = _turned(rows, attitude, offset)
+        moved = np.diff(known[:, :2]) * velocity(known[:, :2].mean(axis=1) - offset)
+        solution, covariance = _refined(
+            turned @ R, moved @ R, known[:, 4:].reshape(-1, ROWS * COLUMNS, 3), camera)
+        curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))
+    rates = np.sqrt(np.mean((turned @ R)[:, :2]**2, axis=0))
+    error = ZOOM_ERROR if rates.min() > BOTH * rates.max() else 1.0
+    return AxesFit(
+        float(shares[:, 0].max()), float(shares.max()), turns[best], offset, float(curve.max()),
+        float(curve[len(offsets) // 2]), R @ solution[:3],
+        WIDENED * np.sqrt((R @ covariance[:3, :3] @ R.T).diagonal()), float(solution[3]),
+        math.hypot(WIDENED * math.sqrt(covariance[3, 3]), error))
+
+
+def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
+             ) -> tuple[Array, Array]:
+    """
+    Return mounting (3,), rad, zoom and each 1 / depth by least squares; covariance of the first 4.
+
+    :param turned: rotation vectors (n, 3), rad; :param moved: displacements (n, 3), m, both in
+        optical axes as configured. :param parts: their shifts (n, PARTS, 3).
+    """
+    x, y = ((np.arange(count) + 0.5) * size / count
+            for count, size in ((COLUMNS, camera.width), (ROWS, camera.height)))
+    middles = camera.undistort(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    rays = np.column_stack([middles, np.ones(len(middles))])
+    by_point = camera.linearize(rays)[1] / camera.matrix[0, 0]
+    by_turn = by_point @ np.array([skew(ray) for ray in rays])
+    seen, good = parts[:, :, :2] / camera.matrix[0, 0], parts[:, :, 2] >= RESPONSE
+    start = solution = (np.arange(len(PRIOR)) == 3).astype(float)
+    prior = np.diag(PRIOR**-2)
+    by_depth = (by_point @ moved[:, None, :, None]) * -np.eye(len(rays))[:, None]
+    for _ in range(_PASSES):
+        vectors = turned @ rotation_vector_to_matrix(solution[:3])
+        by_mounting = np.array([skew(vector) for vector in vectors])
+        design = np.concatenate([  # (n, PARTS, 2, 4 + PARTS)
+            solution[3] * by_turn @ by_mounting[:, None],
+            by_turn @ vectors[:, None, :, None], by_depth], axis=3)
+        off = seen - design[..., 3:] @ solution[3:]
+        length = np.linalg.norm(off, axis=2)
+        # A part that shows the leader has no weight.
+        weights = good / (1.0 + (length / (_FAR * np.median(length[good]) + 1e-5))**2)**2
+        weights *= 2.0 * weights.sum() / max(float(np.sum(weights * length**2)), 1e-9)
+        information = np.einsum('nkim,nk,nkil->ml', design, weights, design) + prior
+        moment = np.einsum('nkim,nk,nki->m', design, weights, off + design @ solution)
+        solution = np.linalg.solve(information, moment + prior @ start)
+    # In a room the depths change as the camera turns: the effect on the rest of all alike.
+    effect = DEPTHS * float(np.sqrt(np.mean(solution[4:]**2))) * np.linalg.solve(
+        information[:4, :4], information[:4, 4:]).sum(axis=1)
+    return solution, np.linalg.inv(information)[:4, :4] + np.outer(effect, effect)
 
 
 def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:
-    """Return rotation vectors in base_link (n, 3), and shifts (n, 2), if both are known."""
+    """Return rotation vectors in base_link (n, 3), and those rows for which they are known."""
     (q1, known1), (q2, known2) = (attitude(rows[:, k] - offset) for k in (0, 1))
     known = known1 & known2
     v1, w1, v2, w2 = q1[known, :3], q1[known, 3:], q2[known, :3], q2[known, 3:]
     turned = w1 * v2 - w2 * v1 - np.cross(v1, v2)
     cosine = w1 * w2 + np.sum(v1 * v2, axis=1, keepdims=True)
     # The angle between two images is so small that it equals its sine.
-    return 2.0 * np.sign(cosine) * turned, rows[known, 2:4]
+    return 2.0 * np.sign(cosine) * turned, rows[known]
 
 
-def _expected(turned: Array, focal: float) -> Array:
-    """Return the shifts (n, 2) by rotation vectors (n, 3) in optical axes."""
-    return focal * np.column_stack([-turned[:, 1], turned[:, 0]])
+def _shares(moves: Sequence[tuple[Array, Array]], R_base_optical: Array) -> Array:
+    """
+    Return the shares of the squares of the shifts that rotation explains, to scale, or -1.
 
-
-def _share(expected: Array, seen: Array) -> float:
-    """Return the share of the squares of the shifts that the expected ones explain."""
-    return 1.0 - float(np.sum((seen - expected)**2) / np.sum(seen**2))
+    :param R_base_optical: rotation, or rotations, (..., 3, 3).
+    """
+    shares = np.full((len(moves), *R_base_optical.shape[:-2]), -1.0)
+    for n, (turned, known) in enumerate(moves):
+        if len(known) >= FEW:
+            expected = (turned @ R_base_optical)[..., 1::-1] * [-1.0, 1.0]
+            together = np.sum(expected * known[:, 2:4], axis=(-2, -1))
+            squares = np.sum(expected**2, axis=(-2, -1)) * np.sum(known[:, 2:4]**2)
+            shares[n] = together * np.abs(together) / np.maximum(squares, 1e-30)
+    return shares
 
 
 def _summit(offsets: Array, curve: Array, peak: int) -> float:

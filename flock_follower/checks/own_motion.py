@@ -24,6 +24,7 @@ import numpy as np
 
 from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
 from flock_follower.checks.image_motion import AxesFit, fit_axes, interpolated
+from flock_follower.checks.mounting import SURE
 from flock_follower.checks.observations import Observations, OwnMotion
 from flock_follower.checks.pictures import camera_model
 from flock_follower.checks.resting_marker import check_resting_marker
@@ -37,7 +38,7 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 from flock_follower.messages import OdometryState
-from flock_follower.odometry.derivation import CHILD, NONE, ODOM
+from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.files import COMMON
 from flock_follower.parameters.spec import filled
@@ -45,7 +46,7 @@ from flock_follower.parameters.spec import filled
 #: rad: difference between the yaws of odometry and autopilot, from which on there is a warning;
 #: the bridge refuses above the second.
 YAWS: Final = (0.12, 0.35)
-#: Share of unusable messages above which nobody can fly by the rest.
+#: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02
 #: deg: mean lean of base_link from which on there is a warning, and an error.
 LEAN, LYING = 20.0, 40.0
@@ -58,8 +59,12 @@ TURNED, SHIFTED = 0.4, 0.8
 OFFSET, BAD_OFFSET = 0.010, 0.030
 #: s: between attitudes farther apart the rotation is not known well enough to find an offset.
 SLOW: Final = 0.06
-#: Relative error of a focal length that is reported, and the share that it must explain.
-ZOOM, ZOOMED = 0.2, 0.9
+#: Relative error of a focal length that is an error: 0.965 was measured with the right one.
+ZOOM: Final = 0.1
+#: Axes of the positions: least number of windows; least error of the velocity, m/s; the squared
+#: errors must fall by so many variances; smaller turns are those of an estimator. A vehicle that
+#: is lower than this, m, was started higher up, or z points down.
+FEW, STILL, EVIDENT, SIN_TURNED, BELOW = 6, 0.02, 60.0, 0.4, -0.5
 TURN_MOVES: Final = 'images move as odometry turns'
 IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
@@ -87,10 +92,18 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if jumps := motion.events['odom jumped']:
         yield warning('odom jumps', f'{jumps} in {len(motion.states)} messages', 'none',
                       'turn off loop closure and relocalisation, or take the frame without them')
+    yield from _positions(motion.source.twist, motion.states)
     yield _twist(motion)
     yield from _lacking(motion)
-    yield from _axes(seen, motion, params)
-    yield from check_resting_marker(seen, motion.states)
+    x, y, z, w = np.array([state.quaternion for state in motion.states]).T
+    up = np.mean([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], 1)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
+    fit = _fit(seen, motion.states, up if lean >= LYING else None)
+    yield from _axes(seen, motion, params, up, lean, fit)
+    known = fit if fit is not None and fit.best >= EXPLAINED else None
+    yield _focal(known, known is not None and seen.calibration.distortion_model == 'equidistant')
+    yield from check_resting_marker(seen, motion.states, known)
     yield from _against_autopilot(seen, motion)
 
 
@@ -123,7 +136,50 @@ def _frames(seen: Observations) -> Finding:
         return error(what, f'changed {len(seen.frames) - 1} times, now {measured}', wanted,
                      'is it published by two sources? Every change starts perception anew')
     return judged(False, not header, what, measured, wanted,
-                  'have its source fill header.frame_id')
+                  'let the odometry source fill header.frame_id')
+
+
+def _positions(twist: TwistFrame, states: list[OdometryState]) -> Iterator[Finding]:
+    """
+    Check that the positions have the axes of attitude and velocity.
+
+    They have others if a rotation, or a reflection, of the velocity explains them, and neither
+    reading of the velocity does without it (Kabsch's method).
+    """
+    what, wanted = 'odom positions', 'along the axes of the velocity'
+    if twist.wanted == NONE or len(twist.windows) < FEW or not np.any(
+            np.array(twist.windows)[:, 1]):
+        return  # without a velocity there is nothing to compare
+    moved, *readings = np.swapaxes(twist.windows, 0, 1)
+    same = min(readings, key=lambda velocity: float(np.sum((moved - velocity)**2)))
+    turned = []
+    for velocity in readings:
+        u, _, vt = np.linalg.svd(moved.T @ velocity + STILL**2 * len(moved) * np.eye(3))
+        turned.append((np.sum((moved - velocity @ (u @ vt).T)**2, axis=0), u @ vt))
+    least, A = min(turned, key=lambda each: float(each[0].sum()))
+    variance = float(least.sum()) / moved.size + STILL**2
+    other = np.abs(A - np.eye(3)).max(axis=1) > SIN_TURNED
+    before, after = (float(left[other].sum()) for left in (
+        np.sum((moved - same)**2, axis=0), least))
+    # An axis whose reversal would show is known.
+    still = ', '.join(axis for axis, gain in zip('xyz', 4.0 * np.sum(moved * same, axis=0))
+                      if gain < EVIDENT * variance)
+    if before - after > max(EVIDENT * variance, 3.0 * after):
+        axes = ', '.join(f'{"-" if row[k] < 0.0 else ""}{"xyz"[k]}'
+                         for row in A for k in [int(np.abs(row).argmax())])
+        turn = math.degrees(math.acos(max(-1.0, 0.5 * (float(np.trace(A)) - 1.0))))
+        yield error(
+            what, f'turned by {turn:.0f} deg against the velocity' if axes == 'x, y, z' else
+            f'x, y, z move as {axes} of the velocity', wanted, 'set up its source to send '
+            'position, attitude and velocity in the axes of REP-103 (ENU, FLU)')
+    elif still:
+        measured = f'{still} moved too little: carry it, and lift it'
+        low = float(np.median([state.position[2] for state in states]))
+        yield unmeasured(what, measured, wanted) if 'z' not in still or low > BELOW else warning(
+            what, f'{measured}; z is {low:.1f} m', wanted, 'if it was not started higher up, z '
+            'points down: set up its source to send ENU (REP-103)')
+    else:
+        yield ok(what, 'as the velocity says', wanted)
 
 
 def _twist(motion: OwnMotion) -> Finding:
@@ -135,7 +191,7 @@ def _twist(motion: OwnMotion) -> Finding:
         return error(what, f'read in {twist.wanted}, the positions say {twist.found}', wanted,
                      'set odom_twist_frame:=auto')
     if twist.found == NONE:
-        return warning(what, f'off by {twist.contradiction:.2f} m/s, however it is read', wanted,
+        return warning(what, f'off by {twist.contradiction:.2f} m/s in either frame', wanted,
                        f'{DERIVED}; check the velocity of the odometry source')
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
@@ -146,25 +202,26 @@ def _twist(motion: OwnMotion) -> Finding:
 
 def _lacking(motion: OwnMotion) -> Iterator[Finding]:
     missing = motion.source.missing
-    fastest = max(float(np.abs(state.angular_velocity).max()) for state in motion.states)
+    fastest = float(np.abs([state.angular_velocity for state in motion.states]).max())
     zero = 'angular velocity' in missing
     yield judged(False, zero, 'odom angular rate', 'always zero' if zero else
                  f'up to {math.degrees(fastest):.0f} deg/s', 'that of the gyroscope',
-                 'works: derived from the attitudes, which is noisier; have it sent if its source '
-                 'can')
+                 'works: derived from the attitudes, which is noisier; let the source send it if '
+                 'possible')
     parts = sorted({name.rsplit(' ', 1)[-1] for name in missing if 'covariance' in name})
     yield judged(False, bool(parts), 'odom covariances',
-                 f'none, or not all, of {" and ".join(parts)}' if parts else 'there',
+                 f'incomplete for {" and ".join(parts)}' if parts else 'there',
                  'those of its filter',
-                 'works: odom_std stands in; set that to what your odometry errs by')
+                 'works: odom_std is used instead; set it to the errors of your odometry')
 
 
-def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterator[Finding]:
-    """Check that up is up and ahead is ahead, the time offset and the focal length."""
-    up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in motion.states], axis=0)
-    up = up / max(float(np.linalg.norm(up)), 1e-9)
-    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
-    fit = _fit(seen, motion.states, up if lean >= LYING else None)
+def _axes(seen: Observations, motion: OwnMotion, params: SourceParams, up: Array, lean: float,
+          fit: AxesFit | None) -> Iterator[Finding]:
+    """
+    Check the vertical and forward axes, and the time offset.
+
+    :param up: (3,), the mean upward direction in base_link; :param lean: that of its z, deg.
+    """
     turned = fit is not None and fit.best >= EXPLAINED and (
         1.0 - fit.best < TURNED * (1.0 - fit.configured))
     what, wanted = 'odom up', "base_link's z up"
@@ -181,15 +238,16 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
                     'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its '
                     'attitude on the body, see docs/sensors.md')
     elif turned and fit is not None and fit.turn[2, 2] < -0.5:
-        yield error(what, 'images turn the other way round: its z is down', wanted,
-                    'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
-                    'the camera upside down (camera_rpy)?')
+        yield error(what, 'images turn the other way round: z of base_link is down', wanted,
+                    'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; '
+                    'or is the camera upside down (camera_rpy)?')
         return
     else:
         yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,
-                     'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
+                     'hold the vehicle level; else set the pose of the IMU on the body '
+                     '(odom_child_rpy)')
     if fit is None:
-        yield unmeasured('odom ahead', 'turned too little: turn it by hand, 30 deg', TURN_MOVES)
+        yield unmeasured('odom ahead', 'turned too little: turn the vehicle by 30 deg', TURN_MOVES)
         yield unmeasured('camera time offset', 'turned too little', IN_TIME)
         return
     what, share = 'odom ahead', f'turning explains {max(fit.configured, 0.0):.0%} of it'
@@ -199,25 +257,32 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
     elif fit.configured >= EXPLAINED:
         yield ok(what, share, TURN_MOVES)
     elif not turned:
-        yield unmeasured(what, f'{share}; turn it by hand', TURN_MOVES)
+        yield unmeasured(what, f'{share}; turn the vehicle by hand', TURN_MOVES)
     period = motion.source.period
     if fit.best >= EXPLAINED and period <= SLOW:
         yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))
     else:
         yield unmeasured('camera time offset', share if period <= SLOW else
                          f'odometry comes only every {period:.2f} s', IN_TIME)
-    # The parts of a fisheye image that are compared move less than its middle does.
-    if (fit.zoomed >= ZOOMED and abs(fit.zoom - 1.0) > ZOOM
-            and seen.calibration.distortion_model != 'equidistant'):
-        yield warning('focal length', f'images move {fit.zoom:.2f} times as far as it says',
-                      'once', 'is the calibration of this lens, and for this size of images?')
+
+
+def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
+    """Check the focal length; in a fisheye image the flow changes too much within a part."""
+    what, wanted = 'focal length', 'images move as far as it says'
+    if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
+        return unmeasured(what, 'a fisheye lens' if fisheye else
+                          'turned too little: pitch and yaw it by hand', wanted)
+    wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SURE * fit.zoom_deviation)
+    return judged(
+        wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
+        wanted, 'is the calibration of this lens, and for this size of images?')
 
 
 def _offset(fit: AxesFit, known: float) -> Finding:
     """Check the time offset; ``known``, s, is the parameter ``time_offset``."""
     off = f'about {1e3 * abs(fit.offset):.0f} ms'
     side, rest = 'later' if fit.offset > 0.0 else 'earlier', abs(fit.offset + known)
-    if abs(fit.offset) <= OFFSET or 1.0 - fit.best >= SHIFTED * (1.0 - fit.together):
+    if abs(fit.offset) <= OFFSET or 1.0 - fit.explained >= SHIFTED * (1.0 - fit.together):
         return ok('camera time offset', off, IN_TIME)
     return judged(rest > BAD_OFFSET, rest > OFFSET, 'camera time offset',
                   f'images are stamped {off} {side} than odometry' if rest > OFFSET else
@@ -232,9 +297,14 @@ def _fit(seen: Observations, states: list[OdometryState], up: Array | None) -> A
     except ValueError:
         return None
     mounted = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
-    attitude = interpolated(np.array([state.stamp * 1e-9 for state in states]),
-                            np.array([state.quaternion for state in states]))
-    return fit_axes(seen.shifts, attitude, float(camera.matrix[0, 0]),
+    stamps = np.array([state.stamp * 1e-9 for state in states])
+    quaternions = np.array([state.quaternion for state in states])
+    velocities = np.array([state.velocity.dot(quaternion_to_matrix(state.quaternion))
+                           for state in states])
+
+    def velocity(times: Array) -> Array:
+        return np.column_stack([np.interp(times, stamps, column) for column in velocities.T])
+    return fit_axes(seen.shifts, interpolated(stamps, quaternions), velocity, camera,
                     quaternion_to_matrix(quaternion_from_rpy(*mounted)) @ R_FLU_OPTICAL, up)
 
 

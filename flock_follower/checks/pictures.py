@@ -29,6 +29,9 @@ from flock_follower.perception.camera import CameraModel
 SMALL, TINY = 18.0, 12.0
 #: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
+#: Largest distance of the optical axis from the middle, share of the image: K for images of
+#: twice or half the size is off by 0.5 and 0.25.
+OFF_CENTRE: Final = 0.15
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
 #: Number of images that show a marker twice: a single one may be a false detection.
@@ -76,6 +79,10 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     if others := {f'{picture.width}x{picture.height}' for picture in pictures} - {size}:
         return error(what, f'for {size}, images are {min(others)}', wanted, calibrate)
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
+    shares = camera.matrix[:2, 2] / (camera.width, camera.height)
+    if np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width:
+        return error(what, f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the '
+                     'image: K is for another resolution', wanted, calibrate)
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     if straight and not rectified and np.any(camera.distortion):
@@ -126,10 +133,10 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
                      'come nearer, print it larger, or use a longer lens or a finer image')
     if side < SMALL:
         return warning(what, measured, wanted,
-                       'come nearer, or print it larger: a small one is lost easily')
+                       'come nearer, or print the marker larger: a small marker is lost easily')
     if share < SELDOM:
         return warning(what, measured, f'{wanted}, most of the time',
-                       'keep it in sight: light, blur, a cut-off margin')
+                       'keep the marker in sight; check light, blur and the white margin')
     return ok(what, measured, wanted)
 
 

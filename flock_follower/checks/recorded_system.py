@@ -38,11 +38,13 @@ from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
-#: s: of a longer bag only the beginning is checked.
+#: s: of a longer bag only the beginning is checked, and the diagnostics of the last LAST ns.
 LONGEST: Final = 300.0
+LAST: Final = 60_000_000_000
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: Of the other topics only the messages are counted.
@@ -91,16 +93,17 @@ class RecordedSystem:
         if DIAGNOSTICS in self.seen.topics:
             self.topics[DIAGNOSTICS] = DIAGNOSTICS
 
-    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> Any:
+    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
+             ) -> tuple[Any, GrayImage | None]:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        Return its fields if they were read. If the bytes are no message of the type, the bag is
-        reported as incomplete.
+        Return its fields if they were read, and the pixels of an image if decoded. If the bytes
+        are no message of the type, the bag is reported as incomplete.
         """
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
-            return None
+            return None, None
         message: Any = None
         repeated = name == 'camera_info' and data[_AFTER_STAMP:] == self._calibration
         if name in READ and not repeated:
@@ -111,13 +114,12 @@ class RecordedSystem:
                 if name == 'odom' and self._reads:
                     self._own.lost, self._own.last_error = self._own.lost + 1, str(problem)
                 self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
-                return None
+                return None, None
         if name == 'camera_info':
             self._calibration = data[_AFTER_STAMP:]
         elif name == 'odom' and self._reads:
             self._own.take(message, time_ns)
-        self._collector.take(name, topic, message, time_ns / NANOSECONDS)
-        return message
+        return message, self._collector.take(name, topic, message, time_ns / NANOSECONDS)
 
     def findings(self) -> list[Finding]:
         """Return the findings in all messages that were taken."""
@@ -140,6 +142,10 @@ def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = ''
             if system.topics:
                 for message in bag.messages(
                         list(system.topics), stop_ns=None if whole else system.stop_ns):
+                    system.take(*message)
+            if not whole and DIAGNOSTICS in system.topics:  # those of the end count
+                system.stop_ns = bag.end_ns + 1
+                for message in bag.messages([DIAGNOSTICS], bag.end_ns - LAST, system.stop_ns):
                     system.take(*message)
         except BagError as problem:
             system.seen.incomplete = system.seen.incomplete or str(problem)

@@ -32,13 +32,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-import math
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import Finding, judged, ok, unmeasured
-from flock_follower.checks.image_motion import interpolated
+from flock_follower.checks.findings import Finding, judged, unmeasured
+from flock_follower.checks.image_motion import AxesFit, interpolated
+from flock_follower.checks.mounting import check_mounting, SURE
 from flock_follower.checks.observations import Observations
 from flock_follower.geometry import (
     Array,
@@ -47,7 +47,6 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     R_FLU_OPTICAL,
     rotation_vector_to_matrix,
-    rpy_from_matrix,
     skew,
 )
 from flock_follower.messages import NANOSECONDS, OdometryState
@@ -76,14 +75,10 @@ LEFT, SWAYED = 0.15, 0.1
 SCALES: Final = (0.4, 2.5)
 #: Relative errors of the size: of a warning, of an error; it must be known to 3 deviations.
 SIZE, BAD_SIZE = 0.05, 0.1
-SURE: Final = 3.0
-#: The same of the mounting, rad.
-LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(10.0)
 #: rad: a larger error of the mounting is another order of axes, which has a row of its own.
 OTHER_AXES: Final = 0.7
 HOW: Final = 'stand the leader on the ground, and carry the camera before it by 1 m, to and fro'
 _FAR: Final = 'as far as odometry moves'
-_MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
 
 
 class OwnPath(NamedTuple):
@@ -142,24 +137,27 @@ class RestFit(NamedTuple):
                 and self.swayed <= SWAYED and float(np.abs(self.turn).max()) < OTHER_AXES)
 
 
-def check_resting_marker(seen: Observations, states: list[OdometryState]) -> Iterator[Finding]:
+def check_resting_marker(seen: Observations, states: list[OdometryState], axes: AxesFit | None
+                         ) -> Iterator[Finding]:
     """
     Check the size of the marker and the mounting of the camera.
 
-    :param states: the odometry, as our nodes read it.
+    :param states: the odometry, as our nodes read it. :param axes: the fit to the image motion,
+        None if it is not conclusive.
     """
-    if not seen.sightings:
-        return
-    number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
-    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
-    fit = _fit(seen, states, number, quaternion_to_matrix(quaternion_from_rpy(*rpy)))
-    if fit is None or not fit.at_rest:
-        why = 'the leader moves' if fit is not None and fit.moved >= MOVED else HOW
-        yield unmeasured('marker size', why, _FAR)
-        yield unmeasured('camera mounting', why, _MOUNTED)
-    else:
-        yield _size(fit, number, seen.marker_sides.get(number, 0.0))
-        yield _mounting(fit, rpy)
+    estimates = [] if axes is None else [(axes.mounting, axes.mounting_deviations)]
+    rpy, why = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0]), HOW
+    if seen.sightings:
+        number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
+        fit = _fit(seen, states, number, quaternion_to_matrix(quaternion_from_rpy(*rpy)))
+        if fit is not None and fit.at_rest:
+            yield _size(fit, number, seen.marker_sides.get(number, 0.0))
+            estimates.append((fit.turn, fit.turn_deviations))
+        else:
+            why = 'the leader moves' if fit is not None and fit.moved >= MOVED else HOW
+            yield unmeasured('marker size', why, _FAR)
+    if estimates or seen.sightings:
+        yield check_mounting(estimates, rpy, why)
 
 
 def _size(fit: RestFit, number: int, side: float) -> Finding:
@@ -174,27 +172,6 @@ def _size(fit: RestFit, number: int, side: float) -> Finding:
         f'measure marker {number}, its black square from edge to edge: {side / fit.scale:.3f} m '
         f'would fit, config/neighbors.yaml says {side:g}. If that is right: is the calibration '
         'of this lens, and the scale of the odometry right?')
-
-
-def _mounting(fit: RestFit, rpy: list[float]) -> Finding:
-    what, known = 'camera mounting', SURE * fit.turn_deviations < LOOKS
-    if not known.any():
-        return unmeasured(what, f'turned too little; {HOW}, and turn it', _MOUNTED)
-    turn = np.where(known & (np.abs(fit.turn) > SURE * fit.turn_deviations), fit.turn, 0.0)
-    off = float(np.linalg.norm(turn))
-    if off <= LOOKS:
-        return ok(what, f'off by {math.degrees(off):.0f} deg', _MOUNTED)
-    ways = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
-            ('looks further right', 'looks further left'))
-    looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
-                      for way, angle in zip(ways, turn.tolist()) if abs(angle) > 0.5 * LOOKS)
-    fitting = rpy_from_matrix(rotation_vector_to_matrix(turn)
-                              @ quaternion_to_matrix(quaternion_from_rpy(*rpy)))
-    shown = ','.join(str(round(angle, 3) + 0.0) for angle in fitting.tolist())
-    return judged(
-        off > BAD_LOOKS, True, what, f'camera {looks} than configured', _MOUNTED,
-        f'camera_rpy:=[{shown}] would fit, in relative_pose and planner; or is the pose of the '
-        'odometry on the body (odom_child_rpy) wrong?')
 
 
 def _fit(seen: Observations, states: list[OdometryState], number: int,

@@ -84,8 +84,9 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
     if machine.idle is not None:
         yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
                      f'{machine.idle:.0%} of {machine.processors} cores left',
-                     f'{IDLE:.0%} or more left',
-                     'end what need not run (rviz, recordings), or ask less of the odometry')
+                     f'{IDLE:.0%} or more left, at least {NONE_IDLE:.0%}',
+                     'end programs that are not needed (rviz, recordings), or reduce the load of '
+                     'the odometry')
     if machine.shares_memory:
         yield from _shared_memory(seen)
     images, frames = seen.topic(seen.image_name), seen.topic('neighbors/frames')
@@ -95,7 +96,7 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
             not frames.arrivals, share < PROCESSED, 'images processed',
             f'{min(share, 1.0):.0%} of the images' if frames.arrivals else 'none',
             f'{PROCESSED:.0%} or more',
-            'less to do for the processor, or a lower frame rate' if frames.arrivals else
+            'reduce the load of the processor, or the frame rate' if frames.arrivals else
             'see images, calibration and odometry; its log names the dropped messages')
 
 
@@ -170,7 +171,8 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     what = 'autopilot'
     if values.get('link') != 'alive':
         yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
-                    'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
+                    'check cable, connection and baud rate; is the autopilot on, is its MAVLink '
+                    'port set up?')
         return
     yield ok(what, f'{values.get("autopilot") or "received"}, {values.get("mode") or "no mode"}, '
              f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')

@@ -85,19 +85,19 @@ def _stream(name: str, topic: TopicSeen, newest: float, live: bool,
     elif topic.rate >= limits.rate[0] and gap > max(limits.gap, 2.5 / topic.rate):
         yield warning(f'{name} rate', f'{rate}, but once nothing for {gap:.2f} s',
                       f'{wanted}, no gap above {limits.gap:g} s',
-                      'find what stops it: USB, a full disk, too little processor time')
+                      'find the cause of the gap: USB, a full disk, too little processor time')
     else:
         yield judged(topic.rate < limits.rate[1], topic.rate < limits.rate[0], f'{name} rate',
                      rate, wanted, limits.faster)
     if zeros := topic.stamps.count(0.0):
         yield error(f'{name} stamps', f'{zeros} of {len(topic.stamps)} are zero',
-                    'the time of the measurement', 'have its driver fill header.stamp')
+                    'the time of the measurement', 'let the driver fill header.stamp')
         return
     disorder = float(np.mean(np.diff(topic.stamps) <= 0.0)) if len(topic.stamps) > 1 else 0.0
     if disorder > DISORDER:
         yield warning(f'{name} stamps', f'{disorder:.0%} repeat the one before, or step back',
                       'each later than the one before',
-                      'is it published twice, or by two drivers? Repetitions are dropped')
+                      'is the topic published twice, or by two drivers? Repetitions are dropped')
     yield _latency(f'{name} latency', topic, limits, live)
 
 
@@ -129,15 +129,14 @@ def _clock_source(seen: Observations) -> Iterator[Finding]:
     wrong = sorted(node for node, value in simulated.items() if value != seen.clock)
     names, wanted = ', '.join(wrong), 'use_sim_time where /clock is'
     if wrong and seen.clock:
-        yield error('clock', f'/clock is published, {names} {"goes" if len(wrong) == 1 else "go"} '
-                    'by the time of day', wanted,
-                    'start with -p use_sim_time:=true; or end what publishes /clock')
+        yield error('clock', f'/clock is published, but use_sim_time is false in {names}', wanted,
+                    'start with -p use_sim_time:=true; or end the publisher of /clock')
     elif wrong:
         yield error('clock', f'{names}: use_sim_time is true, but nobody publishes /clock',
                     wanted, 'start without use_sim_time; or replay with /clock')
     elif simulated:
-        yield ok('clock', '/clock, and all our nodes go by it' if seen.clock
-                 else 'the time of day, in all our nodes', wanted)
+        yield ok('clock', '/clock, used by all our nodes' if seen.clock
+                 else 'the system time, used by all our nodes', wanted)
 
 
 def _one_clock(seen: Observations) -> Iterator[Finding]:

@@ -180,7 +180,8 @@ class Bridge:
                 not self.housekeeping.has_reasons(now)):
             return None
         against = self.texts.unready(now, dialect.arming_mode(status.mode))
-        return against and estimator_health.explained(against, self.telemetry.estimator, now)
+        return against and estimator_health.explained(
+            against, self.telemetry.estimator, now, self.housekeeping.parameters.values)
 
     # The setpoint thread.
 

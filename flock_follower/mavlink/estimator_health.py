@@ -23,7 +23,9 @@ vision: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 import math
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -48,8 +50,8 @@ _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
 #: Part of the text of PX4's arming check for a global position, see ``status_texts``.
 NO_GLOBAL_POSITION: Final[str] = 'no global position'
-UNALIGNED: Final[str] = ('its estimator lacks no flag: its yaw is not aligned; restart it, and '
-                         'set EKF2_MAG_TYPE to 5 where it flies without GPS')
+UNALIGNED: Final[str] = 'its estimator lacks no flag: its yaw is not aligned; restart it'
+WITHOUT_COMPASS: Final[str] = ', and set EKF2_MAG_TYPE to 5 if it flies without GPS'
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
 GPS_SILENCE: Final[float] = 10.0
@@ -89,19 +91,25 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
                            and not flags & mavlink.EKF_CONST_POS_MODE, missing)
 
 
-def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
+def explained(refusal: str, status: EstimatorStatus | None, now: float,
+              parameters: Mapping[str, float] = MappingProxyType({})) -> str:
     """
     Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks.
 
     PX4 1.16 publishes no global position while its yaw is not aligned; no flag reports that. Seen
     after a landing, for 150 s: PX4 learnt a compass offset, which ended the alignment, and yaw
     from vision, already in use, did not restore it.
+
+    :param parameters: the values of the autopilot's parameters that are known.
     """
     if status is None or now - status.time > STATUS_TIMEOUT:
         return refusal
     if status.missing:
         return f'{refusal}; its estimator lacks {", ".join(status.missing)}'
-    return f'{refusal}; {UNALIGNED}' if NO_GLOBAL_POSITION in refusal else refusal
+    if NO_GLOBAL_POSITION not in refusal:
+        return refusal
+    advice = '' if parameters.get('EKF2_MAG_TYPE') == 5.0 else WITHOUT_COMPASS
+    return f'{refusal}; {UNALIGNED}{advice}'
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:

@@ -129,7 +129,7 @@ class FlightEnd:
             math.isnan(remaining) or now - time > BATTERY_TIMEOUT)
 
     def begin(self) -> None:
-        """Forget the flight before: somebody has requested something."""
+        """Reset after a request of an operator."""
         self.why, self._action, self._held_since = '', HOLD, math.inf
 
     def reason(self, active_since: float, command_time: float, handover: str,
@@ -177,7 +177,7 @@ class FlightEnd:
             return ''
         self._held_since = min(self._held_since, now)
         if status.mode != held_mode or not status.armed:
-            self._action = HOLD  # somebody has decided otherwise
+            self._action = HOLD  # an operator has decided otherwise
         elif now - self._held_since >= LANDING_DELAY:
             self._action = HOLD
             return LAND

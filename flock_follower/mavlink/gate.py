@@ -15,8 +15,7 @@
 """
 The setpoint gate decides whether a setpoint may be sent (``permission``), and which one.
 
-The gate stores the newest of each input with its time, and passes them to
-``setpoint_rules.decide``.
+The gate stores the newest inputs with their times, and passes them to ``setpoint_rules.decide``.
 Bridge, ``evaluate`` and ``flights`` use the same object. Nothing here reads a clock.
 """
 

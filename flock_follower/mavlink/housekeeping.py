@@ -82,7 +82,7 @@ class TimeSync:
         """Take a TIMESYNC; return the answer where it is a question."""
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
-        if message.ts1 in self._asked:  # else somebody else has asked
+        if message.ts1 in self._asked:  # else another system has sent the request
             self._unanswered_since = None
             self._samples.append(Sample(
                 message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))

@@ -130,7 +130,7 @@ def _next_marker(buffer: bytearray, start: int) -> int:
     return min(found, default=-1)
 
 
-#: System and component ids of MAVLink but for 0, which means everybody.
+#: Valid system and component ids of MAVLink; 0 means all.
 IDS: Final[Range] = Range(1, 255, whole=True)
 COMPONENT: Final[int] = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 AUTOPILOT_COMPONENT: Final[int] = mavlink.MAV_COMP_ID_AUTOPILOT1

@@ -141,7 +141,7 @@ class Landed:
 
 @dataclass(frozen=True)
 class Restarted:
-    """The autopilot rebooted, or is another one: nobody asked this one for anything."""
+    """The autopilot rebooted, or was replaced: it has received no request."""
 
     why: str
 

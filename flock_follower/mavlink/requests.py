@@ -67,7 +67,7 @@ class Requests:
     """
     Begins requests and steps the one whose outcome is open.
 
-    :param end: of the flight; a request by a person begins it anew.
+    :param end: end of the flight; reset by a request of an operator.
     :param require_failsafe: whether offboard needs the parameters of ``parameter_check.RULES``.
     """
 
@@ -147,7 +147,8 @@ class Requests:
             self._ask(request, streaming_for, now)
             if request.outcome is not None and not request.outcome.success:
                 request.outcome = request.outcome._replace(message=explained(
-                    request.outcome.message, self._link.telemetry.estimator, now))
+                    request.outcome.message, self._link.telemetry.estimator, now,
+                    self._housekeeping.parameters.values))
         if request.goal is OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
             self._gate.permit(OffboardFailed(request.outcome.message))
@@ -292,7 +293,7 @@ class Requests:
         Return whether a take-off explains an offboard mode that misses no setpoint.
 
         ArduPilot takes off in GUIDED, and stays in it above. Before and while it climbs setpoints
-        would do nothing, or end it; after our own take-off nobody has requested offboard yet.
+        would do nothing, or end it; after our own take-off offboard has not been requested yet.
         """
         telemetry, newest = self._link.telemetry, self.newest
         if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:

@@ -67,7 +67,7 @@ _OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_'
 
 
 class SensorAltitude(NamedTuple):
-    """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude that no odometry goes into."""
+    """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude independent of odometry."""
 
     time: float
     altitude: float
@@ -263,7 +263,7 @@ class Telemetry:
     def _notice_reboot(self, message: Any) -> None:
         """Compare the stamp, ms since boot, with that of the message of the same kind before."""
         kind, stamp = message.get_type(), getattr(message, 'time_boot_ms', 0)
-        if not stamp or kind.startswith(_OTHER_CLOCKS):  # 0: nobody has set it
+        if not stamp or kind.startswith(_OTHER_CLOCKS):  # 0: not set
             return
         # Each kind for itself: they overtake one another, and some are stamped when measured.
         fallen = stamp + REBOOT_STEP_MS < self._boot_times_ms.get(kind, 0)

@@ -145,7 +145,7 @@ class SerialTransport(_Line):
     """
     A serial port in raw mode, opened whenever the device is there and no other process has it.
 
-    A second process would take away a share of the bytes received, and send among ours.
+    A second process would receive a part of our bytes, and send its bytes between ours.
     """
 
     def __init__(self, url: str, device: str, baud: int) -> None:
@@ -195,7 +195,7 @@ class SerialTransport(_Line):
     def close(self) -> None:
         """Release the port, for others, too."""
         if self._fd >= 0:
-            # Otherwise it stays exclusive for as long as anybody else has it open.
+            # Otherwise it stays exclusive while another process has it open.
             with contextlib.suppress(OSError):  # unplugged
                 fcntl.ioctl(self._fd, termios.TIOCNXCL)
         super().close()
@@ -209,7 +209,7 @@ class TcpTransport(_Line):
     """
     A TCP connection to a listening autopilot or simulator, made again when it is closed.
 
-    Opening only begins the connection: nobody waits for an answer that may take a minute.
+    Opening only begins the connection, without a wait for an answer that may take a minute.
     """
 
     delivers_late = True
@@ -348,7 +348,7 @@ def open_transport(url: str) -> Transport:
     """
     Open a connection URL.
 
-    A serial device that is not there, and a TCP port where nobody listens, are waited for.
+    A missing serial device, or a TCP port without a listener, is opened as soon as it appears.
 
     :raises ValueError: if the URL is not one of the known forms.
     :raises OSError: if a UDP port cannot be opened; the message names the URL.

@@ -59,7 +59,7 @@ def unhurried() -> Iterator[None]:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals: one that comes while the interpreter ends is no failure."""
+    """Ignore further signals: one during the interpreter's exit must not change the exit code."""
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -82,7 +82,7 @@ def _shut_down_context() -> None:
 
 def _runs_as_a_program() -> bool:
     path = Path(sys.argv[0] if sys.argv else '')
-    return (path.name == '-m' or path.parent.name == 'flock_follower'
+    return (path.name == '-m' or path.parent.name in ('flock_follower', 'flock_desk')
             or Path(__file__).with_name(f'{path.name}.py').exists())
 
 

@@ -22,7 +22,7 @@ steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``plann
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
+disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
 ``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """
@@ -364,8 +364,8 @@ class Planner(FlockNode):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
         if view or self._decision is None or self._decision.state is State.IDLE:
             return None
-        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
-                      'the camera sees')
+        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
+                      'that keep the leader in the image')
 
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:

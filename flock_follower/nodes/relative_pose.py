@@ -214,7 +214,14 @@ class RelativePose(FlockNode):
         try:
             while (seen := self._perceiver.process(
                     time.monotonic(), time.monotonic, self._shown)) is not None:
-                self._report(seen)
+                image, sighting = seen.image, seen.sighting
+                for name, estimate in (*sighting.estimates.items(),
+                                       *sighting.duplicates.items()):
+                    self._publish(name, estimate, image.stamp_ns)
+                if seen.usable:  # after the estimates: the planner has them when it receives this
+                    self._frames.publish(Header(
+                        stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
+                self._count(seen)
         except Exception as error:  # counts as a dropped image; the next one may do better
             self.diagnostics.internal_error('on an image', error)
         self._use_ranges()
@@ -224,13 +231,11 @@ class RelativePose(FlockNode):
     def _shown(self, name: str) -> bool:
         return self._cameras[name].debug_images.get_subscription_count() > 0
 
-    def _report(self, seen: Processed) -> None:
-        """Publish and count the result of an image."""
+    def _count(self, seen: Processed) -> None:
+        """Update the diagnostics with the result of an image, and draw it if anybody looks."""
         image, sighting, camera = seen.image, seen.sighting, self._cameras[seen.image.camera]
         for reason, detail in sighting.rejections:
             camera.reject(reason, detail)
-        for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
-            self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
         age = self.get_clock().now().nanoseconds - image.stamp_ns
         for name in sighting.estimates:
@@ -239,9 +244,6 @@ class RelativePose(FlockNode):
                 self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
         self.diagnostics.latency('processing').add(seen.decoding + seen.perception)
         if seen.usable:
-            # After the estimates: the planner has them when it receives this.
-            self._frames.publish(Header(
-                stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
             self._processed, camera.dropping_since = now, None
             rate = self.diagnostics.rate('processed')
             rate.tick(now)

@@ -100,7 +100,7 @@ class Visualizer(FlockNode):
     Draws the messages of the other nodes while a viewer subscribes.
 
     Its inputs are subscribed to only then, and wait until a tick takes them: 200 messages per
-    second cost 2 % of a core even if nobody takes them.
+    second cost 2 % of a core even if no callback takes them.
     """
 
     def __init__(self, **kwargs: Any) -> None:

@@ -85,6 +85,7 @@ SUITING = 0.3  # rad/s: angular velocities that differ more from the turn do not
 
 
 _NO_TRAVEL: Array = np.zeros(3)
+_ONES = np.ones(3)
 
 
 class OdometrySample(NamedTuple):
@@ -165,7 +166,7 @@ class OdometryBuffer:
         self._rows: Array = np.empty((2 * self.CAPACITY, 17))
         self._stamps = self._rows[:, 0]
         self._first = self._end = 0
-        self._near = self._far = 0.0
+        self._near = self._far = self._rough = 0.0
         self._looks = 0
 
     def __len__(self) -> int:
@@ -237,6 +238,30 @@ class OdometryBuffer:
             return OdometrySample.of_row(self._rows[after].copy())  # a copy, as rows move
         return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
+    def places(self, stamps: Array, points: Array) -> Array | None:
+        """
+        Return points (n, 3) on the body in the smooth frame, (k, n, 3), for stamps (k, n), s.
+
+        Between two samples position and attitude are linear. None if a stamp is not covered.
+        """
+        held = self._stamps[self._first:self._end]
+        if not len(held) or not held[0] <= stamps.min() <= stamps.max() <= held[-1]:
+            return None
+        after = held.searchsorted(stamps).clip(1)
+        span = held[after] - held[after - 1]
+        if span.max() > self.MAX_GAP:
+            return None
+        part = (stamps - held[after - 1]) / span
+        poses = self._rows[self._first:self._end, 10:].T  # travel and attitude
+        before = poses[:, after - 1]
+        px, py, pz, x, y, z, w = before + part * (poses[:, after] - before)
+        u, v, t = points.T
+        # Of the quaternion (r, w), of any length: p + 2 r x (r x p + w p) / (r.r + w w).
+        a, b, c = y * t - z * v + w * u, z * u - x * t + w * v, x * v - y * u + w * t
+        twice = 2.0 / (x * x + y * y + z * z + w * w)
+        return np.stack([px + u + twice * (y * c - z * b), py + v + twice * (z * a - x * c),
+                         pz + t + twice * (x * b - y * a)], axis=-1)
+
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""
         after = self._reaching(stamp, extrapolate)
@@ -284,19 +309,27 @@ class OdometryBuffer:
         # Quaternions times this are the state's inverse times them: by how much they are off.
         off = recent[:, _ATTITUDE].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
                                                  [-x, -y, -z, w]]))
-        apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
-        if not self._agree(apart):
+        apart = np.copysign(2.0, off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
+        if not self._agree(apart, recent[:, _VELOCITY]):
             return state
-        agreeing = (apart * apart).dot(np.ones(3)) < max(self.AGREEMENT**2, 9.0 * self._near)
+        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
         turn = rotation_vector_to_quaternion(agreeing.dot(apart) / count)
         return state._replace(quaternion=quaternion_multiply(state.quaternion, turn))
 
-    def _agree(self, apart: Array) -> bool:
+    @property
+    def white_noise(self) -> tuple[float, float]:
+        """Return the variances of white noise, per axis: attitude, rad^2; velocity, (m/s)^2."""
+        # Of differences of two, in three axes, and of third differences: 1, 3, 3, 1.
+        return self._near / 6.0, self._rough / 60.0
+
+    def _agree(self, apart: Array, velocities: Array) -> bool:
         """
         Return whether attitudes and angular velocities agree, but for the attitudes' white noise.
+
+        The noise of the velocities (n, 3) is updated on the way.
 
         Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
         apart as first and last. Where angular velocities are missing or late, the latter are
@@ -310,6 +343,9 @@ class OdometryBuffer:
         way = apart[-some:] - apart[:some]
         near, far = float(np.vdot(step, step)) / len(step), float(np.vdot(way, way)) / some
         over = min(self._looks, self.LOOKS)
+        if len(velocities) > 3:
+            third = velocities[3:] - velocities[:-3] - 3.0 * (velocities[2:-1] - velocities[1:-2])
+            self._rough += (float(np.vdot(third, third)) / len(third) - self._rough) / over
         self._near += (near - self._near) / over
         self._far += (far - self._far) / over
         return self._far < self.DRIFT * self._near

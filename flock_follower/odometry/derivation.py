@@ -37,6 +37,7 @@ twist includes the probability that the reading is wrong.
 
 from __future__ import annotations
 
+from collections import deque
 import math
 from operator import add
 from typing import Final
@@ -64,7 +65,7 @@ class _WhiteJerk:
 
     :param jerk: its spectral density, (unit/s^3)^2/Hz.
     :param noise: standard deviation of a measurement: initial, least, and largest.
-    :param rate: initial standard deviation of the rate; :param acceleration: likewise.
+    :param rate: initial standard deviation of the rate; :param acceleration: of the acceleration.
     """
 
     def __init__(self, jerk: float, noise: tuple[float, float, float], rate: float,
@@ -267,6 +268,10 @@ class TwistFrame:
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
         """Error of the frame in use, m/s, in the window that last contradicted it."""
+        self.windows: deque[Array] = deque(maxlen=600)
+        """Mean velocities (3, 3), m/s, in odom, of the last 300 s for ``check``: by the positions,
+        and in the two readings.
+        """
         self._before = ''  # the frame found before the velocity was dropped
         self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
@@ -352,9 +357,10 @@ class TwistFrame:
         :param offs: (n, 2, 3), m: how much longer the ways are by the two readings.
         """
         time = float(times.sum())
-        speed = float(np.linalg.norm(ways.sum(axis=0))) / time
+        way, mean = ways.sum(axis=0), offs.sum(axis=0) / time
+        speed = float(np.linalg.norm(way)) / time
         tolerance = 3.0 * (DEVIATION + SHARE * speed)
-        mean = offs.sum(axis=0) / time
+        self.windows.append(np.array([way / time, *(way / time + mean)]))
         means = np.linalg.norm(mean, axis=1)
         # Noise of the positions is least in the mean, and single steps do not show in the median.
         medians = np.linalg.norm(np.median(offs / times[:, None, None], axis=0), axis=1)

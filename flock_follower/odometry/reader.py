@@ -19,9 +19,9 @@ Sources differ (see docs/sensors.md): their child frame is an IMU or a camera in
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
 their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 
-The attitudes show which axis of base_link points up: in flight it is z. If it is another one, the
-pose of the child frame on base_link is set wrongly. The axis that points ahead cannot be seen so,
-as a quadrotor flies to all sides.
+The attitudes show which axis of base_link points up: in flight it is z. If another axis points up,
+the pose of the child frame on base_link is set wrongly. The forward axis cannot be found in this
+way, because a quadrotor flies in all directions.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class OdometrySource:
             self.params.child_position, quaternion_from_rpy(*self.params.child_rpy)))
 
     def place_child(self, T_base_child: Transform) -> None:
-        """Take where the child frame of the odometry is on base_link, and begin anew."""
+        """Set the pose of the odometry's child frame on base_link, and restart."""
         self._child_position = T_base_child.translation
         self._q_child_base = quaternion_conjugate(T_base_child.quaternion)
         self._R_child_base = T_base_child.rotation.T
@@ -188,12 +188,12 @@ class OdometrySource:
 
     @property
     def latency(self) -> float:
-        """Return the longest time of late from a stamp to its arrival, s; 0 before the first."""
+        """Return the longest recent time from a stamp to its arrival, s; 0 before the first."""
         return max(self._latencies, default=0.0)
 
     @property
     def period(self) -> float:
-        """Return the longest time of late between two stamps, s; 0 before the second."""
+        """Return the longest recent time between two stamps, s; 0 before the second."""
         return max(self._gaps, default=0.0)
 
     def new_events(self) -> list[tuple[str, str]]:
@@ -248,7 +248,7 @@ class OdometrySource:
             linear is None or self._reading == NONE)
 
     def _is_new(self, stamp: int, frames: tuple[str, str]) -> bool:
-        """Return whether to take a message in; begin anew where time or frame jumped."""
+        """Return whether to use a message; restart after a jump of time or frame."""
         if self._frames not in (None, frames):
             self.events.append(('odom changed its frames', f'{self._frames} to {frames}'))
             self._restart()
@@ -376,7 +376,7 @@ def _pose(message: Any) -> tuple[Array, Array]:
     q = pose.orientation
     attitude = [q.x, q.y, q.z, q.w]
     if not any(attitude):
-        raise ValueError('quaternion = 0: the source says that it is lost')
+        raise ValueError('quaternion = 0: the source has lost its pose')
     position, sane = _vector(pose.position)
     if not sane:
         raise ValueError(f'position = {position.tolist()}: must be finite, and within {SANE:g}')
@@ -391,7 +391,7 @@ def _vector(message: Any) -> tuple[Array, bool]:
 
 
 def _twist(message: Any) -> tuple[Array | None, Array]:
-    """Return the velocity (3,), None if it is invalid, and the rates (3,), zeros likewise."""
+    """Return the velocity (3,), None if invalid, and the rates (3,), zeros if invalid."""
     twist = message.twist.twist
     (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
     known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large

@@ -30,7 +30,7 @@ from flock_follower.ranges import Range
 #: Offsets of stamps, s, as ``perception.time_offset`` takes them at most; read-out of a shutter.
 MOST_OFFSET: Final = 0.2
 LONGEST_READOUT: Final = 0.2
-#: Where a camera is where nobody says: ahead of the middle of the vehicle, looking ahead.
+#: Default pose of a camera: in front of the middle of the vehicle, looking ahead.
 POSITION: Final = (0.10, 0.0, 0.0)
 AHEAD: Final = (0.0, 0.0, 0.0)
 

@@ -86,7 +86,7 @@ def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | Non
 
     A neighbours' file that they name is looked for beside the recording, too.
 
-    :raises ValueError: see :func:`read_parameters`. :raises OSError: likewise.
+    :raises ValueError, OSError: see :func:`read_parameters`.
     """
     path = (bag if bag.is_dir() else bag.parent) / FLOWN
     if not path.is_file():

@@ -135,7 +135,7 @@ def _faces(T_camera_marker: Transform) -> bool:
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
-#: This often they are searched although nobody is missing, s: for markers of an id in sight.
+#: Period of searches although no neighbour is missing, s: for further markers with a known id.
 SWEEP_PERIOD = 1.0
 #: Who was measured in an image not older than this, s, is well tracked by its camera.
 FRESH = 0.25
@@ -222,6 +222,10 @@ class CameraSchedule:
         self._seen[name] = camera, time
         camera.measured[name] = time
 
+    def seen_last_by(self, name: str, camera: MountedCamera) -> bool:
+        """Return whether no other camera saw a neighbour since this one did."""
+        return self._seen.get(name, (camera, 0.0))[0] is camera
+
     def changed(self, camera: MountedCamera) -> None:
         """Note a change of a camera's time offset: its earlier stamps keep their times."""
         offset = camera.time_offset
@@ -278,7 +282,7 @@ class CameraSchedule:
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """
-        Return whether to search the whole image of a stamp, s, though nobody is missing.
+        Return whether to search the whole image of a stamp, s, although none is missing.
 
         Several cameras take turns: more of them cost no more.
         """

@@ -119,7 +119,7 @@ class Candidate:
 
     def take(self, time: float, measured: Transform, reference: Array,
              covariance: Array) -> None:
-        """Take in a measurement; where its track refuses it, that begins anew."""
+        """Update the track with a measurement; if the track refuses it, the track restarts."""
         arguments = time, measured, reference, covariance
         if self.track.update(*arguments) is UpdateOutcome.OUTLIER:
             self.track.reset()

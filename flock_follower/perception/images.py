@@ -68,7 +68,7 @@ def _png_size(data: bytes) -> tuple[int, int]:
     """
     Return the size in IHDR, of a file that goes on to IEND.
 
-    Every chunk is a length, a name, so many bytes and a checksum.
+    Every chunk is a length, a name, the data and a checksum.
     """
     size, start = (0, 0), len(_PNG)
     while start + 8 <= len(data):
@@ -133,10 +133,12 @@ def compute_in_one_thread() -> None:
 
 def decode_image(message: Any) -> GrayImage:
     """
-    Return the pixels of an Image or CompressedImage message, (H, W) uint8.
+    Return the pixels of an Image or CompressedImage message, (H, W) uint8, or those given.
 
     :raises ValueError: if they cannot be decoded.
     """
+    if isinstance(message, np.ndarray):
+        return message
     if hasattr(message, 'format'):
         return decode_compressed(message.data)
     return decode(message.encoding, message.height, message.width, message.step,

@@ -42,6 +42,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
 from flock_follower.messages import MAX_JUMP
+from flock_follower.perception.learnt_noise import GAP, LearntMotion
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
     ATTITUDE,
@@ -81,7 +82,7 @@ class RangeGate:
     """
     The gate of n series of distances.
 
-    :param most: so many in a row are refused, less one.
+    :param most: at most one less than this number is refused in a row.
     """
 
     def __init__(self, count: int = 1, most: int = 6) -> None:
@@ -90,7 +91,7 @@ class RangeGate:
         self._before: Array = np.zeros(count)  # sign of the last one used, where it surprised
         self._judged: Any = np.zeros(count, dtype=int)
         self.outliers: Array = np.zeros(count)
-        """Which share of the distances was refused of late."""
+        """Share of recent distances that was refused."""
 
     def restart(self, which: Any) -> None:
         """Forget what surprised of some (n,) bool, but not how many are refused."""
@@ -136,7 +137,10 @@ WILD = 10.0
 MIRRORED = 0.3
 #: Nearer than this, m, a distance has no direction.
 NEAREST = 0.01
+#: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
+SETTLING = 0.2
 _CENTRE = np.zeros(3)
+_UNSCALED = [1.0] * 6  # attitude and its rate
 
 
 class UpdateOutcome(Enum):
@@ -151,22 +155,15 @@ class UpdateOutcome(Enum):
     LOST = 'no track'
 
 
-class Step(NamedTuple):
+class Change(NamedTuple):
     """
-    The update by a measurement, for the estimators of noise and time offset.
+    The difference of two successive innovations of the position.
 
-    The state went through ``transition`` (15, 15) to its stamp; there ``gain`` (15, n) times
-    ``innovation`` (n,), of covariance ``spread`` (n, n), was added. ``jacobian`` (n, 15) is that
-    of the measurement to the error state; n is 6, or 3 if only the position was used.
-    ``expected`` (3, 3) is the expected covariance of the position's innovation.
+    ``covariance`` (3, 3) is that of ``difference`` (3,), m, if innovations are white.
     """
 
-    transition: Array
-    jacobian: Array
-    gain: Array
-    innovation: Array
-    spread: Array
-    expected: Array
+    difference: Array
+    covariance: Array
 
 
 class NeighborFilter:
@@ -188,8 +185,8 @@ class NeighborFilter:
 
     def reset(self) -> None:
         """Forget the neighbour."""
-        self.step: Step | None = None
-        """How the newest measurement was used; None if it was not, or if it began the track."""
+        self.change: Change | None = None
+        """Of the newest measurement; None if it was not used, or if it began the track."""
         self.newest: Estimate | None = None
         """The state at the newest measurement; None if there is no track."""
         self._predicted: Estimate | None = None  # from that, to the time last requested
@@ -197,6 +194,8 @@ class NeighborFilter:
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
         self._line = _CENTRE  # on which the last distance was measured
+        self._motion = LearntMotion()
+        self._before: tuple[Array, Array] | None = None  # the last innovation, its covariance
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -228,16 +227,24 @@ class NeighborFilter:
         return now.moved(stamp, *self._transition(stamp - now.stamp))
 
     def continued(self, max_gap: float) -> NeighborFilter:
-        """Return another filter that goes on from where this one is, over gaps up to so many s."""
+        """Return a copy of this filter that bridges gaps of up to ``max_gap`` s."""
         other = NeighborFilter(replace(self.params, max_gap=max_gap))
         other.walk, other.newest = self.walk, self.newest
+        other._motion.factors = [max(factor, 1.0) for factor in self._motion.factors]
         return other
 
     def shift(self, error: Array) -> None:
-        """Add an error state (15,), the cause of which was found elsewhere."""
+        """
+        Add an error state (15,) that was found elsewhere, and widen the covariance accordingly.
+
+        The motion that was learnt with it is forgotten.
+        """
+        self._motion = LearntMotion()
         if self.newest is not None:
-            self.newest = self.newest.corrected(error, self.newest.covariance)
-            self._predicted = None
+            covariance = self.newest.covariance + np.outer(error, error)
+            covariance[VELOCITY, VELOCITY] += error.dot(error) / SETTLING**2 * np.eye(3)
+            self.newest = self.newest.corrected(error, covariance)
+            self._predicted = self._before = None
 
     def _transition(self, dt: float) -> tuple[Array, Array, Array]:
         dt = round(dt, 6)  # images come at even intervals, to the microsecond or so
@@ -246,6 +253,8 @@ class NeighborFilter:
                 self._steps.clear()
             self._steps[dt] = transition(dt, self.params)
         linear, whole, noise = self._steps[dt]
+        x, y, z = self._motion.scale(dt)  # axes are independent of each other
+        noise = noise * np.array([x, y, z, x, y, z, *_UNSCALED, x, y, z])
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
@@ -258,7 +267,7 @@ class NeighborFilter:
 
         :param reach: how far from the newest estimate the body can be by now, m.
         """
-        self.step = None
+        self.change = None
         now = self.newest
         if now is not None and stamp <= now.stamp:
             if now.stamp - stamp <= MAX_JUMP:
@@ -291,8 +300,7 @@ class NeighborFilter:
         self._turned = 0 if plausible else self._turned + 1
         if self._turned >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
-        self.step = Step(self._transition(stamp - now.stamp)[1], jacobian, gain.T, innovation,
-                         spread, nominal)
+        self._learn(stamp - now.stamp, innovation[:3], nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
@@ -301,6 +309,13 @@ class NeighborFilter:
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
+
+    def _learn(self, dt: float, innovation: Array, covariance: Array) -> None:
+        """Learn from the innovation of a position (3,), dt, s, after the one before."""
+        self._motion.take(dt, innovation, covariance)
+        before, self._before = self._before, (innovation, covariance)
+        if before is not None and dt <= GAP:
+            self.change = Change(innovation - before[0], covariance + before[1])
 
     def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
                   covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
@@ -379,7 +394,7 @@ class NeighborFilter:
             gain, gain)
         covariance = bounded_across(covariance[None], along[None], np.array([length]),
                                     self.params.initial_speed)[0]
-        self.step, self._predicted, self._line = None, None, along
+        self.change, self._predicted, self._line = None, None, along
         self.newest = expected.corrected(innovation * gain, covariance)
         surprising = widened[0] != 1.0 or careful[0] != 1.0
         return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The state of a neighbour, its motion model, and the measurement noise learnt in flight.
+The state of a neighbour and its motion model.
 
 ``Estimate``: position p, velocity v and acceleration a of the neighbour's body, its attitude R
 (body to odom) and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,),
@@ -23,12 +23,6 @@ with R_true = exp(dr) R, a rotation vector along odom's axes.
 performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s,
 forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T. White angular
 acceleration drives the angular velocity.
-
-``LearntNoise`` learns from innovations how much measurements err beyond the fit's covariance.
-Across the line of sight, the noise is the error of the own attitude, which moves a neighbour
-sideways: errors of the odometry, of its interpolation and of the camera's stamps. Along the line
-of sight, the noise is anything that changes the marker's apparent size: a rolling shutter, a bent
-print, motion blur.
 """
 
 from __future__ import annotations
@@ -64,7 +58,8 @@ class Estimate(NamedTuple):
     ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
     ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
     odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
-    what the own odometry errs by, both share.
+    both share the errors of the own odometry, but for the white noise of the own attitude and
+    velocity, which published covariances include.
     """
 
     stamp: float
@@ -263,76 +258,3 @@ def bounded_across(covariances: Array, along: Array, distance: Array, speed: flo
         share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
         scale[:, part, part] = line + share * (_EYE - line)
     return scale @ covariances @ scale.transpose(0, 2, 1)
-
-
-#: Number of innovations over which the noise is learnt; initial count of innovations.
-LEARNT = 120
-FIRST = 15
-#: The square of an innovation is limited to this many times its variance.
-LIMIT = 16.0
-#: Largest value that is used, rad, and as share of the distance.
-MOST = 0.05
-_LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
-
-
-class LearntNoise:
-    """
-    The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
-
-    :param least: lower limit and initial value for the attitude, rad; the distance starts at 0.
-    """
-
-    def __init__(self, least: float) -> None:
-        self._least = least**2
-        self.restart()
-
-    def restart(self) -> None:
-        """Reset the estimates."""
-        self._across, self._along = self._least, 0.0
-        self._count = FIRST
-
-    @property
-    def attitude(self) -> float:
-        """Return the noise of the own attitude, one standard deviation, rad."""
-        return math.sqrt(self._across)
-
-    @property
-    def distance(self) -> float:
-        """Return the noise of the distance, one standard deviation, a share of it."""
-        return math.sqrt(self._along)
-
-    def covariance(self, sight: Array) -> Array:
-        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
-        # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
-        # by e x r, and tilts it by e.
-        leverage = _LEVERAGE.copy()
-        leverage[:3] = skew(-sight)
-        covariance: Array = leverage.dot(self._across * leverage.T)
-        if self._along:
-            covariance[:3, :3] += self._along * sight[:, None] * sight
-        return covariance
-
-    def take(self, innovation: Array, spread: Array, sight: Array) -> None:
-        """
-        Take an innovation of a position (3,), m, of covariance (3, 3), and the way there (3,), m.
-
-        The covariance holds the noise as it is now.
-        """
-        # In plain numbers: for every image, and so small.
-        (x, y, z), (u, v, w) = sight.tolist(), innovation.tolist()
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = spread.tolist()
-        squared = x * x + y * y + z * z
-        along = (x * u + y * v + z * w)**2 / squared
-        expected = (x * x * xx + y * y * yy + z * z * zz
-                    + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
-        across, across_expected = u * u + v * v + w * w - along, xx + yy + zz - expected
-        self._count = min(self._count + 1, LEARNT)
-        # Two axes across, each off by the noise times the distance.
-        for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)
-        for_distance = _excess(along, expected) / (squared * self._count)
-        self._across = min(max(self._across + for_attitude, self._least), MOST**2)
-        self._along = min(max(self._along + for_distance, 0.0), MOST**2)
-
-
-def _excess(squared: float, expected: float) -> float:
-    return min(squared, LIMIT * expected) - expected

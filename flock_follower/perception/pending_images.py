@@ -56,7 +56,7 @@ class PendingImage(NamedTuple):
     """
     An image message, when it came (s, any clock), its stamp in ns and s, and its camera.
 
-    ``model``, from :meth:`Perceiver.due`: the calibration; None as long as no usable one came.
+    ``model``, from :meth:`Perceiver.process`: the calibration; None as long as no usable one came.
     """
 
     received: float
@@ -114,7 +114,7 @@ class Perceiver:
         self._max_wait = max_wait
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self._epoch: int | None = None
-        self._pending: list[PendingImage] = []  # by stamp: one from the future holds nobody up
+        self._pending: list[PendingImage] = []  # by stamp: one from the future blocks no other
 
     @property
     def overdue(self) -> float | None:
@@ -189,22 +189,6 @@ class Perceiver:
         most = MOST_PENDING * len(self._cameras)
         return self._pending.pop(0) if len(self._pending) > most else None
 
-    def due(self, now: float) -> PendingImage | None:
-        """Return the next image to process now, and forget it; None if it has to wait."""
-        for k, image in enumerate(self._pending):
-            camera = self._cameras[image.camera]
-            awaited = camera.model is None or self.tracker.missing(
-                image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
-            waited = now - image.received
-            if awaited and waited < self._wait(image.camera):
-                continue
-            if awaited:
-                camera.waits.clear()  # it may be later from now on: wait longer
-            else:
-                camera.waits.append(waited)
-            return self._pending.pop(k)._replace(model=camera.model)
-        return None
-
     def process(self, now: float, clock: Callable[[], float] = lambda: 0.0,
                 shown: Callable[[str], bool] = lambda _: False) -> Processed | None:
         """
@@ -213,7 +197,7 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        image = self.due(now)
+        image = self._due(now)
         if image is None:
             return None
         sighting, pixels = Sighting(), None
@@ -230,6 +214,22 @@ class Perceiver:
         except ValueError as error:
             sighting.rejections.append((INVALID_IMAGE, str(error)))
         return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
+
+    def _due(self, now: float) -> PendingImage | None:
+        """Return the next image to process now, and forget it; None if it has to wait."""
+        for k, image in enumerate(self._pending):
+            camera = self._cameras[image.camera]
+            awaited = camera.model is None or self.tracker.missing(
+                image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
+            waited = now - image.received
+            if awaited and waited < self._wait(image.camera):
+                continue
+            if awaited:
+                camera.waits.clear()  # it may be later from now on: wait longer
+            else:
+                camera.waits.append(waited)
+            return self._pending.pop(k)._replace(model=camera.model)
+        return None
 
     def take_range(self, measured: RangeState) -> Rejection | None:
         """Take a range, or return why not; it is used by ``tracker.ranged``."""

@@ -52,6 +52,7 @@ _MIN_APART = 4.0  # grey levels between black and white, both in the shade
 #: Black or white cells are not used if their variance exceeds this share of the squared half of
 #: their contrast.
 _MAX_SPREAD = 0.35
+_SATURATED = 250.0  # grey levels
 
 
 class Windows(NamedTuple):
@@ -100,16 +101,17 @@ def read(brightness: Array, seen: Windows) -> Array:
     """
     values = brightness.astype(float)[:, seen.cells]
     sums = []
-    for colour in (seen.white, seen.black):  # of the others: a cell does not judge itself
+    # A cell is not compared with itself, and with no saturated cell that should be black.
+    for colour in (seen.white, seen.black * (values < _SATURATED)):
         some = values * colour
         sums.append([total.sum(axis=-1, keepdims=True) - total
                      for total in (colour, some, some * values)])
     (whites, white, white2), (blacks, black, black2) = sums
-    light, dark = white / whites, black / blacks
+    light, dark = white / whites, black / np.maximum(blacks, 1.0)
     half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
     spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
     shown = (values - 0.5 * (light + dark)) / half
-    readable = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
+    readable = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD) & (blacks > 0.0)
     # Best is a window that is even, and in which the cell is as any black or white one.
     odd = spread + (np.abs(shown) - 1.0)**2
     odd, shown = (part.reshape(len(values), -1) for part in (
@@ -129,6 +131,7 @@ _LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Where else a cell is looked at, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+_MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
@@ -200,23 +203,29 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
             and np.count_nonzero(cells * code.bits <= 0.0) <= code.errors
             and _is_word(cells, code)):
         return True
-    if _shows_in_uneven_light(read(brightness[None], code.windows)[0], code):
+    if _shows_in_uneven_light(brightness[None], code):
         return True
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
-    return _shows_in_uneven_light(read(
-        grey_levels(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
+    return _shows_in_uneven_light(grey_levels(image, beside).reshape(len(_BESIDE), -1), code)
 
 
-def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
-    """Return whether all cells (c,), black -1 to white 1, are those of a marker."""
-    inner, around = read[:code.bits.size], read[code.bits.size + code.border:]
-    border = read[code.bits.size:code.bits.size + code.border]
+def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
+    """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
+    colours = read(brightness, code.windows).mean(axis=0)
+    saturated: Any = (brightness >= _SATURATED).any(axis=0)
+    end = code.bits.size + code.border
+    inner, border, around = slice(code.bits.size), slice(code.bits.size, end), slice(end, None)
+    # A reflex hides black cells. It cannot be told from paper that is saturated as well.
+    hidden = saturated[inner] & (code.bits < 0.0)
+    hidden &= saturated[around].mean() <= _MOST_HIDDEN
+    bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
-    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0).sum())
-    return (wrong < max(0.5 * code.errors, 1.0) and _is_word(inner, code)
-            and np.count_nonzero(border < 0.0) >= _MIN_BORDER * code.border
-            and np.count_nonzero(around > 0.0) >= _MIN_AROUND * len(around))
+    wrong = float(np.clip(0.5 - bits * code.bits, 0.0, 1.0)[~hidden].sum())
+    return (wrong < max(0.5 * code.errors, 1.0) and hidden.mean() <= _MOST_HIDDEN
+            and _is_word(bits, code)
+            and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
+            and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))
 
 
 def _is_word(read: Array, code: CellCode) -> bool:

@@ -12,11 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Searches an image for markers: near an expected place, or everywhere; quickly, or thoroughly."""
+"""
+Searches an image for markers: near an expected place, or everywhere; quickly, or thoroughly.
+
+A quick search is OpenCV's detector, which needs an unbroken outline and reads all cells by one
+threshold. A thorough search finds given markers although a shadow's edge lies across them or a
+reflex hides a part. It works on the logarithm of the image: a shadow then darkens black and white
+by the same amount, whatever its depth. The outline is the convex hull of a dark part; a side that
+a reflex has bitten into it is replaced by prolonging its neighbours.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 import math
 
 import cv2
@@ -28,28 +37,35 @@ from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
-    DetectionParams,
     Detections,
     MarkedNeighbor,
     Marker,
     marker_cells,
     marker_code,
     NO_DETECTIONS,
+    outwards,
 )
-from flock_follower.perception.print_model import cell_code, grey_levels, shows_code
+from flock_follower.perception.print_model import cell_code, shows_code
 
-#: Sides of the adaptive threshold's window, px: one finds a marker of the size it is scaled to;
-#: three, OpenCV's own, find more, also in the dark, and take three times as long.
-ONE_WINDOW = DetectionParams(windows=(15, 15, 10))
-THREE_WINDOWS = DetectionParams(windows=(3, 23, 10), min_perimeter=0.03, threshold=4.0)
 #: Near an expected place the image is scaled so that the marker's side has this many px.
 SIDE = 56.0
-#: A square may be a marker if its cells correlate so much with the print.
-_LIKENESS = 0.4
-#: White is the brightest within so many px, wider than a marker's black cells.
-_BRUSH = np.ones((61, 61), dtype=np.uint8)
 #: From this width on, px, a whole image is searched at half its size.
 LARGE = 1280
+_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels: what is darker is noise
+_LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
+#: Side of the window for the mean, px, and of the brush that removes what is narrower. A narrow
+#: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
+#: The brush cuts off the dark rim of a shadow that crosses the paper.
+_WINDOWS = ((7, 1), (15, 1), (11, 3))
+_DARKER = 7  # by so much of the logarithm than the mean of the window is what is dark
+_SHORTEST = 40  # px, of an outline
+_ROUNDEST = 32.0  # squared length over area; of a square 16
+_STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
+_HIDDEN = 0.35  # share of the visible area that a reflex may have hidden
+_SLIGHT = 0.05  # share of that: no reflex, but a blunt corner
+#: A quadrilateral may be a marker if its cells, compared with their neighbours, correlate so much
+#: with the print. Of clutter, 99 % have less.
+_LIKENESS = 0.75
 
 
 def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
@@ -57,7 +73,7 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
     """
     Return the markers about where a neighbour is expected (``T_camera_body``).
 
-    :param thorough: whether to look with three windows instead of one.
+    :param thorough: whether to look for the neighbour's own, by all means.
     """
     outlines = [camera.project((expected @ marker.T_body_marker).apply(
         marker_corners(marker.side_length))) for marker in neighbor.markers]
@@ -75,23 +91,24 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
     scale = float(np.clip(SIDE / max(side, 1.0), 0.1, 2.0))
     if 0.75 < scale < 1.3:
         scale = 1.0
-    return _search(image, (x0, y0, x1, y1), scale, dictionary, thorough, neighbor.markers)
+    return _search(image, (x0, y0, x1, y1), scale, dictionary,
+                   neighbor.markers if thorough else None)
 
 
-def everywhere(image: GrayImage, dictionary: str, thorough: bool,
-               markers: Sequence[Marker] = ()) -> Detections:
+def everywhere(image: GrayImage, dictionary: str,
+               markers: Sequence[Marker] | None = None) -> Detections:
     """
-    Return the markers in an image; see :func:`near`.
+    Return the markers in an image.
 
-    :param markers: those that a thorough search also looks for in uneven light.
+    :param markers: those to look for thoroughly; None: all of the dictionary, quickly.
     """
     height, width = image.shape
     return _search(image, (0, 0, width, height), 0.5 if width >= LARGE else 1.0, dictionary,
-                   thorough, markers)
+                   markers)
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,
-            thorough: bool, markers: Sequence[Marker]) -> Detections:
+            markers: Sequence[Marker] | None) -> Detections:
     x0, y0, x1, y1 = region
     part = image[y0:y1, x0:x1]
     if scale != 1.0:
@@ -99,59 +116,109 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
         part = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1.0
                           else cv2.INTER_LINEAR)
     part = np.ascontiguousarray(part)
-    found = detect(part, dictionary, THREE_WINDOWS if thorough else ONE_WINDOW)
-    if thorough:
-        found = _in_uneven_light(part, found, dictionary, markers)
-        if not len(found.ids):
-            white = cv2.morphologyEx(part, cv2.MORPH_CLOSE, _BRUSH)
-            flat = cv2.divide(part, np.maximum(white, 8), scale=235.0)
-            found = _in_uneven_light(
-                part, detect(flat, dictionary, THREE_WINDOWS), dictionary, markers)
+    found = detect(part, dictionary) if markers is None else _read(part, dictionary, markers)
     # Pixel centres are whole numbers: half a pixel off before scaling, and after.
     scales = np.array([part.shape[1] / (x1 - x0), part.shape[0] / (y1 - y0)])
     corners: Array = (found.corners + 0.5) / scales - 0.5 + np.array([x0, y0])
     return Detections(found.ids, corners)
 
 
-def _in_uneven_light(image: GrayImage, found: Detections, dictionary: str,
-                     markers: Sequence[Marker]) -> Detections:
-    """Return the markers found, also those whose code a shadow or a reflex hides from OpenCV."""
-    ids, corners = found.ids.tolist(), [*found.corners]
+def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker]) -> Detections:
+    """Return the given markers in an image, the likest outline first."""
+    logarithm = cv2.LUT(image, _LOGARITHM)
+    outlines = outwards(quadrilaterals(logarithm), 0.5)
+    if not len(outlines):
+        return NO_DETECTIONS
     cells = marker_cells(dictionary)
     square = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], dtype=np.float32)
     rows, columns = np.mgrid[-1:cells + 1, -1:cells + 1] + 0.5
-    middles = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    prints = [(marker, [_local(np.rot90(np.pad(
-        marker_code(dictionary, marker.marker_id), 1, constant_values=True), turn))
-        for turn in range(4)]) for marker in markers]
-    for outline in found.unread:
-        to_image = cv2.getPerspectiveTransform(square, outline.astype(np.float32))
-        light = _local(grey_levels(image, _mapped(to_image, middles)).reshape(rows.shape))
-        for marker, turns in prints:
-            alike = [float((light * turned).sum()) for turned in turns]
-            turn = int(np.argmax(alike))
-            turned = np.roll(outline, turn, axis=0)
-            if alike[turn] < _LIKENESS or any(
-                    known == marker.marker_id and math.dist(
-                        other.mean(axis=0), outline.mean(axis=0)) < math.dist(*other[:2])
+    middles = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
+    x, y, w = np.moveaxis(np.array([
+        cv2.getPerspectiveTransform(square, outline.astype(np.float32)).dot(middles)
+        for outline in outlines]), 1, 0)
+    seen = _local(cv2.remap(logarithm, (x / w).astype(np.float32), (y / w).astype(np.float32),
+                            cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    ids: list[int] = []
+    corners: list[Array] = []
+    for marker in markers:
+        printed = np.pad(marker_code(dictionary, marker.marker_id), 1, constant_values=True)
+        likeness = seen.dot(_local(np.array([np.rot90(printed, turn).ravel()
+                                             for turn in range(4)])).T)
+        code = cell_code(marker, dictionary)
+        likest = likeness.max(axis=1)
+        for k in np.argsort(-likest)[:np.count_nonzero(likest > _LIKENESS)].tolist():
+            outline = np.roll(outlines[k], int(likeness[k].argmax()), axis=0)
+            if any(known == marker.marker_id and math.dist(
+                    other.mean(axis=0), outline.mean(axis=0)) < math.dist(*other[:2])
                     for known, other in zip(ids, corners)):
                 continue
-            code = cell_code(marker, dictionary)
-            to_image = cv2.getPerspectiveTransform(square, turned.astype(np.float32))
-            if shows_code(image, _mapped(to_image, code.grid + 0.5), code):
+            to_image = cv2.getPerspectiveTransform(square, outline.astype(np.float32))
+            pixels = cv2.perspectiveTransform(code.grid[None] + 0.5, to_image)[0]
+            if shows_code(image, pixels, code):
                 ids.append(marker.marker_id)
-                corners.append(turned)
+                corners.append(outline)
     return Detections(np.array(ids, dtype=np.int64), np.reshape(corners, (-1, 4, 2)))
 
 
-def _local(cells: Array) -> Array:
-    """Return how much brighter each of the cells (n, n) is than those around, of norm 1."""
-    cells = cells.astype(np.float32)
-    compared: Array = cells - cv2.blur(cells, (3, 3))
-    return compared / max(float(np.linalg.norm(compared)), 1e-6)
+def _local(brightness: Array) -> Array:
+    """Return how much squares of cells (n, c) differ from the cells around each, of norm 1."""
+    differs = brightness.astype(float).dot(_differences(math.isqrt(brightness.shape[1])))
+    normalised: Array = differs / np.maximum(
+        np.linalg.norm(differs, axis=1, keepdims=True), 1e-6)
+    return normalised
 
 
-def _mapped(to_image: Array, points: Array) -> Array:
-    """Return points (n, 2) of a plane in an image, px."""
-    mapped: Array = cv2.perspectiveTransform(points[None].astype(np.float32), to_image)[0]
-    return mapped
+@lru_cache(maxsize=16)
+def _differences(side: int) -> Array:
+    """Return the symmetric matrix from square cells to their differences from those around."""
+    cells = np.eye(side * side).reshape(-1, side, side)
+    return np.array([(cell - cv2.blur(cell, (3, 3))).ravel() for cell in cells])
+
+
+def quadrilaterals(logarithm: GrayImage) -> Array:
+    """Return the quadrilaterals (n, 4, 2), px, clockwise, that may be the outlines of markers."""
+    smooth = cv2.blur(logarithm, (3, 3))
+    found = []
+    for window, brush in _WINDOWS:
+        dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C,
+                                     cv2.THRESH_BINARY_INV, window, _DARKER)
+        dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((brush, brush), dtype=np.uint8))
+        contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        holes = [] if tree is None else (tree[0, :, 3] >= 0).tolist()
+        for contour, hole in zip(contours, holes):
+            if hole or sum(cv2.boundingRect(contour)[2:]) < _SHORTEST // 2:
+                continue
+            hull = cv2.convexHull(contour)
+            length, area = cv2.arcLength(hull, True), cv2.contourArea(hull)
+            if _SHORTEST < length < math.sqrt(_ROUNDEST * area):
+                outline = cv2.approxPolyDP(hull, _STRAIGHT * length, True)
+                found += _squares(outline[:, 0].tolist(), _HIDDEN * area)
+    return np.reshape(found, (-1, 4, 2)).astype(float)
+
+
+def _squares(corners: list[list[float]], area: float) -> list[list[list[float]]]:
+    """
+    Return the quadrilaterals that convex corners (n, 2), clockwise, may be the visible part of.
+
+    One side of five is where a reflex ends. Before, sides that hide next to nothing are removed,
+    and of more than five those that hide least.
+
+    :param area: the largest that may be hidden, px^2.
+    """
+    count = len(corners)
+    if count <= 4:
+        return [corners] if count == 4 else []
+    fewer = []
+    for k in range(count):
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = (corners[(k + i) % count] for i in range(4))
+        across = (bx - ax) * (dy - cy) - (by - ay) * (dx - cx)
+        if across > 1e-9:  # the sides before and after meet beyond this one
+            further = ((cx - bx) * (dy - cy) - (cy - by) * (dx - cx)) / across
+            hidden = 0.5 * further * ((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
+            if hidden < area:
+                met = [bx + further * (bx - ax), by + further * (by - ay)]
+                fewer.append((hidden, [met, *(corners[(k + i) % count]
+                                              for i in range(3, count + 1))]))
+    if fewer and (count > 5 or min(fewer)[0] < _SLIGHT * area):
+        return _squares(min(fewer)[1], area)
+    return [square for _, square in fewer] if count == 5 else []

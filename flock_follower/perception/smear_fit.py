@@ -59,23 +59,23 @@ _WHITE = 3  # cells around, in the print
 LENSES = np.array([0.07, 0.11, 0.17, 0.27, 0.4])  # with less, the instants were steps in the image
 FOCUSED = 3  # so many of them are
 _SHARP = 1
-#: Lengths, cells, and directions, quarters of half a turn, of the vectors that are tried first.
+#: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees.
 _LENGTHS = (0.5, 1.0, 1.45)
 
 
 @dataclass(frozen=True, eq=False)
 class SmearModel:
     """
-    A print to be smeared.
+    The model of a print whose image is smeared by motion.
 
-    ``origin`` (3,) and ``axes`` (2, 3), m: where (0, 0), and steps of a cell, are on the body.
-    ``places`` (s, 2), cells, are the samples, row by row, ``around`` more of them. ``printed``
-    (l, H, W, 3): how white it is, 0..1, and by how much more per cell to the right, and down,
+    ``origin`` (3,) and ``axes`` (2, 3), m: place of (0, 0) on the body, and steps of one cell.
+    ``places`` (s, 2), cells, are the sample points, row by row; ``around`` are more of them.
+    ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
     for each of :data:`LENSES`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
-    ``smeared`` (t, k, k) the samples then.
-    ``codes`` (w, b): all words of the dictionary in all turns, 0..1, the marker's own first, of
-    which ``errors`` cells may be misread. ``cells`` are along a side, the black border included.
+    ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
+    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread.
+    ``cells``: number of cells along a side, with the black border.
     """
 
     origin: Array

@@ -13,14 +13,18 @@
 # limitations under the License.
 
 """
-Estimates the offset between the camera's stamps and the odometry's clock, from innovations.
+Estimates the offset between the camera's stamps and the odometry's clock.
 
-An image of stamp t was exposed at t + offset on the odometry's clock. If the own pose is taken at
-t, the computed position of a neighbour has the error offset * (w x r + v): the own vehicle turns
-at rate w and moves at velocity v, and r is the vector to the neighbour. The filter follows part of
-this bias. The rest of it in an innovation is known: the bias goes through the same transitions and
-gains as the state (Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Automatic
-Control, 1969). The innovations are regressed on it, weighted by their covariances.
+An image of stamp t was exposed at t + offset on the odometry's clock. The measured points of a
+neighbour, taken to odom with the own poses at t + offset, are a smooth path only with the true
+offset: otherwise the rotation of the own vehicle moves them.
+
+Every ``BATCH`` seconds, the points of each neighbour are taken to odom with each offset of a grid.
+The misfit of an offset is the chi^2 of a path that begins with any position, velocity and
+acceleration and is driven by white jerk. No offset of the grid is preferred, and nothing is
+linearised: offsets of any size inside the grid are found alike, whatever is applied meanwhile.
+The misfits of all batches are added, old ones forgotten. The deviation comes from their curvature
+and from the least of them, so unmodelled motion and noise make it larger.
 
 ``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learnt noise, and
 its last searches.
@@ -28,40 +32,45 @@ its last searches.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 import math
 from typing import Final
 
-import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.neighbor_filter import Step
-from flock_follower.perception.neighbor_motion import FilterParams, LearntNoise, SIZE
+from flock_follower.perception.neighbor_motion import FilterParams
 
 #: Initial standard deviation of an offset, s; largest offset that is applied, s.
-PRIOR: Final[float] = 0.03
+PRIOR: Final[float] = 0.1
 MOST: Final[float] = 0.2
-#: Factor on the deviation: own and neighbour's motion are correlated, and not white noise.
+#: Step and half width of the grid of offsets about the initial one, s.
+STEP, FURTHEST = 0.01, 0.14
+GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)
+#: Least length of a batch, s; least number of its points, and the most in that time.
+BATCH: Final[float] = 0.6
+FEWEST, MOST_POINTS = 8, 40
+#: Noise of a point, m, and spectral density of the jerk, (m/s^3)^2/Hz: their ratio counts.
+NOISE, JERK = 0.0015, 0.5
+#: Deviations are widened: errors of successive images are alike.
 WIDENING: Final[float] = 2.0
-#: An estimate is certain if its deviation is below this, s.
-SURE: Final[float] = 0.003
-#: It is applied once it differs from the applied offset by this many deviations, and this much, s.
-SIGNIFICANT: Final[float] = 4.0
+#: An estimate is applied once it differs from the applied offset by this many deviations, at first
+#: and later, and by this much, s.
+SIGNIFICANT: Final = (4.0, 1.5)
 LEAST: Final[float] = 0.001
-#: Number of innovations that are used: clocks drift.
-REMEMBERED: Final[float] = 3000.0
-#: With several cameras the offsets are estimated again after this many innovations.
-EVERY: Final[int] = 8
-#: Number of innovations over which their misfit is averaged.
-WATCHED: Final[int] = 100
+#: Pause after a batch, s, while the deviation is below LEAST.
+REST: Final[float] = 3.0
+#: Number of batches that are used: clocks drift.
+REMEMBERED: Final[float] = 60.0
 
 
 class TimeOffset:
     """
-    The offset of the camera's stamps, s: the ``applied`` one and the estimate of the innovations.
+    The offset of the camera's stamps, s: the ``applied`` one and the ``estimate``.
 
     ``before`` is the offset that was applied until the newest change.
 
@@ -75,23 +84,14 @@ class TimeOffset:
 
     def restart(self) -> None:
         """Reset the estimate."""
-        self.applied = self.before = self._first
-        self._information = 1.0 / PRIOR**2
-        self._weighted = self._first / PRIOR**2
-        self._misfit = 1.0
-        self._count = 0
+        self.applied = self.before = self.estimate = self._first
+        self.deviation = PRIOR
+        """Standard deviation of the estimate, s."""
+        self._misfits: Array = np.zeros(len(GRID))
+        self._freedom = 0.0
         self._found = False
-        self._following: dict[str, Array] = {}
-
-    @property
-    def estimate(self) -> float:
-        """Return what the innovations say, s."""
-        return self._weighted / self._information
-
-    @property
-    def deviation(self) -> float:
-        """Return the standard deviation of the estimate, s."""
-        return WIDENING * math.sqrt(max(self._misfit, 1.0) / self._information)
+        self._resting = -math.inf  # until this time, s
+        self._paths: dict[str, list[tuple[float, Array]]] = {}  # times, points on the body
 
     @property
     def describe(self) -> str:
@@ -101,128 +101,80 @@ class TimeOffset:
         known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
         if self._found:
             return f'{known}, applied'
-        return f'{known}, not applied: {1e3 * self.applied:.1f} ms is'
+        return f'{known}, not applied; {1e3 * self.applied:.1f} ms is applied'
 
-    def begin(self, name: str, moving: Array) -> None:
+    def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
+             odometry: OdometryBuffer) -> float:
         """
-        Take that a neighbour's track began with the newest measurement.
+        Take where a camera saw a neighbour; return by how much the applied offset changed, s.
 
-        :param moving: by how much the error state measured changes with the offset, (15,), 1/s.
+        :param time: of the exposure by the camera's clock, s.
+        :param camera_point: a point of the neighbour, (3,), m, in the optical frame.
         """
-        self._following[name] = moving
+        if time < self._resting:
+            return 0.0
+        path = self._paths.setdefault(name, [])
+        if path and not 0.0 < time - path[-1][0] < 0.5 * BATCH:
+            path.clear()
+        if not path or time - path[-1][0] > 0.9 * BATCH / MOST_POINTS:
+            path.append((time, T_body_camera.apply(camera_point)))
+        last = (odometry.newest or time) - self._first - FURTHEST
+        if path[0][0] + BATCH > last:
+            return 0.0
+        usable = [each for each in path if each[0] <= last]
+        if len(usable) < FEWEST or usable[-1][0] - usable[0][0] < BATCH:
+            return 0.0
+        del path[:len(usable)]
+        self._resting = time + (REST if self.deviation < LEAST else 0.0)
+        self._judge(np.array([t for t, _ in usable]), np.array([p for _, p in usable]), odometry)
+        return self._apply()
 
-    def forget(self, name: str) -> None:
-        """Note that a neighbour's track began with a measurement of another camera."""
-        self._following.pop(name, None)
-
-    def take(self, name: str, step: Step, moving: Array) -> float:
-        """
-        Update the estimate with a filter step; return the change of the applied offset, s.
-
-        The caller then moves all states by that change times :meth:`following`.
-        """
-        # Error of state and innovation per offset not applied: measurements lack ``moving``.
-        seen = self.follow(name, step, moving)
-        both = np.array([seen, step.innovation])
-        # (2, 2): products of the two, weighted.
-        (ss, si), (_, ii) = both.dot(cv2.solve(step.spread, both.T)[1]).tolist()
-        off = self.estimate - self.applied
-        self.watch((ii - 2.0 * off * si + off * off * ss) / len(seen))
+    def _judge(self, times: Array, points: Array, odometry: OdometryBuffer) -> None:
+        """Take the points (n, 3) of a batch, in base_link, at n times, s."""
+        places = odometry.places(times + (self._first + GRID)[:, None], points)
+        if places is None:
+            return
+        precision = _precision(times - times[0])
+        misfits = np.einsum('kni,kni->k', precision @ places, places)
+        if not misfits.min() > 0.0:  # NaN is not
+            return
         keep = 1.0 - 1.0 / REMEMBERED
-        self._information = keep * self._information + ss
-        self._weighted = keep * self._weighted + ss * self.applied + si
-        return self.apply()
+        self._misfits = keep * self._misfits + misfits
+        self._freedom = keep * self._freedom + 3.0 * (len(times) - 3)
+        chi2 = self._misfits * (self._freedom / self._misfits.min()) + (GRID / PRIOR)**2
+        best = int(chi2.argmin())
+        weights = np.exp(0.5 * (chi2[best] - chi2))
+        spread = float(weights.dot((GRID - GRID[best])**2) / weights.sum())
+        if 0 < best < len(GRID) - 1:
+            before, least, after = chi2[best - 1:best + 2].tolist()
+            bend = before - 2.0 * least + after
+            shift = 0.5 * STEP * (before - after) / bend
+            spread = max(2.0 * STEP**2 / bend, spread - STEP**2)
+        else:
+            shift, spread = 0.0, PRIOR**2
+        self.estimate = self._first + float(GRID[best]) + shift
+        self.deviation = WIDENING * math.sqrt(spread)
 
-    def follow(self, name: str, step: Step, moving: Array | None = None) -> Array:
-        """
-        Update the bias of a neighbour's state after a step; return its part in the innovation.
-
-        Both are per unit of offset not applied; :param moving: None if another camera measured.
-        """
-        ahead = step.transition.dot(self.following(name))
-        seen: Array = step.jacobian.dot(ahead if moving is None else ahead - moving)
-        self._following[name] = ahead - step.gain.dot(seen)
-        return seen
-
-    def watch(self, misfit: float) -> None:
-        """Update the misfit with the chi^2 per dimension of an innovation."""
-        self._count = min(self._count + 1, WATCHED)
-        self._misfit += (min(misfit, 10.0) - self._misfit) / (self._count + 1)
-
-    def know(self, estimate: float, information: float) -> None:
-        """Set the joint estimate of several cameras, s, and its information, 1/s^2."""
-        self._information, self._weighted = information, estimate * information
-
-    def following(self, name: str) -> Array:
-        """Return the bias of a neighbour's state, (15,), per unit of offset not applied."""
-        return self._following.get(name, np.zeros(SIZE))
-
-    def apply(self) -> float:
-        """Apply the estimate if it is certain; return the change of the applied offset, s."""
-        if self.fixed:
-            return 0.0
+    def _apply(self) -> float:
+        """Apply the estimate if it is significant; return by how much the applied one changed."""
         off = abs(self.estimate - self.applied)
-        self._found = self._found or (
-            self.deviation < SURE and off > max(LEAST, SIGNIFICANT * self.deviation))
-        if not self._found:
+        if self.fixed or not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
             return 0.0
+        self._found = True
         self.before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
         return self.applied - self.before
 
 
-class JointOffsets:
-    """
-    The offsets of several cameras, estimated jointly.
-
-    Each camera's offset also biases the predictions for the others: separate estimates would
-    confuse the offsets of two cameras.
-    """
-
-    def __init__(self, offsets: Sequence[TimeOffset]) -> None:
-        self._offsets = offsets
-        self.restart()
-
-    def restart(self) -> None:
-        """Reset the estimate."""
-        for offset in self._offsets:
-            offset.restart()
-        self._count = 0
-        self._information = np.eye(len(self._offsets)) / PRIOR**2
-        self._weighted = np.array([offset.estimate for offset in self._offsets]) / PRIOR**2
-
-    def begin(self, camera: TimeOffset, name: str, moving: Array) -> None:
-        """Take that a neighbour's track began; see :meth:`TimeOffset.begin`."""
-        for offset in self._offsets:
-            offset.forget(name)
-        camera.begin(name, moving)
-
-    def take(self, camera: TimeOffset, name: str, step: Step, moving: Array) -> list[float]:
-        """Return by how much each applied offset changed; see :meth:`TimeOffset.take`."""
-        if len(self._offsets) == 1:
-            return [camera.take(name, step, moving)]
-        both = np.array([*(offset.follow(name, step, moving if offset is camera else None)
-                           for offset in self._offsets), step.innovation])
-        products = both.dot(cv2.solve(step.spread, both.T)[1])
-        seen, right_side = products[:-1, :-1], products[:-1, -1]
-        applied = np.array([offset.applied for offset in self._offsets])
-        off = np.array([offset.estimate for offset in self._offsets]) - applied
-        camera.watch(float(products[-1, -1] - 2.0 * off.dot(right_side) + off.dot(seen).dot(off))
-                     / len(step.innovation))
-        keep = 1.0 - 1.0 / REMEMBERED
-        self._information = keep * self._information + seen
-        self._weighted = keep * self._weighted + seen.dot(applied) + right_side
-        self._count += 1
-        if self._count % EVERY:
-            return [0.0] * len(self._offsets)
-        for k, offset in enumerate(self._offsets):
-            if offset.fixed:  # known: it explains nothing
-                self._information[k, :] = self._information[:, k] = 0.0
-                self._information[k, k], self._weighted[k] = 1.0, offset.applied
-        spread = np.linalg.inv(self._information)
-        for offset, estimate, variance in zip(
-                self._offsets, spread.dot(self._weighted).tolist(), spread.diagonal().tolist()):
-            offset.know(estimate, 1.0 / variance)
-        return [offset.apply() for offset in self._offsets]
+def _precision(times: Array) -> Array:
+    """Return the inverse covariance (n, n), 1/m^2, of a path with an unknown start, at times."""
+    first, apart = np.minimum(times[:, None], times), np.abs(times[:, None] - times)
+    covariance = NOISE**2 * np.eye(len(times)) + JERK * first**3 * (
+        first**2 / 20.0 + first * apart / 8.0 + apart**2 / 12.0)
+    inverse = np.linalg.inv(covariance)
+    start = np.vander(times, 3)
+    free = inverse @ start
+    precision: Array = inverse - free @ np.linalg.inv(start.T @ free) @ free.T
+    return precision
 
 
 def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
@@ -243,7 +195,7 @@ class MountedCamera:
 
     :param time_offset: estimates the offset of its images' stamps.
     :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
-    :param attitude_noise: of the own attitude as its images show it, at least, rad.
+    :param attitude_noise: of the own attitude as its images show it, before it is learnt, rad.
     :param rectified: whether its images are undistorted already.
     """
 
@@ -261,6 +213,7 @@ class MountedCamera:
     def restart(self, names: Iterable[str]) -> None:
         """Reset all estimates and searches, for neighbours of these names."""
         self.noise.restart()
+        self.time_offset.restart()
         self.searched: float | None = None
         """Stamp of the newest whole image searched, s."""
         self.swept: float | None = None

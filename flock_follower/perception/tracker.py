@@ -61,15 +61,16 @@ from flock_follower.perception.neighbor_filter import (
     NeighborFilter,
     UpdateOutcome,
 )
-from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
+from flock_follower.perception.neighbor_motion import ODOMETRY_WALK, POSITION, VELOCITY
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
-from flock_follower.perception.time_offset import JointOffsets, MountedCamera, TimeOffset
+from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
 MARGIN = 100.0
 #: and otherwise in one of so many.
 MIRRORED_EVERY = 30
+_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -139,7 +140,6 @@ class Tracker:
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
         self._schedule = CameraSchedule(config.neighbors, list(self.cameras.values()))
-        self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
         self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
 
@@ -154,7 +154,6 @@ class Tracker:
         for camera in self.cameras.values():
             camera.restart(self._targets)
         self._schedule.restart()
-        self._offsets.restart()
         self.ranging.restart()
         self._planned: Look | Missing | None = None
 
@@ -215,7 +214,7 @@ class Tracker:
         if len(measured) < look.sought.number:
             self._detect(image, look, measured, others, sighting)
         if self._schedule.sweep_due(look.camera, stamp):
-            found = search.everywhere(image, self.config.dictionary, thorough=False)
+            found = search.everywhere(image, self.config.dictionary)
             self._locate(found, 'full', image, look, measured, others, sighting)
             look.camera.swept = stamp
         sighting.other_ids = sorted(set(sighting.other_ids))
@@ -257,7 +256,7 @@ class Tracker:
         return (own.smooth_pose @ camera.T_body_camera).inverse() @ body
 
     def _view(self, look: Look, delay: float) -> View | Missing:
-        """Return the view of an image's camera so long, s, after the image's stamp."""
+        """Return the view of an image's camera at a delay, s, after the image's stamp."""
         if delay not in look.views:
             own = self._odometry.at(look.stamp + look.camera.time_offset.applied + delay)
             if isinstance(own, Missing):
@@ -276,8 +275,16 @@ class Tracker:
         own = self._odometry.at(stamp) if exposed else view.own
         if isinstance(own, Missing):
             own = view.own
-        _, position, *others = estimate
-        return Estimate(stamp, position + own.correction, *others)
+        # White noise of the own attitude and velocity at the stamp: the filter averages over it.
+        attitude, velocity = self._odometry.white_noise
+        x, y, z = (estimate.position - own.travel).tolist()
+        covariance = estimate.covariance.copy()
+        covariance[POSITION, POSITION] += attitude * np.array(
+            [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
+             [-x * z, -y * z, x * x + y * y]])
+        covariance[_VELOCITIES, _VELOCITIES] += velocity
+        return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
+                                 covariance=covariance)
 
     def _track(self, image: GrayImage,
                look: Look) -> tuple[dict[str, Measurement], list[Measurement]]:
@@ -363,8 +370,9 @@ class Tracker:
             ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
                 if missing():
-                    found = search.everywhere(image, self.config.dictionary, thorough, [
-                        m for name in missing() for m in self._targets[name].neighbor.markers])
+                    found = search.everywhere(image, self.config.dictionary, [
+                        m for name in missing() for m in self._targets[name].neighbor.markers
+                    ] if thorough else None)
                     self._locate(found, 'full', image, look, measured, others, sighting)
                     camera.thorough = not thorough
             sighting.stage, camera.searched = 'full', look.stamp
@@ -438,27 +446,27 @@ class Tracker:
             return
         self._schedule.saw(name, camera, time)
         if not other:
-            self._learn(name, camera, view, T_smooth_body.translation - view.own.travel)
+            self._learn(name, camera, view, look.stamp + delay, measurement)
         sighting.measurements[name] = measurement
         sighting.estimates[name] = self._estimate(name, self._filters[name], look, view)
 
-    def _learn(self, name: str, camera: MountedCamera, view: View, sight: Array) -> None:
-        """Learn clocks and noise from a neighbour's update, its body at ``sight`` (3,), m."""
-        step = self._filters[name].step
-        if step is None:
-            self._offsets.begin(camera.time_offset, name, view.moving(sight))
+    def _learn(self, name: str, camera: MountedCamera, view: View, time: float,
+               measurement: Measurement) -> None:
+        """Learn clock and noise from a neighbour's update with a measurement at a time, s."""
+        change, estimate = self._filters[name].change, self._filters[name].newest
+        if change is not None and estimate is not None:
+            camera.noise.take(*change, estimate.position - view.own.travel)
+        point = measurement.T_camera_body.apply(measurement.reference)
+        shift = camera.time_offset.take(name, time, point, camera.T_body_camera, self._odometry)
+        if not shift:
             return
-        camera.noise.take(step.innovation[:3], step.expected, sight)
-        changes = self._offsets.take(camera.time_offset, name, step, view.moving(sight))
-        if not any(changes):
-            return
-        for each, change in zip(self.cameras.values(), changes):
-            if not change:
-                continue
-            for other, hypotheses in self._hypotheses.items():
-                for track_filter in hypotheses.tracks:
-                    track_filter.shift(change * each.time_offset.following(other))
-            self._schedule.changed(each)
+        camera.noise.restart()
+        for other, hypotheses in self._hypotheses.items():
+            if self._schedule.seen_last_by(other, camera):
+                for each in hypotheses.tracks:
+                    if each.newest is not None:
+                        each.shift(shift * view.moving(each.newest.position - view.own.travel))
+        self._schedule.changed(camera)
 
 
 def _of(name: str, measured: Mapping[str, Measurement],

@@ -166,7 +166,7 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
 
 
 def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
-    """Return the bound that stops it along a unit vector within so much, m."""
+    """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, float(along @ velocity)
     # Until the command acts it goes on as it does.
     speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,

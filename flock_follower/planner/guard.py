@@ -63,7 +63,7 @@ from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
-CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
+CLOSE = 1.75  # m: nearer than this the climb gets what backing off leaves
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
@@ -212,7 +212,7 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
     Without a camera a neighbor seen last may be anywhere: the follower does not back away.
 
     :param velocity: own velocity when the command acts (3,), m/s.
-    :param neighbors: the neighbors at hand in TRACK, else nobody.
+    :param neighbors: the neighbors at hand in TRACK, else none.
     :param blinded: whether no images are processed.
     """
     near = list[Bound]()

@@ -62,7 +62,7 @@ def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | Non
     Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
 
     :param timeout: age at which odometry is not used at all, s.
-    :param before: whether it was too slow up to now.
+    :param before: whether the odometry was too slow before.
     """
     if not spans:
         return None
@@ -186,7 +186,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
 
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
-ACCELERATION_NOISE = 0.35  # m/s^2: an acceleration of a neighbor below this is mostly noise
+ACCELERATION_NOISE = 0.2  # m/s^2: an acceleration of a neighbor below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
 FRESH = 0.12  # s up to which the guard's margin covers what else a neighbor may do

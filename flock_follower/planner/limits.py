@@ -43,6 +43,7 @@ SENT_INSIDE = 1.0 - 2e-7
 
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
+INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``constrained``
 STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
 
 
@@ -227,7 +228,9 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
 
     Where the bounds leave no room they are met one after the other in their order, each as
-    nearly as those before it allow.
+    nearly as those before it allow. Cohesion beyond ``v_max`` is met less: as nearly as the
+    velocity is that is nearest to ``INSISTENCE`` times the correction. To the last bit it would
+    give up all speed across for very little, and switch between the two from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
@@ -253,10 +256,15 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
     vertical, strongest = requested[2], a_max * SENT_INSIDE
     left = float(v[2]) + vertical * period
-    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
-                  complex(*(-v[:2] / period)),
-                  math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period)
-    point = lexicographic(complex(*limit_norm(a, SANE)[:2]), bounds, discs)
+    within = complex(*(-v[:2] / period)), math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period
+    goal = complex(*limit_norm(a, SANE)[:2])
+    for k, (normal, least) in enumerate(bounds):
+        if missed[k] and sides[k][2] == COHESION:
+            step = min(INSISTENCE * (least - product(normal, goal)), SANE) / abs(normal) ** 2
+            reached = Discs(*within, *within).best(goal + step * normal)
+            bounds[k] = normal, min(least, product(normal, reached))
+    point = lexicographic(goal, bounds, Discs(
+        0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within))
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # Those that the command did not keep, and those that hold it where it is now.
     acting = [k for k, (normal, least) in enumerate(bounds)

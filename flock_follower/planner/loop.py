@@ -96,7 +96,7 @@ class PlannerLoop:
         """
         Take, and return, the state that the bridge reports; see ``modes``.
 
-        A pilot who takes over disengages it: it commands again only once it is engaged anew.
+        A pilot's takeover disengages the planner: it commands only after it is engaged again.
 
         :param silence: time since the message before, s.
         """

@@ -44,6 +44,7 @@ from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
+SETTLING = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
@@ -69,18 +70,21 @@ def observed(motions: Mapping[str, SmoothedMotion],
     for n in neighbors:
         last = motions.get(n.name)
         if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
+            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3)
+                                  if n.acceleration is None else n.acceleration)
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
             change = -math.expm1(-elapsed / SMOOTHING) * (n.velocity - last.velocity)
-            last = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
-        updated[n.name] = last if n.acceleration is None else last._replace(
-            acceleration=n.acceleration)
+            acceleration = change / elapsed if n.acceleration is None else (
+                last.acceleration - math.expm1(-elapsed / SETTLING) * (
+                    n.acceleration - last.acceleration))
+            last = SmoothedMotion(n.stamp, last.velocity + change, acceleration)
+        updated[n.name] = last
     return updated
 
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
-NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
+NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
 
 
 class Loss(NamedTuple):
@@ -124,7 +128,7 @@ class Memory(NamedTuple):
     motions: Mapping[str, SmoothedMotion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
-    """See ``Neighborhood``, in the last step that followed somebody; likewise ``edges``."""
+    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
     edges: frozenset[str] = frozenset()
     faced: str = ''
     """The neighbor that it faced then."""
@@ -139,7 +143,7 @@ class Memory(NamedTuple):
     lost: Loss | None = None
     """The loss of the neighbor that it followed, while it lasts."""
     given_up: bool = False
-    """Whether it followed nobody for too long to command anything until it is engaged anew."""
+    """Whether it had no neighbor for too long; then it sends no command until engaged again."""
     begun: float | None = None
     """Time at which it left IDLE, s."""
     home: Array | None = None
@@ -210,7 +214,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        what, before = 'heard estimate' if n.received else 'estimate', kept.get(n.name)
+        what, before = 'received estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped

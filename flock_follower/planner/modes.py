@@ -18,7 +18,7 @@ The planner's states, from the freshness of its inputs.
 =======  ================================================  ===================================
 state    when                                              horizontal command
 =======  ================================================  ===================================
-IDLE     not engaged, or nobody flies the commands         none at all
+IDLE     not engaged, or no vehicle flies the commands     none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
          one received of at most ``heard_timeout``
@@ -85,10 +85,10 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
     :param fault: fault of the own odometry or of perception, or ''.
-    :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
+    :param youngest: age of the youngest estimate of a neighbour in sight, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
-    :param given_up: whether it followed nobody for too long, and must be engaged again.
+    :param given_up: whether it had no neighbour for too long, and must be engaged again.
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the faced neighbour is occluded.
     """
@@ -195,8 +195,8 @@ class ClockWatch:
     """
     Finds steps of the system clock, and messages that were stamped before the last one.
 
-    ``shift`` is by how much the clock was set so far, ns: a stamp less the shift is a time of a
-    clock that goes on evenly.
+    ``shift`` is the sum of all steps of the clock, ns: a stamp minus the shift is the time of a
+    clock without steps.
     """
 
     def __init__(self) -> None:

@@ -60,7 +60,7 @@ def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     return Member(AVOID, known.radius) if duplicate else known
 
 
-RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no faster than this
+RETURN_SPEED = 0.4  # m/s: beyond the margin of an edge the distance returns no faster than this
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ class GuardParams(Checked):
 
     tau: float = parameter(0.5, Range(0.05, 5.0, 's'), 'guard: reaction time', live=True)
     b: float = parameter(
-        1.0, Range(0.1, 10.0, 'm/s^2'),
+        0.2, Range(0.1, 10.0, 'm/s^2'),
         'guard: deceleration with which an approach to an edge is stopped', live=True)
     T_g: float = parameter(
-        0.2, Range(0.02, 2.0, 's'),
+        0.4, Range(0.02, 2.0, 's'),
         "Time in which the distance's rate is brought to its bound, s.")
     m: float = parameter(
-        0.25, Range(0.0, 5.0, 'm'),
+        0.38, Range(0.0, 5.0, 'm'),
         'guard: margin to each edge, at most 0.24 of the width of the band', live=True)
 
     def closing(self, gap: float, b: float | None = None) -> tuple[float, float]:
@@ -215,7 +215,7 @@ class PlannerParams(Checked):
         1.0, Range(0.05, 6.0, 'rad/s'),
         'largest rate of the commanded yaw, and of the turn to it', live=True)
     scan_rate: float = parameter(
-        0.5, Range(0.0, 3.0, 'rad/s'),
+        1.0, Range(0.0, 3.0, 'rad/s'),
         'yaw rate of the search for a neighbor; 0: no search', live=True)
 
     radius: float = parameter(

@@ -75,6 +75,8 @@ from flock_follower.planner.vertical_yaw import (
     turning,
 )
 
+UP = np.array([0.0, 0.0, 1.0])
+
 
 class Decision(NamedTuple):
     """The outcome of one step."""
@@ -131,13 +133,11 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     Return the memory for the next step, and the decision for the time ``now``, s.
 
     :param now: a step back by more than 0.1 s forgets everything.
-    :param engaged: whether commands are wanted.
-    :param own: the newest odometry since the last step, or None.
+    :param engaged: whether commands are wanted; :param own: the newest odometry, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
     :param looked: when the last image was processed, s; None if none was, which is no fault.
     :param waiting: why it may not command although engaged, or what disengaged it, or ''.
-    :param view: fields of view of the cameras; () if unknown.
-    :param ground: height at arming, m, in the frame of the odometry.
+    :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
     :param frames: stamps of the newest processed images, s, in their order.
     """
     last = memory.now
@@ -152,10 +152,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     if memory.own is None or mode.silent:
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
         return memory, Decision(mode.state, mode.reason, rejected=rejected)
-
     me, tracking = at(memory.own, now), mode.state is State.TRACK
-    # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
-    # They are flown with the time constant response_time: part of them since the measurement.
+    # Commands that are not flown yet count as velocity; part was flown since the measurement.
     coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
     neighbors = gathered(memory, me, [at(n, now) for n in memory.neighbors.values()], params,
                          elapsed) if tracking else NOBODY
@@ -165,12 +163,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         lost=_loss(memory, flock, me, tracking, leader, params),
         home=me.position if memory.home is None else memory.home)
-    altitude, vertical = _altitude(
-        memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
-    # The thrust bias only corrects a wrong hover thrust: it does not move the vehicle.
-    bias = np.array([0.0, 0.0, altitude.thrust_bias])
+    altitude, vertical = _altitude(memory, mode, me, neighbors, ground, coming, params, elapsed)
+    bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
-                               me.velocity + coming - bias * params.period, params)
+                               me.velocity + coming - bias * params.period * UP, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -183,12 +179,11 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         leader=last_known(memory, neighbors), looking=leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (
-            command.acceleration - bias))
+            command.acceleration - bias * UP))
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
-        command.reason, rejected,
-        _warnings(memory, mode, me, neighbors, leader, params), float(bias[2]),
+        command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params), bias,
         tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
 
 
@@ -301,8 +296,8 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
                 float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
 
 
-def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bool,
-              ground: float | None, coming: float, params: PlannerParams,
+def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
+              ground: float | None, coming: Array, params: PlannerParams,
               elapsed: float) -> tuple[Altitude, float]:
     """Return the altitude to hold, and the vertical acceleration, m/s^2."""
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
@@ -313,15 +308,15 @@ def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bo
         follows and neighbors.peers) else altitude.following(
         neighbors.level if follows else None, params, elapsed)
     if not params.guard:
-        return altitude.controlled(me, params, elapsed, coming=coming)
+        return altitude.controlled(me, params, elapsed, coming=float(coming[2]))
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
                                if me.stamp - n.stamp <= params.coast_timeout]
     raised = altitude
-    if memory.lost is not None and not blinded:
+    if memory.lost is not None and not mode.blinded:
         above = overflight(memory.lost, me.position, altitude.held, params)
         raised = altitude._replace(held=max(altitude.held, min(above, altitude.highest)))
     controlled, vertical = raised.controlled(
-        me, params, elapsed, *climb_range(near, me, params), coming)
+        me, params, elapsed, *climb_range(near, me, params), float(coming[2]))
     # The climb lasts as long as the loss: the next one begins at the altitude held before.
     return controlled._replace(held=altitude.held), vertical
 
@@ -367,25 +362,19 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
     """Return the yaw to command."""
     if params.yaw_mode != 'leader':
         return last
-    since = -math.inf
-    towards: Array = np.zeros(3)
-    if leader is not None:
-        faced, since = _awaited(leader, me.stamp, params), me.stamp - leader.stamp
-        towards = faced.position - me.position
-    elif faced is None and state is State.SEARCH:
+    if leader is None and faced is not None:
+        return facing(last, me, faced, params, elapsed)
+    if leader is None and state is State.SEARCH:
         # It looks round, anticlockwise.
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
-    elif faced is None:
-        if memory.lost is None:
-            return last
-        since, towards = me.stamp - (memory.followed or 0.0), memory.lost.towards
-        newest = max((n for n in memory.flock.values() if n.member.role != AVOID),
-                     key=lambda n: n.stamp, default=None)
-        faced = None if newest is None else at(newest, me.stamp)
-    since -= params.coast_timeout
-    if since <= 0.0 and faced is not None:
-        return facing(last, me, faced, params, elapsed)
-    return searching(last, math.atan2(towards[1], towards[0]), max(since, 0.0), params, elapsed)
+    n = leader or max((n for n in memory.flock.values() if n.member.role != AVOID),
+                      key=lambda n: n.stamp, default=None)
+    if n is None:
+        return last
+    since = me.stamp - n.stamp - params.coast_timeout
+    there = _awaited(n, me.stamp, params)
+    return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
+        last, me, there, since, params, elapsed)
 
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,

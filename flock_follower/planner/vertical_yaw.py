@@ -139,7 +139,7 @@ class Altitude(NamedTuple):
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
-        :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
+        :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
             lowest and the highest altitude go before.
         :param coming: vertical velocity, m/s, that is commanded and not yet flown.
         """
@@ -195,7 +195,8 @@ YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves
 YAW_LEAD = 0.4  # s: in which a vehicle turns to 63 % of a commanded yaw
 OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
 LOOK_ASIDE = 0.8  # rad to either side of where it was lost, before looking all round
-LOOK_THERE = 1.0  # s for which it is awaited there first
+WIDER = 1.4  # times as far to the other side, until it has looked all round
+LOOK_THERE = 0.5  # s for which it is awaited there first
 
 
 def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
@@ -211,16 +212,23 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
     return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
 
 
-def searching(last: float, lost: float, since: float, params: PlannerParams,
+def searching(last: float, me: OwnState, there: Neighbor, since: float, params: PlannerParams,
               elapsed: float) -> float:
     """
-    Return the yaw that looks where a neighbour was lost, to both sides, then all round.
+    Return the yaw that looks where a neighbour is expected, to both sides, then all round.
 
-    :param lost: direction in which it was lost, rad; :param since: how long it is searched, s.
+    The first side is the one to which the neighbour moved.
+
+    :param there: the neighbour where it is expected; :param since: how long it is searched, s.
     """
-    swept = params.scan_rate * max(since - LOOK_THERE, 0.0)
-    aside = swept if swept < LOOK_ASIDE else 2.0 * LOOK_ASIDE - swept  # and on, clockwise
-    return _turned(last, lost + aside, params, elapsed)
+    x, y, _ = there.position - me.position
+    left = params.scan_rate * max(since - LOOK_THERE, 0.0)
+    aside, end = 0.0, math.copysign(LOOK_ASIDE, x * there.velocity[1] - y * there.velocity[0])
+    while left > abs(end - aside):
+        left -= abs(end - aside)
+        aside, end = end, -WIDER * end
+    aside += math.copysign(left, end - aside)
+    return _turned(last, math.atan2(y, x) + aside, params, elapsed)
 
 
 def turning(before: float, commanded: float, me: OwnState, params: PlannerParams,

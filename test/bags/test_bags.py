@@ -21,7 +21,6 @@ import shutil
 import subprocess
 import sys
 
-import cv2
 from full_disk import disk_of
 import numpy as np
 import pytest
@@ -34,7 +33,6 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from flock_follower.bags.bag import BagError, deserialize, open_bag, serialize, typestore
 from flock_follower.bags.writer import BagWriter
 
-REAL = Path(__file__).parents[3] / 'shared' / 'data' / 'real'
 START = 1_700_000_000_000_000_000
 STRING = 'std_msgs/msg/String'
 MIGRATED = [
@@ -418,27 +416,6 @@ def test_bytes_damaged_in_the_middle_never_raise_anything_else(tmp_path):
                 assert '\n' not in str(error)
                 noticed += 1
         assert noticed == 25, file.name
-
-
-@pytest.mark.parametrize(('name', 'infos', 'height'), [
-    ('ubiq_aruco_images.bag', 15, 960), ('ubiq_aruco_marker.bag', 1, 720)])
-def test_real_ros1_bags_hold_a_jpeg_and_its_camera_info(name, infos, height):
-    path = REAL / name
-    if not path.exists():
-        pytest.skip(f'{path} is not there')
-    with open_bag(path) as bag:
-        assert {t.name: (t.msgtype, t.count) for t in bag.topics.values()} == {
-            '/raspicam_node/image/compressed': ('sensor_msgs/msg/CompressedImage', 1),
-            '/raspicam_node/camera_info': ('sensor_msgs/msg/CameraInfo', infos)}
-        [image] = bag.messages(['/raspicam_node/image/compressed'])
-        jpeg = deserialize(image.data, image.msgtype)
-        assert jpeg.header.frame_id == 'raspicam'
-        assert cv2.imdecode(np.asarray(jpeg.data), cv2.IMREAD_GRAYSCALE).shape == (height, 1280)
-        for message in bag.messages(['/raspicam_node/camera_info']):
-            info = deserialize(message.data, message.msgtype)
-            assert (info.width, info.height) == (1280, height)
-            assert info.distortion_model == 'plumb_bob' and len(info.d) == 5
-            assert info.k[8] == 1.0 and 1000 < info.k[0] < 1300
 
 
 def test_damaged_messages_raise_a_bag_error_and_pixels_are_not_copied():

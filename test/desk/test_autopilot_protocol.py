@@ -47,12 +47,6 @@ def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
     assert (answer.param_id, answer.param_type, encoded) == (name, kind, value)
 
 
-@BOTH
-def test_unknown_parameters_are_not_answered(personality):
-    flight = Flight(personality)
-    assert ask(flight, 'NO_SUCH_THING') == []
-
-
 def test_a_parameter_can_be_set_and_takes_effect():
     flight = Flight('arducopter')
     answers = flight.send(mavlink.MAVLink_param_set_message(1, 1, b'GUID_TIMEOUT', 0.5, 9))

@@ -173,18 +173,6 @@ def test_outages_silence_odometry_and_hide_the_leader(camera):
         assert frame.usable == (not (1.2 <= time < 1.6 or 0.5 <= time < 0.9))
 
 
-def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says(camera):
-    slow = VioErrors(rate=20.0, latency=(0.03, 0.03))
-    flown = Commanded(camera, odometry=slow).fly(1.0, look=False)
-    stamps, arrivals = (np.array([o[k] for o in flown.odometry]) for k in (0, 1))
-    np.testing.assert_array_equal(np.diff(stamps[1:]), 50_000_000)
-    np.testing.assert_array_equal(arrivals - stamps, 30_000_000)
-    for stamp, _, state in flown.odometry[-5:]:
-        assert state.time == pytest.approx(stamp * 1e-9)
-    at_once = Commanded(camera).fly(1.0, look=False).odometry
-    assert [arrival - stamp for stamp, arrival, _ in at_once] == [0] * 100
-
-
 def test_light_changes_blind_for_as_long_as_the_scenario_says():
     changing = ScenarioRun(scenario(sensing=Sensing(light_changes=30.0)), 3)
     assert len(changing.light_changes) > 3

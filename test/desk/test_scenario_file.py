@@ -33,6 +33,18 @@ leader:
 """
 
 
+NAMES = """approach bobbing circle duplicate_marker fast_approach fast_leader fast_random_walk
+fast_spline fast_stairs figure_eight flock_line flock_line_all_round flock_ring
+flock_ring_all_round flock_wedge flock_wedge_all_round handover hidden_coming hidden_stop hover
+hover_noisy indoor latency marker_lost_1s marker_lost_5s narrow_circle narrow_figure_eight
+narrow_hover narrow_toward occluded outdoor overhead random_walk range_only_5s restart shuttle
+spline stairs stop straight toward vio_lost worst_case"""
+
+
+def test_the_package_has_these_scenarios() -> None:
+    assert names() == NAMES.split()
+
+
 @pytest.mark.parametrize('name', names())
 def test_every_scenario_of_the_package_is_valid_and_says_what_it_is(name: str) -> None:
     scenario = load(name)
@@ -87,6 +99,23 @@ def test_a_wrong_file_is_told_with_line_and_what_is_allowed(change: tuple[str, s
     with pytest.raises(ScenarioError) as error:
         parse(text, 'x.yaml')
     assert str(error.value).startswith(message)
+
+
+VARIANTS = GOOD + """variants:
+  windy: {summary: with wind, wind: {speed: 2}, leader: {repeat: true}}
+"""
+
+
+def test_a_variant_differs_in_the_keys_that_it_has(tmp_path: Path) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text(VARIANTS)
+    base, windy = load(str(path)), load(f'{path}:windy')
+    assert windy == replace(base, name='windy', summary='with wind', wind=replace(
+        base.wind, speed=(2.0, 2.0)), leader=replace(base.leader, repeat=True))
+    with pytest.raises(ScenarioError, match=r'mine\.yaml: has no variant calm, only windy'):
+        load(f'{path}:calm')
+    with pytest.raises(ScenarioError, match=r'x\.yaml:8: variants\.windy\.wind\.sped: unknown'):
+        parse(VARIANTS.replace('speed', 'sped'), 'x.yaml', 'windy')
 
 
 @pytest.mark.parametrize('text', ['', '# nothing', 'just text', '- a\n- b'])

@@ -74,6 +74,14 @@ def test_the_formations_of_the_package_keep_apart_and_together(name: str) -> Non
     assert not runs['lost'].any()
 
 
+def test_followers_that_start_too_far_apart_gather() -> None:
+    flights = fly(replace(HOVER, duration=20.0, flock=Flock(3, spacing=4.0)), [50], True)
+    band = np.sqrt([flights.scenario.flight.d0, flights.scenario.flight.d1])
+    assert np.all(flights.farthest[:, 0] > band[1] + 1.0)
+    assert np.all(flights.farthest[:, -1] < band[1])
+    assert np.nanmin(flights.nearest) > band[0]
+
+
 def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
     flock = replace(HOVER, duration=12.0, leader=LeaderMotion('wander', speed=(0.3, 0.3)),
                     flock=Flock(3, 'wedge', fails=FollowerFailure(2, 4.0, 4.0)))

@@ -183,7 +183,7 @@ def test_whose_poses_stall_is_told_and_what_is_missing(two):
             assert stalled == ''  # the leader's may be late
         elif 0.17 + LONGEST_GAP * 1e-9 < missing < LATE - 0.03:
             assert stalled == 'poses of the leader come too far apart: no image between them'
-    assert stalled.startswith('no pose of the leader for 0.9 s: no image: PX4 is heard')
+    assert stalled.startswith('no pose of the leader for 0.9 s: no image: PX4 is connected')
     assert 'odometry' not in stalled and vehicles.gone(now) == ''
     stalled = vehicles.stalled(now + LATE + 0.1, flown)
     assert stalled.startswith('no pose of the vehicle for 0.6 s: no image, no odometry: ')

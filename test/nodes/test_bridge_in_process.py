@@ -360,7 +360,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     bench.node._report._start -= 4.0
     found = bench.problems()
     for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
-                 'mavlink_bridge/offboard asks for offboard'):
+                 'mavlink_bridge/offboard to request offboard'):
         assert part in found
     bench.receive()
     bench.odometry(yaw=0.0)
@@ -373,7 +373,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     last = bench.node._report._last.setpoint
     bench.node._report.cycle(
         Cycle(last._replace(kind=COMMAND), False, None), time.monotonic())
-    assert 'no setpoint has left for 1.0 s' in bench.problems(ahead=1.0)
+    assert 'no setpoint was sent for 1.0 s' in bench.problems(ahead=1.0)
     assert 'autopilot lost on' in bench.problems(ahead=60.0)
 
 

@@ -88,7 +88,7 @@ def test_a_flight_by_keys_and_every_way_to_end_it(desk: Processes) -> None:
         before = first.until(f'press {key} for {step}')  # it is armed and in the air already
         assert 'press a' not in before and 'press t' not in before
         first.press(key)
-    first.until('it follows')
+    first.until('the follower flies')
     first.until('ACTIVE   TRACK   leader ')
     os.close(first.keyboard)  # the terminal is gone
     assert first.process.wait(DEADLINE) != 0
@@ -96,7 +96,7 @@ def test_a_flight_by_keys_and_every_way_to_end_it(desk: Processes) -> None:
     desk.wait_for_log('planner', 'disengaged: no more commands')
 
     second = Terminal(desk, '--yes')
-    second.until('it follows')
+    second.until('the follower flies')
     second.press('l')
     second.until('land: ')
     second.process.send_signal(signal.SIGTERM)  # the landing goes on

@@ -176,7 +176,7 @@ def acceleration(command: MultiDOFJointTrajectory) -> Any:
 
 def test_silence_of_neighbors_is_a_fault_only_if_no_image_is_processed(rig: Rig) -> None:
     rig.run(0.1)
-    time.sleep(2.1)
+    rig.wait(lambda: rig.reports('no /neighbors for '))
     rig.run(0.1, None)  # images without a leader in them
     assert not rig.reports('no /neighbors for ')
     assert rig.reports('no /neighbors for ', ahead=2.6)
@@ -250,7 +250,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     rig.send('camera_info', CameraInfo(width=640, height=480, k=np.zeros(9)))
     rig.fly()
     assert counters['invalid camera_info'] == 1
-    rig.wait(lambda: rig.reports('no /camera_info: flies without regard'))
+    rig.wait(lambda: rig.reports('no /camera_info: flies without bounds'))
     rig.send('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
     place = PointStamped()
     place.point.z = 0.4

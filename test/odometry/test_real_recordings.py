@@ -78,10 +78,10 @@ def test_the_velocity_from_the_positions_is_near_that_of_the_messages() -> None:
 def test_tags_on_walls_seen_in_flight_come_out_at_rest_though_images_are_stamped_late() -> None:
     offset = TimeOffset()
     found = seen_tags(recorded(FLIGHT), source_of(FLIGHT).take, time_offset=offset, shift=0.05)
-    assert offset.estimate == pytest.approx(0.004 - 0.05, abs=0.002)
+    assert offset.estimate == pytest.approx(0.004 - 0.05, abs=0.003)
     assert offset.deviation < 0.001
     assert len(found) > 1100
-    assert velocity_rms(found) < 0.13  # while the offset is learnt
+    assert velocity_rms(found) < 0.1  # while the offset is learnt
     assert scatter(found) < 0.08  # its odometry corrects itself by 29 cm meanwhile
 
 

@@ -26,8 +26,6 @@ from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import marker_corners
 
-THREE_WINDOWS = aruco.DetectionParams(windows=(3, 23, 10), min_perimeter=0.03)
-
 
 def poses(distance: float, count: int) -> list[Transform]:
     """Return poses of a marker at a distance, m, all over the image and turned by up to 30 deg."""
@@ -50,8 +48,7 @@ def test_corners_are_good_enough_for_the_edges_to_be_found_from_them(
         distance: float, trouble: dict[str, float]) -> None:
     camera = make_camera()
     for k, pose in enumerate(poses(distance, 4)):
-        found = aruco.detect(render(camera, {3: pose}, rays=3, seed=k, **trouble), DICTIONARY,
-                             THREE_WINDOWS)
+        found = aruco.detect(render(camera, {3: pose}, rays=3, seed=k, **trouble), DICTIONARY)
         assert found.ids.tolist() == [3]
         assert np.abs(found.corners[0] - true_corners(camera, pose)).max() < 2.0
 

@@ -129,6 +129,18 @@ def test_contrast_must_be_enough_and_the_border_black() -> None:
     assert not shows_code(image, places(code), code)
 
 
+@pytest.mark.parametrize(('white', 'hidden', 'is_shown'), [
+    (200, 3, True), (200, 4, True), (200, 5, False), (255, 3, False)])
+def test_a_reflex_may_hide_some_cells_unless_paper_is_saturated_as_well(
+        white: int, hidden: int, is_shown: bool) -> None:
+    code, cells = code_of(5), aruco.marker_code(DICTIONARY, 5)
+    image = picture(cells, white=white)
+    for k in np.flatnonzero(code.bits < 0.0)[:hidden]:
+        column, row = (code.grid[k] + AROUND) * PX
+        image[row:row + PX, column:column + PX] = 255
+    assert shows_code(image, places(code), code) == is_shown
+
+
 def shaded(image: GrayImage, direction: float, offset: float, light: float) -> GrayImage:
     """Return an image half of which lies in shade, from ``offset`` cells past the middle on."""
     v, u = np.mgrid[:image.shape[0], :image.shape[1]] - (len(image) - 1) / 2.0

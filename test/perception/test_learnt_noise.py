@@ -12,15 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The noise of measurements, learnt from innovations: its size, its direction, its limits."""
+"""Noise learnt from innovations: of measurements its size, direction and limits; of motion."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_motion import LEARNT, LearntNoise
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception.learnt_noise import LEARNT, LearntMotion, LearntNoise
+from flock_follower.perception.neighbor_filter import NeighborFilter
 
 SIGHT = np.array([1.2, -1.6, 0.0])  # 2 m away
 ALONG, ACROSS = SIGHT / 2.0, np.array([0.8, 0.6, 0.0])
@@ -33,8 +34,13 @@ def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1
     learnt, rng = LearntNoise(0.0005), np.random.default_rng(seed)
     for _ in range(count):
         true = np.linalg.cholesky(BASE + covariance(attitude, distance))
-        learnt.take(true @ rng.standard_normal(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+        learnt.take(np.sqrt(2.0) * true @ rng.standard_normal(3), expected(learnt), SIGHT)
     return learnt
+
+
+def expected(learnt: LearntNoise) -> Array:
+    """Return the covariance of the difference of two measurements, (3, 3)."""
+    return 2.0 * (BASE + learnt.covariance(SIGHT)[:3, :3])
 
 
 def covariance(attitude: float, distance: float) -> Array:
@@ -58,14 +64,14 @@ def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
 
 def test_a_single_slip_does_not_make_it_large() -> None:
     learnt = fed(0.0005, 0.0)
-    learnt.take(0.5 * ACROSS, BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+    learnt.take(0.5 * ACROSS, expected(learnt), SIGHT)
     assert learnt.attitude < 0.001
 
 
 def test_it_is_forgotten_where_it_ends() -> None:
     learnt = fed(0.005, 0.01)
     for _ in range(5 * LEARNT):
-        learnt.take(np.zeros(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+        learnt.take(np.zeros(3), expected(learnt), SIGHT)
     assert learnt.attitude < 0.001
     assert learnt.distance < 0.001
     learnt.restart()
@@ -80,3 +86,58 @@ def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
     np.testing.assert_allclose(added[3:, 3:], noise.attitude**2 * np.eye(3))
     # Turned about +z, what is at SIGHT moves along z x SIGHT.
     assert added[:3, 5] == pytest.approx(noise.attitude**2 * np.cross(UP, SIGHT))
+
+
+def flown(period: float, seed: int, seconds: float = 12.0) -> tuple[LearntNoise, float]:
+    """
+    Follow a neighbour that changes its speed by 1 m/s, at 2 m/s^2, every ``period`` s.
+
+    Return the noise learnt of measurements that err by 1 mm, and the mean NEES of the velocity.
+    """
+    rng, dt, learnt, tracker = np.random.default_rng(seed), 1.0 / 30.0, LearntNoise(0.0005), (
+        NeighborFilter())
+    noise, nees = np.diag([0.001] * 3 + [0.01] * 3)**2, []
+    place, velocity = SIGHT, np.array([0.5, 0.0, 0.0])
+    for k in range(round(seconds / dt)):
+        t = k * dt
+        forward = int(t / period) % 2 == 0
+        wanted = 0.5 if forward else -0.5
+        before = velocity
+        velocity = velocity + np.array([1.0, 0.0, 0.0]) * np.clip(
+            wanted - velocity[0], -2.0 * dt, 2.0 * dt)
+        place = place + 0.5 * dt * (before + velocity)
+        measured = Transform(np.eye(3), place + rng.normal(0.0, 0.001, 3))
+        tracker.update(t, measured, np.zeros(3), noise)
+        if tracker.change is not None:
+            learnt.take(*tracker.change, place)
+        if t > 2.0 and tracker.newest is not None:
+            error = tracker.newest.velocity - velocity
+            nees.append(error @ np.linalg.solve(tracker.newest.covariance[3:6, 3:6], error))
+    return learnt, float(np.mean(nees))
+
+
+def test_a_manoeuvre_is_no_noise_of_the_measurements() -> None:
+    tracker, noise, changes = NeighborFilter(), np.diag([0.001] * 3 + [0.01] * 3)**2, []
+    for k in range(90):
+        ahead = 2.0 + 1.0 * max(k / 30.0 - 1.0, 0.0)**2  # from 1 s on at 2 m/s^2
+        tracker.update(k / 30.0, Transform(translation=np.array([ahead, 0.0, 0.0])), np.zeros(3),
+                       noise)
+        if tracker.change is not None:
+            changes.append(float(np.abs(tracker.change.difference).max()))
+    assert 0.0 < max(changes) < 0.003  # m; the innovations are up to 0.011
+    learnt, _ = flown(2.0, 1)
+    assert learnt.attitude < 0.0005
+    assert learnt.distance < 0.0005
+
+
+@pytest.mark.parametrize('period', [2.0, 1000.0])
+def test_the_velocity_errs_as_its_covariance_says(period: float) -> None:
+    assert 0.3 < np.mean([flown(period, seed)[1] for seed in range(3)]) < 4.5
+
+
+def test_a_neighbour_unseen_may_do_more_than_it_did() -> None:
+    learnt = LearntMotion()
+    for k in range(300):  # it follows every single error: too fast
+        learnt.take(1.0 / 30.0, np.full(3, (-1)**k * 1e-3), 1e-6 * np.eye(3))
+    assert max(learnt.scale(1.0 / 30.0)) < 1.0
+    assert learnt.scale(1.0) == [1.0] * 3

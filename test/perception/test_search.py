@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import cv2
 from marker_images import DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
 import pytest
@@ -64,11 +65,12 @@ def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,
 def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) -> None:
     camera = make_camera(width=width, height=480)
     pose = facing((0.14 * width / 640 * 1.6, -0.1, 1.2), (0.1, 0.3, 0.2))
-    found = search.everywhere(render(camera, {3: pose}, rays=3), DICTIONARY, thorough)
+    found = search.everywhere(render(camera, {3: pose}, rays=3), DICTIONARY,
+                              LEADER.markers if thorough else None)
     assert found.ids.tolist() == [3]
     errors = found.corners[0] - corners_of(camera, pose)
-    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.0)
-    assert np.abs(errors.mean(axis=0)).max() < 0.35
+    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.5)
+    assert np.abs(errors.mean(axis=0)).max() < (0.35 if width < search.LARGE else 0.7)
 
 
 @pytest.mark.parametrize('place', [
@@ -97,13 +99,20 @@ def test_at_the_rim_of_the_image_what_is_left_of_the_region_is_searched(
     assert np.abs(found.corners[0] - corners_of(CAMERA, inside)).max() < 1.5
 
 
+#: Where the middle of the light is: as far from the marker's, in side lengths.
+REACH = {'shadow': (-0.3, 0.3), 'reflex': (-0.3, 0.3), 'spot': (-0.5, 0.5)}
+
+
 def in_uneven_light(image: GrayImage, pose: Transform, seed: int, kind: str) -> GrayImage:
-    """Return an image in which a marker is half in the shade, or reflects the sun."""
+    """Return an image in which a marker is half in the shade, or the sun is reflected on it."""
     random, outline = np.random.default_rng(seed), corners_of(CAMERA, pose)
     side = np.linalg.norm(outline[0] - outline[1])
-    x, y = outline.mean(axis=0) + random.uniform(-0.3, 0.3, 2) * side
+    x, y = outline.mean(axis=0) + random.uniform(*REACH[kind], 2) * side
     rows, columns = np.mgrid[:image.shape[0], :image.shape[1]]
-    if kind == 'reflex':
+    if kind == 'spot':
+        far = ((columns - x)**2 + (rows - y)**2) / (random.uniform(0.1, 0.2) * side)**2
+        light = image + 400.0 * np.exp(-far**4)
+    elif kind == 'reflex':
         far = ((columns - x)**2 + (rows - y)**2) / (random.uniform(0.25, 0.5) * side)**2
         light = image + random.uniform(80.0, 200.0) * np.exp(-0.5 * far)
     else:
@@ -113,21 +122,35 @@ def in_uneven_light(image: GrayImage, pose: Transform, seed: int, kind: str) -> 
     return np.clip(light, 0.0, 255.0).astype(np.uint8)
 
 
-@pytest.mark.parametrize('kind, least', [('shadow', 6), ('reflex', 8)])
+@pytest.mark.parametrize('kind, least', [('shadow', 7), ('reflex', 9), ('spot', 9)])
 def test_a_thorough_search_reads_a_marker_in_uneven_light(kind: str, least: int) -> None:
     found = []
     for seed in range(10):
         pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * seed))
         image = in_uneven_light(render(CAMERA, {3: pose}), pose, seed, kind)
-        detections = search.everywhere(image, DICTIONARY, True, LEADER.markers)
+        detections = search.everywhere(image, DICTIONARY, LEADER.markers)
         found.append(detections.ids.tolist() == [3] and np.abs(
             detections.corners[0] - corners_of(CAMERA, pose)).max() < 3.0)
     assert sum(found) >= least
 
 
-@pytest.mark.parametrize('kind', ['shadow', 'reflex'])
+@pytest.mark.parametrize('kind', ['shadow', 'reflex', 'spot'])
 def test_no_other_marker_in_uneven_light_is_taken_for_the_one_sought(kind: str) -> None:
     for other in range(4, 14):
         pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * other))
         image = in_uneven_light(render(CAMERA, {other: pose}), pose, other, kind)
-        assert 3 not in search.everywhere(image, DICTIONARY, True, LEADER.markers).ids
+        assert 3 not in search.everywhere(image, DICTIONARY, LEADER.markers).ids
+
+
+@pytest.mark.parametrize('bitten', [
+    [], [(20, 20, 18)], [(110, 60, 22)], [(110, 110, 20)], [(65, 20, 15), (110, 20, 10)]])
+def test_an_outline_is_whole_although_reflexes_hide_a_corner_and_parts_of_sides(
+        bitten: list[tuple[int, int, int]]) -> None:
+    image = np.full((140, 150), 190, dtype=np.uint8)
+    image[20:111, 20:111] = 30
+    for x, y, radius in bitten:
+        cv2.circle(image, (x, y), radius, 255, -1)
+    corners = np.array([[20.0, 20.0], [110.0, 20.0], [110.0, 110.0], [20.0, 110.0]])
+    errors = [np.abs(np.roll(outline, k, axis=0) - corners).max()
+              for outline in search.quadrilaterals(image) for k in range(4)]
+    assert min(errors) < 2.0

@@ -220,9 +220,9 @@ def searches(monkeypatch: pytest.MonkeyPatch, drone: Hovering) -> list[tuple[flo
     done: list[tuple[float, bool]] = []
     everywhere = tracker_module.search.everywhere
 
-    def watched(image: GrayImage, dictionary: str, thorough: bool, *markers: Any) -> Any:
-        done.append((drone.stamp, thorough))
-        return everywhere(image, dictionary, thorough, *markers)
+    def watched(image: GrayImage, dictionary: str, markers: Any = None) -> Any:
+        done.append((drone.stamp, markers is not None))
+        return everywhere(image, dictionary, markers)
 
     monkeypatch.setattr(tracker_module.search, 'everywhere', watched)
     return done

@@ -30,7 +30,7 @@ from flock_follower.planner.bounds import Edges, radial_bounds
 from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import Bound, COHESION, limit_command, SEPARATION
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.params import GuardParams
+from flock_follower.planner.params import GuardParams, RETURN_SPEED
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()
@@ -156,13 +156,13 @@ def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: 
 
 def test_beyond_the_margin_the_distance_returns_slowly() -> None:
     assert PARAMS.closing(-0.1)[0] == pytest.approx(-0.2)
-    assert PARAMS.closing(-1.0)[0] == -0.3
+    assert PARAMS.closing(-1.0)[0] == -RETURN_SPEED
 
 
 def test_bounds_are_those_of_the_formula() -> None:
     p, w, its = np.array([-1.5, 0.0, 0.0]), np.array([0.3, 0.4, 0.0]), np.array([0.5, 0.0, 0.0])
     lower, upper = bounds(p, w, its)
-    near, far = 1.5 - 1.0 - 0.25, math.sqrt(8.0) - 0.25 - 1.5
+    near, far = 1.5 - 1.0 - PARAMS.m, math.sqrt(8.0) - PARAMS.m - 1.5
     common, rate = -0.5 - 0.4 ** 2 / 1.5, -0.3
     (speed, slope), (far_speed, far_slope) = PARAMS.closing(near), PARAMS.closing(far)
     assert lower.least == pytest.approx(common - (rate + speed) / PARAMS.T_g - slope * rate)
@@ -174,7 +174,7 @@ def test_bounds_are_those_of_the_formula() -> None:
 def test_the_slope_is_the_derivative_of_the_closing_speed(gap: float, tau: float,
                                                           b: float) -> None:
     params, step = GuardParams(tau=tau, b=b), 1e-7
-    corners = 0.0, -0.3 * tau  # where the slope itself, or the speed, changes at once
+    corners = 0.0, -RETURN_SPEED * tau  # where the slope itself, or the speed, changes at once
     assume(all(abs(gap - corner) > 1e-5 for corner in corners))
     rise = params.closing(gap + step)[0] - params.closing(gap - step)[0]
     assert params.closing(gap)[1] == pytest.approx(rise / (2.0 * step), rel=1e-3, abs=1e-5)

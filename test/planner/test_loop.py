@@ -130,6 +130,32 @@ def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
             loop.memory.neighbors['leader'].position_covariance, SURE[:3, :3])
 
 
+@pytest.mark.parametrize(('std', 'known'), [(0.49, True), (0.51, False), (np.nan, False)])
+def test_the_yaw_of_a_neighbour_is_known_up_to_a_deviation(std: float, known: bool) -> None:
+    loop, covariance = engaged(), SURE.copy()
+    covariance[5, 5] = std**2
+    loop.take_odometry(own(START), START)
+    loop.take_neighbor(leader(START, covariance=covariance))
+    loop.tick(START, PARAMS)
+    assert (loop.memory.neighbors['leader'].yaw is not None) == known
+
+
+def test_only_a_seen_neighbour_has_an_acceleration_and_the_faced_one_the_distance() -> None:
+    loop = engaged()
+    assert loop.distance() is None
+    accelerates = leader(START)._replace(acceleration=np.array([0.3, 0.0, 0.0]))
+    reported = accelerates._replace(child='peer', position=np.array([0.0, 1.6, 2.0]))
+    loop.take_odometry(own(START), START)
+    loop.take_neighbor(accelerates)
+    loop.take_neighbor(reported, received=True)
+    loop.tick(START, PARAMS)
+    known = loop.memory.neighbors
+    np.testing.assert_array_equal(known['leader'].acceleration, accelerates.acceleration)
+    assert known['peer'].acceleration is None or not np.any(known['peer'].acceleration)
+    assert loop.memory.faced == 'leader'
+    assert loop.distance() == ('leader', pytest.approx(2.5, abs=0.01))  # though the peer is nearer
+
+
 def watched(loop: PlannerLoop, now: int) -> Decision:
     return fly(loop, now, seen=now)[0]
 

@@ -69,7 +69,7 @@ def test_it_does_not_catch_up_in_height_beside_a_closing_one_that_it_lost() -> N
     for _ in range(16):
         follower.tick()
         assert follower.velocity[0] < -0.42  # 0.29 where it sank at 0.3 m/s
-        assert abs(follower.velocity[2]) < 0.1
+        assert abs(follower.velocity[2]) < 0.13
 
 
 def test_where_it_shall_not_retreat_it_stays() -> None:
@@ -93,7 +93,7 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
     assert spreads == pytest.approx(reached * (np.maximum(blind, 0.0) - 0.5 * reached))
 
 
-@pytest.mark.parametrize(('reported', 'least', 'most'), [(0.1, 0.0, 0.001), (0.35, 0.17, 0.18),
+@pytest.mark.parametrize(('reported', 'least', 'most'), [(0.05, 0.0, 0.001), (0.2, 0.09, 0.11),
                                                      (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
 def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(reported: float, least: float,
                                                                      most: float) -> None:

@@ -110,8 +110,7 @@ def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_bac
         along.append(commanded(decision)[0])
     assert states == [State.TRACK] * 5 + [State.COAST] * 15 + [State.HOLD] * 9
     # The longer it is out of sight the more places it may be in: out of its way.
-    assert np.all(np.array(along[5:7]) == 0.0)
-    assert np.all(np.array(along[7:20]) < 0.0)
+    assert np.all(np.array(along[5:20]) < 0.0)
     assert np.all(np.array(along[20:]) < -0.5 * 0.3 / PARAMS.brake_time_constant)
     memory, decision = step(memory, 3.0, True, own(3.0), [leader(2.97)], PARAMS)
     assert (decision.state, decision.stamp) == (State.TRACK, 2.97)
@@ -335,7 +334,7 @@ def test_a_change_of_parameters_and_seeing_again_make_no_jump() -> None:
 def test_the_guard_acts_at_once_while_the_law_is_being_faded_in() -> None:
     near = leader(0.0, (1.1, 0.0, 2.0), (-0.3, 0.0, 0.0))
     decision = decide(0.0, near)
-    assert commanded(decision)[0] == pytest.approx(-PARAMS.a_max)
+    assert commanded(decision)[0] < -1.5
     assert 'separation' in decision.limits
 
 

@@ -29,14 +29,16 @@ import numpy as np
 import pytest
 from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
+from flock_follower import check
 from flock_follower.bags import mcap_file
-from flock_follower.bags.bag import open_bag, serialize
+from flock_follower.bags.bag import deserialize, open_bag, serialize, typestore
 from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
-from flock_follower.checks.observations import Observations
+from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 
@@ -110,6 +112,42 @@ def test_an_unknown_message_type_leaves_the_rest_of_the_recording_in_the_report(
     with open_bag(tmp_path / 'recording' / 'last_minute') as part:
         assert (part.topics.keys(), part.duration_ns) == ({'/pose'}, 60_000_000_000)
         assert not part.incomplete
+
+
+def test_a_report_of_a_long_recording_holds_its_end(tmp_path: Path) -> None:
+    array, string, second = 'diagnostic_msgs/msg/DiagnosticArray', 'std_msgs/msg/String', 10**9
+    with BagWriter(tmp_path / 'bag', ['/planner/state']) as writer:
+        for time in range(0, 401, 10):
+            message = empty(array)
+            message.status = [typestore().types['diagnostic_msgs/msg/DiagnosticStatus'](
+                0, 'planner', f'at {time} s', '', [])]
+            writer.write('/diagnostics', array, time * second, serialize(message, array))
+        for time, state in ((1, 'IDLE'), (9, 'TRACK')):
+            message = empty(string)
+            message.data = state
+            writer.write('/planner/state', string, time * second, serialize(message, string))
+    main([str(tmp_path / 'bag'), '--report', str(tmp_path / 'report.zip')])
+    with zipfile.ZipFile(tmp_path / 'report.zip') as archive:
+        archive.extractall(tmp_path)
+        assert json.loads(archive.read('diagnostics.json'))['planner']['message'] == 'at 400 s'
+    with open_bag(tmp_path / 'recording' / 'last_minute') as part:
+        found = [(m.topic, m.stamp_ns // second) for m in part.messages()]
+        (state,) = part.messages(['/planner/state'])
+        assert deserialize(state.data, string).data == 'TRACK'
+    assert found[0] == ('/planner/state', 340)
+    assert found[1:] == [('/diagnostics', time) for time in range(340, 401, 10)]
+
+
+def test_a_report_of_a_running_system_holds_the_recording_of_its_black_box(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen = Observations(statuses={
+        'a/black_box': NodeStatus(0, '', {'recording': str(SAMPLE)})})
+    monkeypatch.setattr(check, '_observe', lambda options: (seen, []))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))  # without a recording in the default folder
+    for namespace, there in (('a', True), ('b', False)):
+        main(['--report', str(tmp_path / namespace), '--namespace', namespace])
+        with zipfile.ZipFile(tmp_path / namespace) as archive:
+            assert any('last_minute' in name for name in archive.namelist()) is there
 
 
 def of(topic: str, edit: Callable[[Any], None]) -> Change:
@@ -200,7 +238,19 @@ def test_the_axes_of_an_imu_are_named_unless_they_are_configured(
     config = configured(tmp_path, f'odom_child_rpy: {list(map(float, IMU_RPY))}')
     _, found = checked(capsys, bag, '--config', config)
     assert found['odom up']['level'] == found['odom ahead']['level'] == 'ok'
-    assert_told(found, ('error', 'camera time offset', '50 ms earlier', 'exposure'))
+    assert_told(found, ('error', 'camera time offset', 'ms earlier', 'exposure'))
+
+
+def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def longer(message: Any) -> None:
+        message.k = message.k * np.array([1.2, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0, 1.0, 1.0])
+    bag = excerpt(tmp_path / 'bag', 12.0, of('/camera_info', longer))
+    config = configured(tmp_path, 'camera_rpy: [0.0, 0.1745, 0.0]')
+    code, found = checked(capsys, bag, '--config', config)
+    assert code == 1
+    assert_told(found, ('error', 'focal length', '0.8', 'this lens'))
+    assert_told(found, ('error', 'camera mounting', 'looks higher', 'camera_rpy:=['))
 
 
 def test_topics_are_taken_by_the_names_they_have(
@@ -243,7 +293,8 @@ def test_the_table_is_narrow_and_ends_with_the_verdict(
     assert lines[-1].startswith('not usable as it is: 1 error, 1 warning, ')
     assert main([str(SAMPLE)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        'usable: 0 errors, 0 warnings, 19 ok, 2 not measured (marker size, camera mounting)')
+        'usable: 0 errors, 0 warnings, 20 ok, 3 not measured (odom positions, marker size, '
+        'camera mounting)')
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [

@@ -216,12 +216,12 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
     assert_told(found, 'command/trajectory', '2 publishers', 'end all but one')
     assert_told(found, 'mavlink_bridge/state QoS', '/planner receives nothing: /stand_in',
                 'QoS of /stand_in')
-    assert_told(found, 'odom wiring', 'planner does not listen to /vio/odom',
+    assert_told(found, 'odom wiring', 'planner does not subscribe to /vio/odom',
                 '-r odom:=/vio/odom')
     assert_told(found, 'odom_child_rpy', '[-1.5708, 0.0, -1.5708] in relative_pose', '/**')
-    assert_told(found, 'parameter file', 'holds parameters for /planners', 'sections')
+    assert_told(found, 'parameter file', 'holds parameters for /planners', 'section')
     assert_told(found, 'parameter file', f'{other}: holds no parameters for /planner, only '
-                'for /camera', 'sections')
+                'for /camera', 'section')
     assert_told(found, 'parameter file', 'relative_pose has not taken it: max_wait is 0.35',
                 '--params-file')
 

@@ -32,6 +32,7 @@ import numpy as np
 import pytest
 
 from flock_desk import figures
+from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.runs import paper_plots
 from flock_desk.runs.paper_plots import distance, positions, styled, WIDTH
 from flock_desk.runs.record import last_flight, LiveRecord, read_flown, scenario_flown, set_aside
@@ -62,7 +63,8 @@ def redrawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, F
         return save(figure, path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_plots, 'save', keep)
-        assert figures.main(['--out', str(out), '--flights', str(out / 'none')]) == 0
+        assert figures.main(['--out', str(out), '--flights', str(out / 'none'),
+                             '--campaign', str(out / 'none.json')]) == 0
         for dim in '23':
             assert figures.main(['--out', str(out / 'flocks'), '--agents', '9', '--dim', dim,
                                  '--duration', '1']) == 0
@@ -263,6 +265,28 @@ def test_flights_are_drawn_twice_the_same_or_how_to_fly_them_is_said(
         assert path.read_bytes() == (tmp_path / 'again' / path.name).read_bytes()
     page = (tmp_path / 'once' / 'indoor_distance.pdf').read_bytes()
     assert b'/FontFile2' in page and b'/Type3' not in page  # as publishers want them
+
+
+def test_controllers_are_compared_at_each_v_max_by_the_scenarios_that_all_flew(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flown(v_max: float, jerk: float) -> dict[str, float]:
+        return {'max_speed_m_s': 0.9 * v_max, 'max_speed_share': 0.9, 'in_band': 0.5,
+                'horizontal_jerk_m_s3': jerk}
+    path, drawn = tmp_path / 'flights.json', list[Figure]()
+    path.write_text(json.dumps({
+        'one': dict.fromkeys(figures.CONTROLLERS, flown(0.5, 1.0)), 'flock': {'law': {}},
+        'two': dict.fromkeys(figures.CONTROLLERS, flown(0.5, 2.0)),
+        'fast': dict.fromkeys(figures.CONTROLLERS, flown(2.0, 3.0))}))
+    monkeypatch.setattr(paper_plots, 'save',
+                        lambda figure, path: drawn.append(figure) or path.name)
+    assert figures.redraw_controllers(tmp_path, path) == (['controllers'], [])
+    slow, fast = drawn[0].axes
+    assert [line.get_xydata().tolist() for line in slow.lines] == [[[1.5, 50.0]]] * 5
+    assert fast.get_title(loc='left') == '$v_{max}$ = 2 m/s'
+    assert set(CONTROLLERS) == set(figures.CONTROLLERS)
+    missing = tmp_path / 'missing.json'
+    assert figures.redraw_controllers(tmp_path, missing) == (
+        [], [f'controllers: not drawn, {missing} does not have them: make flights'])
 
 
 def test_a_flight_that_cannot_be_read_is_an_error_after_all_else(

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 
 from flock_desk.fly import cautions, main
+from flock_desk.runs.column import column_figures, spacing
 from flock_desk.runs.flight import (
     ended_by_bridge,
     External,
@@ -37,7 +38,7 @@ from flock_desk.runs.frame_errors import COLUMNS
 from flock_desk.runs.judge import flat, judge, nearest, scenario_bounds
 from flock_desk.runs.processes import free_udp_port, Processes
 from flock_desk.runs.record import LiveRecord, read_flown
-from flock_desk.runs.summary import column_figures, scenario_figures, spacing
+from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import Outage, Scenario
 from flock_desk.scenarios.scenario_file import load
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flock_desk.runs import frame_errors
 from flock_desk.runs.frame_errors import COLUMNS, FrameErrors
 from flock_follower.geometry import (
     Array,
@@ -106,6 +107,15 @@ def test_errors_as_large_as_the_covariances_say_have_a_nees_of_three() -> None:
     for i, axis in enumerate('xyz'):
         np.testing.assert_allclose(table[f'velocity_sigma_{axis}'], VELOCITY_SIGMA[i])
         assert np.std(table[f'position_{axis}']) == pytest.approx(POSITION_SIGMA[i], rel=0.1)
+
+
+def test_a_long_flight_is_compared_in_batches_to_the_same_figures(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = collected(100, noise=1.0)
+    monkeypatch.setattr(frame_errors, 'BATCH', 30)
+    monkeypatch.setattr(frame_errors, 'LATE', 7)
+    for name, column in collected(100, noise=1.0).items():
+        np.testing.assert_array_equal(column, whole[name])
 
 
 def test_a_wrong_attitude_is_an_angle() -> None:

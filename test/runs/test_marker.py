@@ -24,15 +24,13 @@ import subprocess
 import sys
 
 import cv2
-from marker_images import make_camera, render, SIDE
 import numpy as np
 import pytest
 import yaml
 
 from flock_desk.marker import main
-from flock_desk.runs.marker_pages import Box, draw, entry, layout, Page, PAGES, panel_entry
-from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
-from flock_follower.odometry.buffer import OdometrySample
+from flock_desk.runs.marker_pages import Box, draw, layout, Page, PAGES
+from flock_follower.geometry import Array
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
@@ -40,7 +38,6 @@ from flock_follower.perception.markers import (
     dictionary_size,
     marker_cells,
 )
-from flock_follower.perception.tracker import camera_mounting, Tracker
 
 POINT = 25.4 / 72.0  # mm
 NUMBER = r'(-?[\d.]+)'
@@ -289,53 +286,3 @@ def test_the_print_holds_the_markers_where_the_entry_says(
     np.testing.assert_allclose(smallest.T_body_marker.translation, [-0.2, 0.0, 0.0])
     for x, y, w, h in drawing.boxes:
         assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
-
-
-CAMERA = make_camera()
-MOUNTING = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
-PANEL = neighbors.parse(yaml.safe_load(panel_entry(layout('DICT_4X4_50', [0, 1], [0.3, 0.06]))))
-SINGLE = neighbors.parse(yaml.safe_load(entry('DICT_4X4_50', [0], 0.16)))
-
-
-def misplaced(config: neighbors.NeighborConfig, distance: float, aside: float,
-              up: float) -> Array | None:
-    """
-    Return by how much the leader is misplaced, (3,), m; None where it is not seen.
-
-    :param distance: of its tail before the camera, m; ``aside`` and ``up``, as shares of that,
-        how far off the middle of the image.
-    """
-    leader = Transform(translation=np.array([0.3, 0.0, 0.0]) + distance * np.array(
-        [1.0, aside, up]))
-    image = np.full((CAMERA.height, CAMERA.width), 255, dtype=np.uint8)
-    for marker in config.neighbors[0].markers:
-        pose = MOUNTING.inverse() @ leader @ marker.T_body_marker
-        # A marker half as large looks the same at half the distance.
-        scaled = Transform(pose.rotation, pose.translation * (SIDE / marker.side_length))
-        alone = render(CAMERA, {marker.marker_id: scaled}, rays=3, noise=0.0, black=30.0,
-                       white=200.0)
-        empty = render(CAMERA, {}, rays=3, noise=0.0)
-        image = np.where(alone != empty, alone, image)
-    image = np.where(image == 255, empty, image)
-    tracker = Tracker(config, MOUNTING)
-    for stamp in (0.98, 1.0, 1.02):
-        tracker.feed_odometry(OdometrySample(
-            stamp, np.zeros(3), IDENTITY_QUATERNION, np.zeros(3), np.zeros(3)))
-    estimate = tracker.process_image(1.0, image, CAMERA).estimates.get('leader')
-    return None if estimate is None else estimate.position - leader.translation
-
-
-@pytest.mark.parametrize(('distance', 'aside', 'up', 'error'), [
-    (0.3, 0.2, -0.17, 0.003), (1.4, 0.1, 0.0, 0.01),
-    (8.0, 0.1, 0.1, 0.1)])
-def test_a_panel_is_seen_from_near_and_far(distance: float, aside: float, up: float,
-                                           error: float) -> None:
-    off = misplaced(PANEL, distance, aside, up)
-    assert off is not None and np.linalg.norm(off) < error
-
-
-@pytest.mark.parametrize(('distance', 'aside', 'up'), [(0.3, 0.2, -0.17), (12.0, 0.1, 0.1)])
-def test_one_marker_is_not(distance: float, aside: float, up: float) -> None:
-    assert misplaced(SINGLE, distance, aside, up) is None
-    off = misplaced(SINGLE, 1.4, aside, up)
-    assert off is not None and np.linalg.norm(off) < 0.01

@@ -54,10 +54,6 @@ def decoded(bag, topic):
     return [deserialize(m.data, m.msgtype) for m in bag[topic]]
 
 
-def stamps(messages):
-    return np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages])
-
-
 def vector(v):
     return np.array([v.x, v.y, v.z])
 
@@ -68,56 +64,12 @@ def poses(messages):
         for m in messages]
 
 
-def velocities(messages):
-    """Return how fast they move, (N, 3), in odom."""
-    return np.array([pose.rotation @ vector(m.twist.twist.linear)
-                     for pose, m in zip(poses(messages), messages)])
-
-
-def quantisation_tables(jpeg):
-    """Return the quantisation table (64,) of a grey JPEG."""
-    start = bytes(jpeg).index(b'\xff\xdb') + 5
-    return np.frombuffer(bytes(jpeg), np.uint8, 64, start)
-
-
 def test_the_bag_is_small_and_holds_what_it_should(bag):
     size = sum(file.stat().st_size for file in resource('bags/sample').iterdir())
     assert size <= 12_000_000
     assert {topic: len(messages) for topic, messages in bag.items()} == TOPICS
     assert {bag[topic][0].msgtype for topic in TOPICS if 'odom' in topic or 'truth' in topic} == {
         'nav_msgs/msg/Odometry'}
-
-
-def test_images_are_grey_jpegs_of_quality_80_or_better(bag):
-    reference = cv2.imencode('.jpg', np.zeros((8, 8), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    for message in decoded(bag, '/image_raw/compressed')[::30]:
-        assert message.format == 'jpeg'
-        assert np.all(quantisation_tables(message.data) <= quantisation_tables(reference))
-        image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED)
-        assert image.shape == (480, 640)
-        assert image.std() > 25 and 90 < image.mean() < 170  # well exposed, full of contrast
-
-
-def test_the_true_flight_keeps_1_2_to_2_6_m_and_accelerates_up_to_1_m_s2(bag):
-    follower, leader = (decoded(bag, t) for t in ('/truth/odom', '/truth/neighbors'))
-    offsets = [a.translation - b.translation for a, b in zip(poses(leader), poses(follower))]
-    distances = np.linalg.norm(offsets, axis=1)
-    assert 1.2 < distances.min() < 1.4 and 2.5 < distances.max() < 2.6
-    a = np.linalg.norm(np.diff(velocities(leader), axis=0) * 30.0, axis=1)
-    assert 0.85 < a.max() <= 1.0
-    moved = np.diff([p.translation for p in poses(leader)], axis=0) * 30.0
-    np.testing.assert_allclose(moved, (velocities(leader)[1:] + velocities(leader)[:-1]) / 2,
-                               atol=0.001)
-
-
-def test_odometry_drifts_from_the_truth_by_no_more_than_a_good_estimator(bag):
-    odom, truth = decoded(bag, '/odom'), decoded(bag, '/truth/odom')
-    at = np.searchsorted(stamps(odom), stamps(truth))
-    errors = np.array([a.translation - b.translation for a, b in zip(
-        poses([odom[k] for k in at]), poses(truth))])
-    assert np.linalg.norm(errors[:30], axis=1).max() < 0.1
-    assert 0.01 < np.linalg.norm(errors[-1]) < 0.3
-    assert odom[-1].pose.covariance[0] > odom[0].pose.covariance[0] > 0.0
 
 
 def test_the_marker_is_mounted_as_the_default_configuration_says():

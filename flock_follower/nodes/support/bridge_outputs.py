@@ -39,7 +39,7 @@ from flock_follower.nodes.support.publisher_thread import PublisherThread
 
 # Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PLACE_TIMEOUT = 1.0  # s: with odometry older than this nobody knows where it was armed
+PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
 
 

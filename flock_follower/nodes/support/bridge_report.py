@@ -341,8 +341,8 @@ class BridgeReport:
             return None
         bridge, setpoint = self._bridge, self._last.setpoint
         if now - self._stuck_since > STUCK:
-            return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
-                           f'{bridge.link.transport.url} takes none')
+            return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
+                           f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not (
             bridge.requests.takeoff_explains_mode(now))
@@ -350,20 +350,20 @@ class BridgeReport:
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if silent else WARN
-            return level, (f'no setpoints are sent: {permission.reason}; the service '
-                           'mavlink_bridge/offboard asks for offboard')
+            return level, (f'no setpoints are sent: {permission.reason}; call '
+                           'mavlink_bridge/offboard to request offboard')
         if setpoint.kind == NONE and not bridge.withheld():
             return ERROR, f'no setpoints are sent: {setpoint.reason}'
         if setpoint.kind in (COMMAND, NONE) or not bridge.gate.flies:
             return None
         if setpoint.kind == LEVEL:
-            return ERROR, f'flying blind and level: {setpoint.reason}, and no other velocity'
+            return ERROR, f'only level setpoints: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
         reason = self._bridge.gate.permission.reason
         if reason.startswith(TWO_COMMAND):
-            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
+            return ERROR, f'{reason}; the bridge brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 

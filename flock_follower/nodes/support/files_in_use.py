@@ -55,7 +55,7 @@ def _ours() -> Iterator[tuple[str, Path, list[str]]]:
         try:
             words = command.read_bytes().decode(errors='replace').split('\0')
         except OSError:
-            continue  # ended meanwhile, or somebody else's
+            continue  # ended meanwhile, or of another user
         for node in OURS:
             if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
                 yield node, command.parent, words

@@ -107,8 +107,8 @@ class FlockNode(ValidatedNode):
         """
         Add an entity that the executor waits for, as rclpy does; QoS events once a second.
 
-        Each topic, in or out, has two such events, of incompatible nodes, which are rare. To wait
-        for all of them took a third of the time of every wait.
+        Each publisher and subscription has two QoS events, which report incompatible nodes and
+        are rare. Waiting for all these events took a third of the time of every wait.
         """
         if isinstance(waitable, EventHandler):
             waitable.callback_group = self._events

@@ -1,0 +1,82 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The controllers that flights are compared by, in place of the law and with or without the guard.
+
+Each flies the same planner, limits, altitude and yaw. Without the guard they have no bounds:
+
+- the two predecessors of the law, see ``flocking``;
+- a PD servo, the controller that one would write without this package: it keeps the middle of the
+  band, u = P (r - r_m) n + D (v_L - v_F), with P = 2 1/s^2 and D = 3 1/s. Of the gains tried (1 to
+  4 1/s^2, 2 to 4 1/s) the quieter ones lose a leader that reverses.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.flocking import accelerations, FlockingParams, Model
+from flock_follower.geometry import Array
+
+PROPORTIONAL, DERIVATIVE = 2.0, 3.0  # 1/s^2 and 1/s
+
+
+class PdServo(FlockingParams):
+    """Keeps the middle of the band to each neighbor."""
+
+    def command(self, offsets: Array, differences: Array) -> Array:
+        distance = np.linalg.norm(offsets, axis=1, keepdims=True)
+        error = distance - (math.sqrt(self.d0) + math.sqrt(self.d1)) / 2.0
+        towards = offsets / np.maximum(distance, 1e-6)
+        total: Array = np.sum(PROPORTIONAL * error * towards + DERIVATIVE * differences, axis=0)
+        return total
+
+
+class CuckerSmale(FlockingParams):
+    """Alignment alone."""
+
+    def command(self, offsets: Array, differences: Array) -> Array:
+        return _of_model('cucker_smale', offsets, differences, self)
+
+
+class CuckerDong(FlockingParams):
+    """The law without cohesion."""
+
+    def command(self, offsets: Array, differences: Array) -> Array:
+        return _of_model('cucker_dong', offsets, differences, self)
+
+
+class Controller(NamedTuple):
+    """A controller, and whether the guard bounds its commands."""
+
+    law: type[FlockingParams]
+    guard: bool = False
+
+
+#: Those that flocks fly, too.
+IN_FLOCKS = 'law', 'guard'
+#: By key of flights.json.
+CONTROLLERS = {'law': Controller(FlockingParams), 'guard': Controller(FlockingParams, True),
+               'pd': Controller(PdServo), 'cucker_smale': Controller(CuckerSmale),
+               'cucker_dong': Controller(CuckerDong)}
+
+
+def _of_model(model: Model, offsets: Array, differences: Array, params: FlockingParams) -> Array:
+    positions, velocities = (np.vstack([np.zeros((1, each.shape[1])), each])
+                             for each in (offsets, differences))
+    return accelerations(positions, velocities, params, model)[0]

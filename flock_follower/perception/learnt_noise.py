@@ -1,0 +1,165 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Noise learnt from innovations in flight: of the measurements, and of a neighbour's motion.
+
+If both are right, the innovations of a Kalman filter are white, of the expected covariance. An
+unmodelled motion makes successive innovations alike. An error of the measurements, white from
+image to image, does not. So half the square of the difference of two successive innovations shows
+the noise of the measurements, and their mean over ``MEAN_TIME`` shows the motion (Mehra, "On the
+identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control, 1970).
+
+``LearntNoise``: across the line of sight, the noise is the error of the own attitude, which moves
+a neighbour sideways: errors of the odometry, of its interpolation and of the camera's stamps.
+Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
+shutter, a bent print, motion blur.
+
+``LearntMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
+follow the motion of a neighbour and the errors of the own velocity.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from flock_follower.geometry import Array, skew
+
+#: Number of innovations over which the noise is learnt; initial count of innovations.
+LEARNT = 120
+FIRST = 15
+#: The square of an innovation is limited to this many times its variance.
+LIMIT = 16.0
+#: Largest value that is used, rad, and as share of the distance.
+MOST = 0.05
+#: Lower limit of the variance of the attitude, as share of the initial one.
+LEAST = 0.04
+_LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
+
+
+class LearntNoise:
+    """
+    The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
+
+    :param initial: initial value for the attitude, rad; the distance starts at 0.
+    """
+
+    def __init__(self, initial: float) -> None:
+        self._initial = initial**2
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset the estimates."""
+        self._across, self._along = self._initial, 0.0
+        self._count = FIRST
+
+    @property
+    def attitude(self) -> float:
+        """Return the noise of the own attitude, one standard deviation, rad."""
+        return math.sqrt(self._across)
+
+    @property
+    def distance(self) -> float:
+        """Return the noise of the distance, one standard deviation, a share of it."""
+        return math.sqrt(self._along)
+
+    def covariance(self, sight: Array) -> Array:
+        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
+        # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
+        # by e x r, and tilts it by e.
+        leverage = _LEVERAGE.copy()
+        leverage[:3] = skew(-sight)
+        covariance: Array = leverage.dot(self._across * leverage.T)
+        if self._along:
+            covariance[:3, :3] += self._along * sight[:, None] * sight
+        return covariance
+
+    def take(self, change: Array, expected: Array, sight: Array) -> None:
+        """
+        Take the change of a position's innovation: the fields of ``neighbor_filter.Change``.
+
+        :param sight: from the own vehicle to the neighbour (3,), m.
+        """
+        # In plain numbers: for every image, and so small.
+        (x, y, z), (u, v, w) = sight.tolist(), change.tolist()
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = expected.tolist()
+        squared = x * x + y * y + z * z
+        along = (x * u + y * v + z * w)**2 / squared
+        variance = (x * x * xx + y * y * yy + z * z * zz
+                    + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
+        across, across_variance = u * u + v * v + w * w - along, xx + yy + zz - variance
+        self._count = min(self._count + 1, LEARNT)
+        # Two axes across, each off by the noise times the distance, in two innovations.
+        for_attitude = _excess(across, across_variance) / (4.0 * squared * self._count)
+        for_distance = _excess(along, variance) / (2.0 * squared * self._count)
+        self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
+        self._along = min(max(self._along + for_distance, 0.0), MOST**2)
+
+
+def _excess(squared: float, expected: float) -> float:
+    return min(squared, LIMIT * expected) - expected
+
+
+#: Time constants, s: of the mean innovation, of the noise that it is compared with, and of the
+#: learnt motion.
+MEAN_TIME: Final = 0.25
+NOISE_TIME: Final = 2.0
+MOTION_TIME: Final = 2.0
+#: Limit of the surplus of one image; limits of the factor.
+STRONGEST: Final = 4.0
+FACTORS: Final = (0.05, 16.0)
+#: After a longer gap, s, the mean restarts, and the factor is at least 1: ``FilterParams`` holds.
+GAP: Final = 0.3
+
+
+class LearntMotion:
+    """Factors of the spectral densities of a neighbour's motion, for each axis of odom."""
+
+    def __init__(self) -> None:
+        self.factors = [1.0] * 3
+        self._means = [0.0] * 3
+        self._noises = [1.0] * 3
+        self._before = [0.0] * 3
+        self._share = 0.0  # variance of the means if innovations are white, of variance 1
+
+    def scale(self, dt: float) -> list[float]:
+        """Return by what to multiply the covariance that dt, s, adds, by axis."""
+        least = 0.0 if abs(dt) <= GAP else 1.0
+        return [max(factor, least) for factor in self.factors]
+
+    def take(self, dt: float, innovation: Array, expected: Array) -> None:
+        """
+        Take an innovation of the position (3,), m, and its expected covariance (3, 3).
+
+        :param dt: time since the innovation before, s.
+        """
+        if dt > GAP:
+            self._share, self._means = 0.0, [0.0] * 3
+        weight = min(dt / MEAN_TIME, 0.5)
+        self._share = (1.0 - weight)**2 * self._share + weight**2
+        variances = expected.diagonal().tolist()
+        for k, (off, variance) in enumerate(zip(innovation.tolist(), variances)):
+            off = min(max(off / math.sqrt(variance), -STRONGEST), STRONGEST)
+            if dt <= GAP:
+                self._noises[k] += min(dt / NOISE_TIME, 1.0) * (
+                    0.5 * (off - self._before[k])**2 - self._noises[k])
+            self._before[k] = off
+            self._means[k] += weight * (off - self._means[k])
+            surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - 1.0
+            factor = self.factors[k] * math.exp(
+                min(dt, GAP) / MOTION_TIME * min(surplus, STRONGEST))
+            self.factors[k] = min(max(factor, FACTORS[0]), FACTORS[1])
