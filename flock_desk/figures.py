@@ -167,17 +167,17 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
     """
     from flock_desk.runs import paper_plots as plots
     results = json.loads(path.read_text()) if path.exists() else {}
-    def mean(figure: str, key: str, group: list[tuple[float, str]]) -> float:
-        return float(np.mean([results[name][key][figure] for _, name in group]))
-
     flown = sorted((round(each['law']['max_speed_m_s'] / each['law']['max_speed_share'], 3), name)
                    for name, each in results.items() if CONTROLLERS.keys() <= each.keys())
     if not flown:
         return [], [f'controllers: not drawn, {path} does not have them: make flights']
-    means = {v_max: {title: (mean('horizontal_jerk_m_s3', key, group), mean('in_band', key, group))
-                     for key, title in CONTROLLERS.items()}
-             for v_max, group in ((v, list(of_v)) for v, of_v in groupby(
-                 flown, lambda each: each[0]))}
+    means = dict[float, dict[str, tuple[float, float]]]()
+    for v_max, group in groupby(flown, lambda each: each[0]):
+        names = [name for _, name in group]
+        means[v_max] = {title: (
+            float(np.mean([results[name][key]['horizontal_jerk_m_s3'] for name in names])),
+            float(np.mean([results[name][key]['in_band'] for name in names])))
+            for key, title in CONTROLLERS.items()}
     return [plots.save(plots.controllers(means), out / 'controllers')], []
 
 

@@ -147,8 +147,6 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
             folder, f'flock_follower on the desk: {title}', scenario.summary, summary, bounds,
             partial(_pictures, folder, flight), warnings=cautions(summary))
     print()
-    for warning in (warning for each in summaries.values() for warning in cautions(each)):
-        print(f'warning: {warning}', file=sys.stderr)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
@@ -157,7 +155,10 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
             scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
             partial(column_chapters, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
-    return announce(summary, judgements, pages, out)
+    code = announce(summary, judgements, pages, out)
+    for warning in (warning for each in summaries.values() for warning in cautions(each)):
+        print(f'warning: {warning}', file=sys.stderr)
+    return code
 
 
 def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:

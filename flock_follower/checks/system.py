@@ -84,7 +84,7 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
     if machine.idle is not None:
         yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
                      f'{machine.idle:.0%} of {machine.processors} cores left',
-                     f'{IDLE:.0%} or more left',
+                     f'{IDLE:.0%} or more left, at least {NONE_IDLE:.0%}',
                      'end programs that are not needed (rviz, recordings), or reduce the load of '
                      'the odometry')
     if machine.shares_memory:

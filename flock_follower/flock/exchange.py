@@ -151,11 +151,13 @@ class Sharing:
         """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
         name = sender_of(state.frame)
         if not name:
-            return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
-                                f'NAME{FRAME}, where NAME is the sending vehicle')
+            return self._refuse(
+                'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
+                f'NAME{FRAME}, where NAME is the sending vehicle')
         if name == self.name:
             if _key(state) not in self._echoes:  # else an own message that came back
-                self._refuse('somebody uses my name', f'{name} sends {state.child[:70]!r}')
+                self._refuse('another vehicle uses this name',
+                             f'{name} sends {state.child[:70]!r}')
             return None
         sender = self.senders.get(name)
         if refused := refusal(state, received):
@@ -164,18 +166,18 @@ class Sharing:
             return self._refuse(*refused)
         if sender is None:
             if len(self.senders) >= SENDERS_MAX:
-                return self._refuse('too many tellers', name)
+                return self._refuse('too many senders', name)
             sender = self.senders[name] = Sender(name)
         sender.received = received
         if why := sender.banned(received):
-            return self._refuse('not listened to for a while', f'{name} {why}')
+            return self._refuse('ignored for a while', f'{name} {why}')
         return self._take_from(sender, state, received)
 
     def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:
         """Take a valid message of a sender."""
         of_itself, before = state.child == sender.name, sender.states.get(state.child)
         if before is not None and state.stamp <= before.stamp:
-            return self._refuse('word out of order', f'{sender.name} sends {state.child}')
+            return self._refuse('message out of order', f'{sender.name} sends {state.child}')
         if before is None and len(sender.states) >= SEEN_MAX:
             return self._refuse('too many vehicles', f'{sender.name} sends {state.child}')
         leap = '' if before is None else leapt(before, state)

@@ -180,7 +180,7 @@ VAGUE = 25.0
 AGES, SLOW = 50, 0.25
 Refusal = tuple[str, str]
 #: Refusal after which a sender is ignored for a while: all its stamps are wrong.
-FUTURE = 'word from the future'
+FUTURE = 'message from the future'
 
 
 def sender_of(frame: str) -> str:
@@ -211,16 +211,16 @@ def refusal(state: OdometryState, received: int) -> Refusal | None:
     """Return why a message of another vehicle, received at a time, ns, is refused, or None."""
     sender, age = sender_of(state.frame), (received - state.stamp) / NANOSECONDS
     if not NAME.fullmatch(state.child):
-        return 'word of a vehicle without a name', f'{sender}: child_frame_id {state.child[:70]!r}'
+        return 'message of an unnamed vehicle', f'{sender}: child_frame_id {state.child[:70]!r}'
     if problem := too_fast(state):
-        return f'word {problem[0]}', f'{sender}: {problem[1]}'
+        return f'message {problem[0]}', f'{sender}: {problem[1]}'
     if age < -CLOCK_TOLERANCE:
         return FUTURE, (
-            f'{sender}: by {-age:.3f} s: its clock is ahead by that at least')
+            f'{sender}: stamped {-age:.3f} s in the future: its clock is ahead by at least that')
     if age > MESSAGE_AGE_MAX:
-        return 'word too old', (f'{sender}: {age:.2f} s: its clock is behind, or the way is slow')
+        return 'message too old', f'{sender}: {age:.2f} s: its clock is behind, or the way is slow'
     known = state.child == sender or is_covariance(state.pose_covariance[:3, :3])
-    return None if known else ('word without a covariance', f'{sender} sends {state.child}')
+    return None if known else ('message without a covariance', f'{sender} sends {state.child}')
 
 
 #: Odometry that is further from its prediction than this, m or rad, has jumped ...
@@ -291,7 +291,7 @@ class Sender:
         """Return a warning if all of its last messages were old on reception, or ''."""
         least = min(self.ages, default=0.0)
         return '' if least < SLOW else (
-            f'words are {least:.2f} s old or more: a slow way, or its clock is behind')
+            f'messages are {least:.2f} s old or more: a slow way, or its clock is behind')
 
     def leapt_at(self, received: int) -> None:
         """Note a leap of its odometry."""

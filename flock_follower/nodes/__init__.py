@@ -82,7 +82,7 @@ def _shut_down_context() -> None:
 
 def _runs_as_a_program() -> bool:
     path = Path(sys.argv[0] if sys.argv else '')
-    return (path.name == '-m' or path.parent.name == 'flock_follower'
+    return (path.name == '-m' or path.parent.name in ('flock_follower', 'flock_desk')
             or Path(__file__).with_name(f'{path.name}.py').exists())
 
 

@@ -101,7 +101,7 @@ class TimeOffset:
         known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
         if self._found:
             return f'{known}, applied'
-        return f'{known}, not applied: {1e3 * self.applied:.1f} ms is'
+        return f'{known}, not applied; {1e3 * self.applied:.1f} ms is applied'
 
     def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
              odometry: OdometryBuffer) -> float:

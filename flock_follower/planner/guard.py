@@ -63,7 +63,7 @@ from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
-CLOSE = 1.7  # m: nearer than this the climb gets what backing off leaves
+CLOSE = 1.75  # m: nearer than this the climb gets what backing off leaves
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...

@@ -43,7 +43,7 @@ SENT_INSIDE = 1.0 - 2e-7
 
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
-INSISTENCE = 4.0  # of cohesion beyond ``v_max``: see ``constrained``
+INSISTENCE = 10.0  # of cohesion beyond ``v_max``: see ``constrained``
 STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
 
 

@@ -44,7 +44,7 @@ from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
-SETTLING = 0.2  # s in which an estimated acceleration is followed: two thirds of its noise go
+SETTLING = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
@@ -214,7 +214,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
-        what, before = 'heard estimate' if n.received else 'estimate', kept.get(n.name)
+        what, before = 'received estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
         outside, old = far(n, me), jumped is not None and n.stamp < jumped

@@ -79,7 +79,7 @@ class GuardParams(Checked):
         0.4, Range(0.02, 2.0, 's'),
         "Time in which the distance's rate is brought to its bound, s.")
     m: float = parameter(
-        0.35, Range(0.0, 5.0, 'm'),
+        0.38, Range(0.0, 5.0, 'm'),
         'guard: margin to each edge, at most 0.24 of the width of the band', live=True)
 
     def closing(self, gap: float, b: float | None = None) -> tuple[float, float]:

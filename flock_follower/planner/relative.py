@@ -41,9 +41,9 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.vertical_yaw import Altitude, facing, turning
 
-#: Largest acceleration, m/s^2; the gate has the same limit. Vertically less: the altitude must not
-#: take what keeps the distance.
-ACCELERATION_MAX, VERTICAL_MAX = 1.0, 0.6
+#: Largest acceleration, m/s^2; the gate has the same limit. The altitude must not take what keeps
+#: the distance: so much vertically, and besides what offsets an error of the thrust.
+ACCELERATION_MAX, VERTICAL_MAX, CLIMB_MAX = 1.0, 1.0, 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
@@ -114,7 +114,8 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     disturbance = (memory.disturbance or Disturbance()).observed(
         (me.velocity - there.velocity)[:2], memory.command, elapsed, params.response_time)
     command = limited(
-        level(me, memory.pending, leader, others, params) - disturbance.acceleration, vertical,
+        level(me, memory.pending, leader, others, params) - disturbance.acceleration, min(
+            max(vertical, altitude.thrust_bias - CLIMB_MAX), altitude.thrust_bias + CLIMB_MAX),
         memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last

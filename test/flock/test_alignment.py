@@ -119,7 +119,7 @@ def test_a_liar_is_refused_and_harms_nobody_else() -> None:
 def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
     flock = flown(Conditions('line', 0, attitude_std=0.03,
                              clocks={'follower_2': 0.2, 'follower_3': -0.3}), 5.0)
-    assert flock.events['word from the future'] > 50
+    assert flock.events['message from the future'] > 50
     now = flock.stamp(flock.time, '')
     status = flock.sharing['follower_1'].status(now)
     slow = {s.name: s.slow for s in status}

@@ -102,21 +102,21 @@ def test_own_words_that_come_back_are_no_impostors() -> None:
         sharing.take_message(word, EPOCH)
     assert reasons(sharing) == []
     sharing.take_message(state('f1/odom', 'f1', EPOCH + MS), EPOCH + MS)
-    assert reasons(sharing) == ['somebody uses my name']
+    assert reasons(sharing) == ['another vehicle uses this name']
 
 
 @pytest.mark.parametrize(('word', 'received', 'reason'), [
-    (state(frame='odom'), EPOCH, 'frame of a word is not unique'),
-    (state(frame='/odom'), EPOCH, 'frame of a word is not unique'),
-    (state(frame='a/b/odom'), EPOCH, 'frame of a word is not unique'),
-    (state(child=''), EPOCH, 'word of a vehicle without a name'),
-    (state(velocity=(0, math.inf, 0)), EPOCH, 'word not finite, or too fast'),
-    (state(velocity=(60, 0, 0)), EPOCH, 'word not finite, or too fast'),
-    (state(child=LEADER, variance=0.0), EPOCH, 'word without a covariance'),
-    (state(child=LEADER, variance=-1.0), EPOCH, 'word without a covariance'),
-    (state(child=LEADER, variance=math.nan), EPOCH, 'word without a covariance'),
-    (state(), EPOCH - 25 * MS, 'word from the future'),
-    (state(), EPOCH + 1100 * MS, 'word too old'),
+    (state(frame='odom'), EPOCH, 'frame of a message is not unique'),
+    (state(frame='/odom'), EPOCH, 'frame of a message is not unique'),
+    (state(frame='a/b/odom'), EPOCH, 'frame of a message is not unique'),
+    (state(child=''), EPOCH, 'message of an unnamed vehicle'),
+    (state(velocity=(0, math.inf, 0)), EPOCH, 'message not finite, or too fast'),
+    (state(velocity=(60, 0, 0)), EPOCH, 'message not finite, or too fast'),
+    (state(child=LEADER, variance=0.0), EPOCH, 'message without a covariance'),
+    (state(child=LEADER, variance=-1.0), EPOCH, 'message without a covariance'),
+    (state(child=LEADER, variance=math.nan), EPOCH, 'message without a covariance'),
+    (state(), EPOCH - 25 * MS, 'message from the future'),
+    (state(), EPOCH + 1100 * MS, 'message too old'),
 ])
 def test_a_word_that_cannot_be_is_refused_by_its_reason(
         word: OdometryState, received: int, reason: str) -> None:
@@ -132,7 +132,7 @@ def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either
     sharing.take_message(state(child=LEADER), EPOCH)  # an image takes a while
     sharing.take_message(state(stamp=EPOCH + 45 * MS), EPOCH)
     sharing.take_message(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
-    assert reasons(sharing)[1:] == ['word from the future', 'not listened to for a while']
+    assert reasons(sharing)[1:] == ['message from the future', 'ignored for a while']
     assert sharing.status(EPOCH + 10 * MS)[0].why == 'has a clock that is ahead'
     sharing.take_message(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
     assert sharing.status(EPOCH + 5100 * MS)[0].why != 'has a clock that is ahead'
@@ -143,14 +143,14 @@ def test_a_repeated_or_late_word_changes_nothing() -> None:
     for stamp in (EPOCH, EPOCH, EPOCH - 50 * MS):
         sharing.take_message(state(stamp=stamp), EPOCH)
     assert reasons(sharing) == [
-        'not aligned with f2', 'word out of order', 'word out of order']
+        'not aligned with f2', 'message out of order', 'message out of order']
 
 
 def test_tellers_and_whom_they_tell_of_are_counted() -> None:
     sharing = listening()
     for k in range(40):
         sharing.take_message(state(f'v{k}/odom', f'v{k}'), EPOCH)
-    assert reasons(sharing).count('too many tellers') == 8
+    assert reasons(sharing).count('too many senders') == 8
     for k in range(60):
         sharing.take_message(state('v0/odom', f'w{k}'), EPOCH)
     assert reasons(sharing).count('too many vehicles') == 21
@@ -167,7 +167,7 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
     assert near.status(now)[0].why.startswith('sends at 20 Hz')
     assert apart.status(now)[0].why.startswith('leapt 3 times')
     for sharing in (apart, near):
-        assert 'not listened to for a while' in reasons(sharing)
+        assert 'ignored for a while' in reasons(sharing)
 
 
 def test_why_nothing_is_heard_is_told() -> None:

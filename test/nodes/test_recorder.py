@@ -135,7 +135,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_it_holds(
     _, error = process.communicate(timeout=20.0)
     assert process.returncode == 1
     assert error.splitlines()[-1] == (
-        f'error: {tmp_path / "bag"}: No space left on device; what was recorded before is kept, '
+        f'error: {tmp_path / "bag"}: No space left on device; the recording so far is kept, '
         'marked incomplete')
     assert 'Traceback' not in error
     assert words(tmp_path / 'bag') == ['0', '1', '2', '3', '4']

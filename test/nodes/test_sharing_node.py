@@ -164,8 +164,8 @@ def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     counters = flock.sharing['front'].diagnostics.counters
     flock.wait(lambda: counters[f'invalid {SHARED_TOPIC}'])
     flock.run(0.3)
-    flock.wait(lambda: counters['somebody uses my name'] == 1
-               and counters['frame of a word is not unique'] == 1)
+    flock.wait(lambda: counters['another vehicle uses this name'] == 1
+               and counters['frame of a message is not unique'] == 1)
     count = len(flock.states['front'])
     flock.run(0.3)
     flock.wait(lambda: len(flock.states['front']) > count)

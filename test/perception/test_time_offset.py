@@ -147,7 +147,7 @@ def test_a_state_is_moved_as_the_offset_moves_it() -> None:
 
 def test_the_offset_is_described_in_words() -> None:
     found = TimeOffset()
-    assert found.describe == '0.0 +- 100.0 ms, not applied: 0.0 ms is'
+    assert found.describe == '0.0 +- 100.0 ms, not applied; 0.0 ms is applied'
     flown(0.02, 4.0, found)
     assert found.describe.startswith(('19.', '20.'))
     assert found.describe.endswith(' ms, applied')

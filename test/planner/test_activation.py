@@ -102,7 +102,8 @@ class Flight:
         self.height, self.yaw = 0.0, 0.0
         self.velocity: Array = np.zeros(3)
         self.silent = math.inf
-        self.leader: tuple[float, float] | None = (2.5, 0.1)  # distance, m, and speed, m/s
+        # Distance, m, and speed, m/s: no bound of the guard acts.
+        self.leader: tuple[float, float] | None = (2.2, 0.2)
 
     @property
     def held(self) -> float | None:

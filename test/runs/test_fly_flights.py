@@ -60,6 +60,7 @@ def test_a_flight_is_safe_and_its_report_complete(tmp_path):
     assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
     assert '<code>time_in_band_share</code>' in page
     assert (tmp_path / 'picture.jpg').read_bytes()[:2] == b'\xff\xd8'
+    assert (tmp_path / 'record' / 'metadata.yaml').exists()  # closed, not cut off
 
 
 @pytest.fixture
