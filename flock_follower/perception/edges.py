@@ -191,11 +191,16 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     design[:, 2] = (rows * xy).dot(_MINUS)
     design[:, :3] /= points[:, 2:]
     # A turn r moves a point by r x arm, and g . (r x arm) = (arm x g) . r.
-    design[:, 3:6] = ((points - center)[:, :, None] * design[:, None, :3]).reshape(
-        count, 9).dot(_CROSS)
+    design[:, 3:6] = cross(points - center, design[:, :3])
     design[:, 6:] = model.bloom
     return Lines(model, pixels[:count], normals, design, center,
                  _scale(along, model.examples, float(center[2])), pixels[count:])
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector products (n, 3) of (n, 3): np.cross takes three times as long."""
+    products: Array = (a[:, :, None] * b[:, None]).reshape(-1, 9).dot(_CROSS)
+    return products
 
 
 def _scale(along: Array, examples: tuple[int, int], depth: float) -> tuple[float, float]:

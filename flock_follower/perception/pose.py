@@ -133,12 +133,13 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior) -> Measurement | None:
+           expected: PosePrior, edges_only: bool = False) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
+    :param edges_only: whether no pose is accepted that edges do not confirm.
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
@@ -148,7 +149,8 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
             if (one := _good_fit(image, camera, alone, start)) is not None
             and _shown(image, one).all()]
     if not fits:
-        return _without_edges(image, camera, sought, index, corners, starts, expected)
+        return None if edges_only else _without_edges(
+            image, camera, sought, index, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit

@@ -219,10 +219,13 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
     # A reflex hides black cells. It cannot be told from paper that is saturated as well.
     hidden = saturated[inner] & (code.bits < 0.0)
     hidden &= saturated[around].mean() <= _MOST_HIDDEN
+    count = np.count_nonzero(hidden)
     bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = float(np.clip(0.5 - bits * code.bits, 0.0, 1.0)[~hidden].sum())
-    return (wrong < max(0.5 * code.errors, 1.0) and hidden.mean() <= _MOST_HIDDEN
+    # Codewords differ by more than twice the errors: hidden cells leave a difference.
+    return (wrong < (0.5 if count else max(0.5 * code.errors, 1.0))
+            and count <= min(2 * code.errors, _MOST_HIDDEN * len(hidden))
             and _is_word(bits, code)
             and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
             and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))

@@ -34,10 +34,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Array, skew, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import moved
-from flock_follower.perception.edges import normal_covariance, solve_normal, within_reason
+from flock_follower.perception.edges import (
+    cross,
+    normal_covariance,
+    solve_normal,
+    within_reason,
+)
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     correctable_cells,
@@ -45,6 +50,7 @@ from flock_follower.perception.markers import (
     Marker,
     marker_code,
 )
+from flock_follower.perception.print_model import median
 
 #: Samples per cell, each way; beyond the black border; and away from where a marker is expected
 #: up to which it is looked for.
@@ -53,6 +59,8 @@ MARGIN = 1
 REACH = 8
 #: Of the exposure, which lasts for 1.
 INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
+#: The mean over the instants, and the mean of what grows with them: (2, 13).
+_MEANS = (np.stack([np.ones_like(INSTANTS), INSTANTS]) / len(INSTANTS)).astype(np.float32)
 _TEXELS = 12  # of the print, per cell
 _WHITE = 3  # cells around, in the print
 #: Blur there is without motion, cells: of lenses, one taken to begin with, and out of focus.
@@ -139,9 +147,8 @@ def smear_print(printed: Any, places: Array, smear: Array) -> tuple[Array, Array
     at = ((at + 0.5 + _WHITE) * _TEXELS - 0.5).astype(np.float32)
     seen = cv2.remap(printed, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
                      borderMode=cv2.BORDER_REPLICATE).reshape(len(INSTANTS), -1)
-    mean = seen.mean(axis=0).astype(float).reshape(-1, 3)
-    by_smear = INSTANTS.dot(seen).reshape(-1, 3)[:, 1:] / len(INSTANTS)
-    return mean[:, 0], mean[:, 1:], by_smear
+    mean, by_smear = _MEANS.dot(seen).reshape(2, -1, 3).astype(float)
+    return mean[:, 0], mean[:, 1:], by_smear[:, 1:]
 
 
 _LENS = 0.75  # px: blur there is without motion
@@ -161,7 +168,6 @@ _FLOOR = 1.0  # grey levels: least standard deviation of a sample
 _ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
 #: Of the pose (6), the response (3) and the smear (2), which a smear of 0 leaves open.
 _PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
-_CAUTION = np.array([0.0] * 9 + [1.0, 1.0])
 
 
 class SmearFit(NamedTuple):
@@ -261,7 +267,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
             lens = int(np.abs(LENSES[:FOCUSED] - blur).argmin())
         white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
         # Gamma and over-exposure bend what would be straight.
-        response = np.column_stack([white, np.ones(len(white)), white * (1.0 - white)])
+        response = np.stack([white, np.ones_like(white), white * (1.0 - white)], axis=1)
         if count == 0:
             first = solve_normal(response.T.dot(response), response.T.dot(brightness))
             if first is None:
@@ -269,15 +275,15 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
             light, _, curve = first.tolist()
         slope = (light + curve * (1.0 - 2.0 * white))[:, None]
         along = _by_point(pose, model, points, slope * by_place)
-        design = np.column_stack([along, _cross(points - center, along), response,
-                                  slope * by_smear])
+        design = np.concatenate([along, cross(points - center, along), response,
+                                 slope * by_smear], axis=1)
         # The steeper it is, the more it matters what lens and cells are really like.
         steep = _BLURRED**2 * (slope * slope * by_place * by_place).sum(axis=1)
         weights = weights / (variance + steep)
         weighted = design * weights[:, None]
         information = weighted.T.dot(design) + _PRIOR
         # Smears to either side of an axis look alike: a whole step from one leads to the other.
-        held = information + np.diag(information.diagonal() * _CAUTION)
+        held = information + information * _PRIOR
         step = solve_normal(held, weighted.T.dot(brightness))
         if step is None:
             return None
@@ -292,7 +298,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         if count > 2 and offset < 10.0 * _SMALL * cell and turn < _SMALL:
             break
         squares = residual * residual
-        variance = max((1.4826 * float(np.median(np.abs(residual))))**2, _FLOOR**2)
+        variance = max(1.4826**2 * median(squares), _FLOOR**2)
         weights = np.maximum(1.0 - squares / (25.0 * (variance + steep)), 0.0)**2
     else:
         return None
@@ -302,18 +308,12 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
 
 def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array) -> Array:
     """Return by how much brightness grows as points (s, 3) move, per m, from that per cell."""
-    right, down = model.axes @ pose.rotation.T
+    right, down = (skew(axis) for axis in model.axes @ pose.rotation.T)
     # As the marker moves by v, at a pixel is the place r, d before: v = r right + d down + ray.
-    across = points.dot(np.cross(right, down))
-    return -(by_place[:, :1] * _cross(down, points)
-             + by_place[:, 1:] * _cross(points, right)) / across[:, None]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return the vector products (s, 3) of (s, 3) or (3,): np.cross takes twice as long."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    product: Array = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-    return product
+    across = points.dot(right.dot(down[[2, 0, 1], [1, 2, 0]]))
+    moved_by: Array = (by_place[:, 1:] * points.dot(right.T)
+                       - by_place[:, :1] * points.dot(down.T)) / across[:, None]
+    return moved_by
 
 
 def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
