@@ -40,8 +40,9 @@ from flock_follower.geometry import Array
 from flock_follower.messages import RangeState
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.markers import MarkedNeighbor
-from flock_follower.perception.neighbor_filter import NeighborFilter, RangeGate, UpdateOutcome
+from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
+from flock_follower.perception.range_gate import RangeGate
 from flock_follower.ranges import Checked, parameter, Range
 
 #: Before anything was learnt, m: a standard deviation.

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_follower.perception.neighbor_filter import RANGE_GATE, RANGE_WILD, RangeGate
+from flock_follower.perception.range_gate import RANGE_GATE, RANGE_WILD, RangeGate
 from flock_follower.perception.range_tracking import RangeBias, UNKNOWN_BIAS
 
 ONE = np.ones(1)
