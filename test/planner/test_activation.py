@@ -103,7 +103,7 @@ class Flight:
         self.velocity: Array = np.zeros(3)
         self.silent = math.inf
         # Distance, m, and speed, m/s: no bound of the guard acts.
-        self.leader: tuple[float, float] | None = (2.2, 0.2)
+        self.leader: tuple[float, float] | None = (2.0, 0.2)
 
     @property
     def held(self) -> float | None:
