@@ -242,6 +242,20 @@ def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -
     rig.wait(lambda: rig.states[-1] == 'TRACK')
 
 
+def test_the_motion_without_odometry_is_flown_on_and_marks_the_commands(rig: Rig) -> None:
+    rig.fly()
+    for _ in range(40):
+        rig.send(MOTION_TOPIC, to_odometry(
+            nanoseconds_to_stamp(rig.now + STEP), RELATIVE, 'base_link', (0.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+        rig.run(0.02, frame=RELATIVE)  # with the odometry that is contradicted
+    rig.wait(lambda: rig.states[-1] == 'RELATIVE' and rig.commands)
+    assert rig.commands[-1].header.frame_id == RELATIVE
+    rig.run(0.6)
+    rig.wait(lambda: rig.states[-1] == 'TRACK')
+    assert rig.commands[-1].header.frame_id == 'odom'
+
+
 def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> None:
     counters, values = rig.planner.diagnostics.counters, rig.planner.diagnostics.values
     rig.run(0.1, frame='map')
@@ -367,17 +381,3 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         'neighbors stamped before the system clock was set')} == dict.fromkeys(
             node.diagnostics.counters, 1)
     node.destroy_node()
-
-
-def test_the_motion_without_odometry_is_flown_on_and_marks_the_commands(rig: Rig) -> None:
-    rig.fly()
-    for _ in range(40):
-        rig.send(MOTION_TOPIC, to_odometry(
-            nanoseconds_to_stamp(rig.now + STEP), RELATIVE, 'base_link', (0.0, 0.0, 2.0),
-            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
-        rig.run(0.02, frame=RELATIVE)  # with the odometry that is contradicted
-    rig.wait(lambda: rig.states[-1] == 'RELATIVE' and rig.commands)
-    assert rig.commands[-1].header.frame_id == RELATIVE
-    rig.run(0.6)
-    rig.wait(lambda: rig.states[-1] == 'TRACK')
-    assert rig.commands[-1].header.frame_id == 'odom'
