@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import groupby
@@ -189,15 +190,14 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
              for controller in of_scenario(scenario) for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
-    progress = Progress(len(scenarios))
     flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
-    for name, group in groupby(tasks, lambda task: task.scenario.name):
-        progress.start(name)
-        its_tasks = list(group)
-        for number, task in enumerate(its_tasks, start=1):
-            parts.setdefault((name, task.controller), []).append(next(flown))
-            progress.share(number / len(its_tasks))
-    progress.finish()
+    with closing(Progress(len(scenarios))) as progress:
+        for name, group in groupby(tasks, lambda task: task.scenario.name):
+            progress.start(name)
+            its_tasks = list(group)
+            for number, task in enumerate(its_tasks, start=1):
+                parts.setdefault((name, task.controller), []).append(next(flown))
+                progress.share(number / len(its_tasks))
     list(flown)  # ends the generator
     shown = {s.name: parts[s.name, max(of_scenario(s), key=lambda name: name == 'guard')]
              for s in scenarios}

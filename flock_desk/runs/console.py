@@ -87,4 +87,8 @@ class Progress:
     def finish(self) -> None:
         """End the last job."""
         self.share(1.0)
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bar as it is: later output begins on a line of its own."""
         self._bar.close()
