@@ -78,5 +78,5 @@ def test_an_exception_in_a_callback_would_be_found(monkeypatch):
     def broken(message, twist_frame='child'):
         raise IndexError('oops')
     monkeypatch.setattr('flock_follower.nodes.planner.from_odometry', broken)
-    with pytest.raises(FuzzError, match=r'on (odom|neighbors): IndexError: oops \(in broken'):
+    with pytest.raises(FuzzError, match=r'on [a-z/]+: IndexError: oops \(in broken'):
         fuzz_node('planner', 50, 1)

@@ -47,7 +47,8 @@ OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_
 def graph(ros: Any) -> Iterator[Node]:
     """Return a node that sees all nodes of a follower."""
     nodes: list[Node] = [RelativePose(), Planner(), Visualizer(), MavlinkBridge(
-        parameter_overrides=[Parameter('connection', value='udpin:127.0.0.1:0')])]
+        parameter_overrides=[Parameter('connection', value='udpin:127.0.0.1:0'),
+                             Parameter('relative_flight', value=True)])]
     end = time.monotonic() + 10.0
     while not {'/mavlink/odom', '/visualizer/markers', '/odom'} <= dict(
             nodes[0].get_topic_names_and_types()).keys():
