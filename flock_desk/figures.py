@@ -90,37 +90,36 @@ def _draw(options: argparse.Namespace) -> int:
 def redraw(out: Path) -> list[str]:
     """Write the paper's simulations and ``results.csv``, print the table, return the names."""
     from flock_desk.runs import paper_plots as plots
-    progress = Progress(2 * len(MODELS) + 7)
-    leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
-    runs: dict[str, dict[Model, Simulation]] = {}
-    for scenario, start, lead, duration in (
-            ('leaderless', paper.LEADERLESS, None, 20.0),
-            ('leader-follower', paper.LEADER_FOLLOWER, leader, 10.0)):
-        runs[scenario] = {}
-        for model, name in MODELS.items():
-            progress.start(f'{scenario}: {name}')
-            runs[scenario][model] = simulate(
-                start.positions, start.velocities, paper.PARAMS, duration=duration, model=model,
-                leader=lead, sample_period=0.005, progress=progress.share)
-    alone, led = ({MODELS[model]: run for model, run in by_model.items()}
-                  for by_model in runs.values())
-    continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
-    three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
-    unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
-    figures = {
-        'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
-        'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
-        'leaderless_distances': lambda: plots.distances(alone, 10.0),
-        'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
-        'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
-        'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
-        'leader_distances': lambda: plots.distances(led, 10.0, unseen),
-    }
-    written = []
-    for name, draw in figures.items():
-        progress.start(f'drawing {name}')
-        written.append(plots.save(draw(), out / name))
-    progress.finish()
+    with Progress(2 * len(MODELS) + 7) as progress:
+        leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
+        runs: dict[str, dict[Model, Simulation]] = {}
+        for scenario, start, lead, duration in (
+                ('leaderless', paper.LEADERLESS, None, 20.0),
+                ('leader-follower', paper.LEADER_FOLLOWER, leader, 10.0)):
+            runs[scenario] = {}
+            for model, name in MODELS.items():
+                progress.start(f'{scenario}: {name}')
+                runs[scenario][model] = simulate(
+                    start.positions, start.velocities, paper.PARAMS, duration=duration,
+                    model=model, leader=lead, sample_period=0.005, progress=progress.share)
+        alone, led = ({MODELS[model]: run for model, run in by_model.items()}
+                      for by_model in runs.values())
+        continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
+        three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
+        unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
+        figures = {
+            'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
+            'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
+            'leaderless_distances': lambda: plots.distances(alone, 10.0),
+            'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
+            'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
+            'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
+            'leader_distances': lambda: plots.distances(led, 10.0, unseen),
+        }
+        written = []
+        for name, draw in figures.items():
+            progress.start(f'drawing {name}')
+            written.append(plots.save(draw(), out / name))
     rows = [row(scenario, MODELS[model], run)
             for scenario, by_model in runs.items() for model, run in by_model.items()]
     write_csv(out / 'results.csv', COLUMNS, rows)
@@ -188,20 +187,19 @@ def one_flock(options: argparse.Namespace) -> list[str]:
     usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
     neighbors: Neighbors = options.neighbors or usual
     start = random_start(options.agents, options.dim, params, options.seed)
-    progress = Progress(2)
-    progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
-    run = simulate(
-        start.positions, start.velocities, params, duration=options.duration,
-        model=options.model, neighbors=neighbors, coupling=options.coupling,
-        integrator='semi_implicit', sample_period=0.05, method=options.method,
-        dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
-        progress=progress.share)
-    m = run.metrics
-    name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
-            f'seed{options.seed}')
-    progress.start(f'drawing {name}')
-    written = plots.save(plots.flock(run), options.out / name)
-    progress.finish()
+    with Progress(2) as progress:
+        progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
+        run = simulate(
+            start.positions, start.velocities, params, duration=options.duration,
+            model=options.model, neighbors=neighbors, coupling=options.coupling,
+            integrator='semi_implicit', sample_period=0.05, method=options.method,
+            dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
+            progress=progress.share)
+        m = run.metrics
+        name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
+                f'seed{options.seed}')
+        progress.start(f'drawing {name}')
+        written = plots.save(plots.flock(run), options.out / name)
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')
     values = (m.time, m.min_r2, m.max_r2, m.mean_distance, m.speed, m.disagreement, m.order)

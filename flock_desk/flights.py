@@ -25,7 +25,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
 from functools import partial
 from itertools import groupby
 import json
@@ -191,7 +190,7 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
              for controller in of_scenario(scenario) for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
     flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
-    with closing(Progress(len(scenarios))) as progress:
+    with Progress(len(scenarios)) as progress:
         for name, group in groupby(tasks, lambda task: task.scenario.name):
             progress.start(name)
             its_tasks = list(group)

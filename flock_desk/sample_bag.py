@@ -248,12 +248,11 @@ def _rendered(k: int) -> BagMessage:
 
 def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
     """Yield the images, showing how many have been."""
-    progress = Progress(1)
-    progress.start(f'{name}, {count} images')
-    for done, image in enumerate(images, start=1):
-        yield image
-        progress.share(done / count)
-    progress.finish()
+    with Progress(1) as progress:
+        progress.start(f'{name}, {count} images')
+        for done, image in enumerate(images, start=1):
+            yield image
+            progress.share(done / count)
 
 
 def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,

@@ -84,11 +84,11 @@ class Progress:
         """Show that a share, 0 to 1, of the present job is done, if it is time for it."""
         self._bar.update(self._done + share - self._bar.n)
 
-    def finish(self) -> None:
-        """End the last job."""
-        self.share(1.0)
-        self.close()
+    def __enter__(self) -> Progress:
+        return self
 
-    def close(self) -> None:
-        """Leave the bar as it is: later output begins on a line of its own."""
+    def __exit__(self, error: object, *_: object) -> None:
+        """End the last job; after an error leave the bar: later output begins on a new line."""
+        if error is None:
+            self.share(1.0)
         self._bar.close()

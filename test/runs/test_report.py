@@ -76,12 +76,11 @@ def test_a_command_ends_in_one_line_and_its_exit_code(
 
 
 def test_progress_is_shown_in_a_pipe_too(capsys: pytest.CaptureFixture[str]) -> None:
-    progress = Progress(2)
-    progress.start('first')
-    for share in (0.2, 0.4, 0.6):
-        progress.share(share)
-    progress.start('second')
-    progress.finish()
+    with Progress(2) as progress:
+        progress.start('first')
+        for share in (0.2, 0.4, 0.6):
+            progress.share(share)
+        progress.start('second')
     shown = capsys.readouterr().err
     assert shown.startswith('\rbegin:   0 %') and 'second: 100 %' in shown
     assert len(shown.splitlines()) <= 3
