@@ -45,6 +45,9 @@ R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 
 IDENTITY_QUATERNION: Array = np.array([0.0, 0.0, 0.0, 1.0])
 
+#: Standard acceleration of gravity, m/s^2.
+GRAVITY = 9.80665
+
 
 def enu_to_ned(vector: ArrayLike) -> Array:
     """Return the NED coordinates, shape ``(..., 3)``, of vectors given in ENU; self-inverse."""

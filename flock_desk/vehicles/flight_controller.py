@@ -31,8 +31,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_desk.vehicles.autopilot_parameters import AutopilotParameters
 from flock_desk.vehicles.estimator import Estimator
 from flock_desk.vehicles.profiles import HOLD, LAND, Profile, SETPOINTS
-from flock_desk.vehicles.vehicle import GRAVITY, Quadrotor
-from flock_follower.geometry import Array, ned_to_enu, wrap_angle, yaw_ned_to_enu
+from flock_desk.vehicles.vehicle import Quadrotor
+from flock_follower.geometry import Array, GRAVITY, ned_to_enu, wrap_angle, yaw_ned_to_enu
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
 VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])

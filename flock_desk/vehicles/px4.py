@@ -49,8 +49,7 @@ from flock_desk.vehicles.flight_controller import (
     TrackedSetpoint,
 )
 from flock_desk.vehicles.profiles import LAND, PX4
-from flock_desk.vehicles.vehicle import GRAVITY
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, GRAVITY
 
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
 FUSION_TIMEOUT: Final[float] = 0.55

@@ -30,11 +30,11 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import (
     Array,
+    GRAVITY,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
 )
 
-GRAVITY: Final[float] = 9.80665  # m/s^2
 _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 

@@ -32,10 +32,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, quaternion_to_matrix
+from flock_follower.geometry import Array, GRAVITY, quaternion_to_matrix
 from flock_follower.messages import OdometryState, RELATIVE
 
-GRAVITY: Final[float] = 9.80665
 #: Odometry that is usable for this long, s, is flown on again.
 RETURN_TIME: Final[float] = 1.0
 #: At its beginning the marker's estimate starts anew: for this long, s, the stream goes on level.

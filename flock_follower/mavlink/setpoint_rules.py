@@ -50,7 +50,7 @@ from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
 from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
-from flock_follower.messages import Command, FASTEST_OWN, SANE
+from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
     limit_command,
@@ -171,10 +171,6 @@ class DisturbanceObserver:
         self.excess_since = min(self.excess_since, now) if abs(up) > OFFSET_MAX else math.inf
 
 
-#: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
-RELATIVE_MAX: Final[float] = 1.0
-#: Oldest image that such a command may rest on, s.
-OLDEST_MARKER: Final[float] = 0.5
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'

@@ -53,7 +53,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array, wrap_angle
+from flock_follower.geometry import Array, GRAVITY, wrap_angle
 from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
     Expected,
@@ -70,7 +70,7 @@ from flock_follower.planner.limits import (
     SIGHT,
 )
 from flock_follower.planner.params import GuardParams, PlannerParams
-from flock_follower.planner.sight import all_round, GRAVITY, MARGIN, vertical, View
+from flock_follower.planner.sight import all_round, MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.

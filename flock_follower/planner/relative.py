@@ -35,21 +35,20 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
 from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, untimely
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.vertical_yaw import Altitude, facing, turning
 
-#: Largest acceleration, m/s^2; the gate has the same limit. The altitude must not take what keeps
-#: the distance: so much vertically, and besides what offsets an error of the thrust.
-ACCELERATION_MAX, VERTICAL_MAX, CLIMB_MAX = 1.0, 1.0, 0.6
+#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
+#: leaves the rest of ``RELATIVE_MAX`` to the distance.
+CLIMB_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
 SETTLING = 1.0
-#: Oldest sight of the marker that is flown on, s.
-OLDEST = 0.5
 #: Relative speed for each metre off the middle of the band, 1/s, and the largest, m/s.
 GAIN = 0.5
 SPEED = 0.4
@@ -96,7 +95,7 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     if fault := untimely(own.stamp, now, params.odom_timeout):
         return f'no odometry, and the motion by attitude is {fault.detail} old'
     seen = {name: n for name, n in memory.neighbors.items()
-            if not n.received and now - n.stamp <= OLDEST}
+            if not n.received and now - n.stamp <= OLDEST_MARKER}
     leader = seen.get(memory.faced) or max(
         (n for n in seen.values() if n.member.role != AVOID), key=lambda n: n.stamp, default=None)
     if leader is None:
@@ -169,8 +168,8 @@ def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
 
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
-    up = min(max(vertical, -VERTICAL_MAX), VERTICAL_MAX)
-    flat = limit_norm(horizontal, math.sqrt(ACCELERATION_MAX ** 2 - up * up))
+    up = min(max(vertical, -RELATIVE_MAX), RELATIVE_MAX)
+    flat = limit_norm(horizontal, math.sqrt(RELATIVE_MAX ** 2 - up * up))
     return without_step(np.array([*flat, up]), last)
 
 

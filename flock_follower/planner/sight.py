@@ -29,10 +29,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, wrap_angle
+from flock_follower.geometry import (
+    Array,
+    GRAVITY,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    wrap_angle,
+)
 from flock_follower.planner.inputs import at, Neighbor, OwnState
 
-GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
 WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
 

@@ -28,7 +28,8 @@ import pytest
 
 from flock_desk import autopilot
 from flock_desk.vehicles.mavlink_vehicle import STEP
-from flock_desk.vehicles.vehicle import GRAVITY, Quadrotor
+from flock_desk.vehicles.vehicle import Quadrotor
+from flock_follower.geometry import GRAVITY
 
 pytestmark = pytest.mark.slow
 

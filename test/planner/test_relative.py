@@ -22,16 +22,14 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.messages import OdometryChoice, OdometryState, RELATIVE
+from flock_follower.messages import OdometryChoice, OdometryState, RELATIVE, RELATIVE_MAX
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.relative import (
-    ACCELERATION_MAX,
     limited,
     STEP_MAX,
-    VERTICAL_MAX,
 )
 from flock_follower.planner.step import step
 
@@ -95,9 +93,9 @@ def test_a_leader_that_stops_is_not_run_into():
 def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     command = limited(np.array(level), vertical, None if last is None else np.array(last))
     before = np.zeros(3) if last is None else last
-    assert np.linalg.norm(command) <= ACCELERATION_MAX + 1e-9
+    assert np.linalg.norm(command) <= RELATIVE_MAX + 1e-9
     if last is None:
-        assert abs(command[2]) <= VERTICAL_MAX
+        assert abs(command[2]) <= RELATIVE_MAX
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 
 

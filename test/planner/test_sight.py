@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, GRAVITY
 from flock_follower.planner.bounds import (
     in_sight,
     MARKER_ANGLE,
@@ -38,7 +38,6 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import (
     all_round,
     FieldOfView,
-    GRAVITY,
     View,
 )
 
