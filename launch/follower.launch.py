@@ -30,7 +30,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
 
-from flock_follower.parameters.launch_arguments import refuse_unknown
+from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_unknown
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic and service'),
@@ -70,8 +70,6 @@ PARAMETERS = {
     'visualizer': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
-#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
-END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 NUMBERS = ('a_max', 'v_max')
 WHOLE = ('target_system', 'disk_used')
 #: By which argument a node is started or not.

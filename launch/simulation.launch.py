@@ -37,7 +37,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from flock_follower.parameters.launch_arguments import refuse_unknown
+from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_unknown
 
 FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 ARGUMENTS = {
@@ -64,7 +64,7 @@ def generate_launch_description() -> LaunchDescription:
     port = LaunchConfiguration('port')
     simulator = Node(
         package='flock_follower', executable='simulator', exec_name='simulator', output='screen',
-        prefix='setpriv --pdeathsig TERM',  # as follower.launch.py
+        prefix=END_WITH_LAUNCH,
         namespace=LaunchConfiguration('namespace'), parameters=[{
             'scenario': LaunchConfiguration('scenario'),
             'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),

@@ -19,6 +19,9 @@ from collections.abc import Collection, Sequence
 import difflib
 from pathlib import Path
 
+#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
+END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
+
 
 def refuse_unknown(command_line: Sequence[str], file: str, known: Collection[str]) -> None:
     """
