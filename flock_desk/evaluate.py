@@ -179,10 +179,11 @@ def _pictures(evaluation: Evaluation) -> Sequence[Chapter]:
 def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
     """Return the warning of a bag whose follower was faster than allowed, if it was."""
     share = summary['faster_than_v_max_share']
-    return [
-        f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
-        f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
-        'brake; set v_max (--config) to the recorded speed'] if share else []
+    if not share:
+        return []
+    return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
+            f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
+            'brake; set v_max (--config) to the recorded speed']
 
 
 if __name__ == '__main__':

@@ -234,7 +234,8 @@ def failures(subject: str | Path, what: str) -> Iterator[None]:
 
 def reason_of(error: Exception) -> str:
     """Return what an exception says, in one line."""
-    return (isinstance(error, OSError) and error.strerror) or ' '.join(str(error).split())
+    strerror = error.strerror if isinstance(error, OSError) else None
+    return strerror or ' '.join(str(error).split())
 
 
 def absolute(topic: str) -> str:

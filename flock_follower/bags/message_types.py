@@ -44,8 +44,8 @@ def empty(msgtype: str) -> Any:
 @cache
 def _maker(msgtype: str) -> Callable[[], Any]:
     """Return a function that makes empty messages of a type."""
-    message, fields = typestore().types[msgtype], [
-        _zero(description) for _, description in typestore().fielddefs[msgtype][1]]
+    message = typestore().types[msgtype]
+    fields = [_zero(description) for _, description in typestore().fielddefs[msgtype][1]]
     return lambda: message(*[make() for make in fields])
 
 
