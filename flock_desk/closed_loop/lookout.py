@@ -166,12 +166,8 @@ class Lookout:
         for row, arrival in enumerate(arrivals):
             self._images[row].append((arrival, now))
         for i in np.flatnonzero(found).tolist():
-            full = YAW_NOISE ** 2 * np.eye(6)
-            full[:3, :3] = covariance[i]
-            outcome = self._filters[i].update(now, Transform(translation=measured[i]), _CENTRE,
-                                              full)
-            state = self._filters[i].newest
-            if outcome in _USED and state is not None:
+            state = _updated(self._filters[i], now, measured[i], covariance[i])
+            if state is not None:
                 self._send(arrivals[i // m], i, state._replace(
                     position=state.position + correction[i // m],
                     velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
@@ -186,7 +182,7 @@ class Lookout:
         """
         image, now, m = k // IMAGE_STEPS, k * STEP, len(self._others)
         found, offsets = self._visible[image] & self.in_sight.ravel(), scene.offsets.reshape(-1, 3)
-        covariances = self._sensing.noise ** 2 * relative_noise(offsets, self._noise)
+        covariances, scale = relative_noise(offsets, self._noise), self._sensing.noise
         for row, motion in enumerate(motions):
             if motion is None:
                 self._alone.pop(row, None)
@@ -196,14 +192,12 @@ class Lookout:
                 continue
             self.seen[row, 0] = True
             turn = attitudes[row] @ scene.rotations[:, 1:].reshape(-1, 3, 3)[row].T
-            noise = np.linalg.cholesky(covariances[i]) @ self._drawn[image, i, :3]
-            covariance = YAW_NOISE ** 2 * np.eye(6)
-            covariance[:3, :3] = covariances[i]
-            track = self._alone.setdefault(row, NeighborFilter())
-            outcome = track.update(now, Transform(
-                translation=motion.position + turn @ (offsets[i] + noise)), _CENTRE, covariance)
-            if outcome in _USED and track.newest is not None:
-                self._send(now + self._latency[image, row], i, track.newest,
+            noise = scale * np.linalg.cholesky(covariances[i]) @ self._drawn[image, i, :3]
+            state = _updated(self._alone.setdefault(row, NeighborFilter()), now,
+                             motion.position + turn @ (offsets[i] + noise),
+                             max(scale, 1e-3) ** 2 * covariances[i])
+            if state is not None:
+                self._send(now + self._latency[image, row], i, state,
                            float(scene.yaws[:, self._others].ravel()[i]), relative=True)
 
     def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None,
@@ -287,6 +281,15 @@ class Lookout:
         return [(_due(images, now), [*{
             (each.name, each.relative): each for each in _due(coming, now)}.values()])
                 for images, coming in zip(self._images, self._coming)]
+
+
+def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
+             ) -> Estimate | None:
+    """Return the estimate after a place (3,), m, of a covariance (3, 3); None if it is refused."""
+    full = YAW_NOISE ** 2 * np.eye(6)
+    full[:3, :3] = covariance
+    outcome = track.update(now, Transform(translation=place), _CENTRE, full)
+    return track.newest if outcome in _USED else None
 
 
 class Sighted(NamedTuple):
