@@ -38,6 +38,7 @@ import sys
 
 import numpy as np
 
+from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
@@ -57,9 +58,6 @@ MODELS: dict[Model, str] = {
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
-#: The controllers of ``flights``, by key of flights.json.
-CONTROLLERS = {'law': 'law', 'guard': 'law and guard', 'pd': 'PD servo',
-               'cucker_smale': 'Cucker-Smale', 'cucker_dong': 'Cucker-Dong'}
 #: The scenarios of ``fly`` that the paper shows flights of.
 FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
@@ -173,10 +171,10 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
     means = dict[float, dict[str, tuple[float, float]]]()
     for v_max, group in groupby(flown, lambda each: each[0]):
         names = [name for _, name in group]
-        means[v_max] = {title: (
+        means[v_max] = {controller.title: (
             float(np.mean([results[name][key]['horizontal_jerk_m_s3'] for name in names])),
             float(np.mean([results[name][key]['in_band'] for name in names])))
-            for key, title in CONTROLLERS.items()}
+            for key, controller in CONTROLLERS.items()}
     return [plots.save(plots.controllers(means), out / 'controllers')], []
 
 

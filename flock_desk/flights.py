@@ -248,7 +248,7 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
 
 
 def _fly(task: Task) -> Flown:
-    law, guard = CONTROLLERS[task.controller]
+    _, law, guard = CONTROLLERS[task.controller]
     flights = fly(task.scenario, task.runs, guard, cpu_time=time.thread_time, law=law)
     rows, cpu = measure(flights), flights.cpu.ravel()
     many = task.scenario.company.followers

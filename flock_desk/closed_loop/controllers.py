@@ -62,8 +62,9 @@ class CuckerDong(FlockingParams):
 
 
 class Controller(NamedTuple):
-    """A controller, and whether the guard bounds its commands."""
+    """A controller, its title in figures, and whether the guard bounds its commands."""
 
+    title: str
     law: type[FlockingParams]
     guard: bool = False
 
@@ -71,9 +72,11 @@ class Controller(NamedTuple):
 #: Those that flocks fly, too.
 IN_FLOCKS = 'law', 'guard'
 #: By key of flights.json.
-CONTROLLERS = {'law': Controller(FlockingParams), 'guard': Controller(FlockingParams, True),
-               'pd': Controller(PdServo), 'cucker_smale': Controller(CuckerSmale),
-               'cucker_dong': Controller(CuckerDong)}
+CONTROLLERS = {'law': Controller('law', FlockingParams),
+               'guard': Controller('law and guard', FlockingParams, True),
+               'pd': Controller('PD servo', PdServo),
+               'cucker_smale': Controller('Cucker-Smale', CuckerSmale),
+               'cucker_dong': Controller('Cucker-Dong', CuckerDong)}
 
 
 def _of_model(model: Model, offsets: Array, differences: Array, params: FlockingParams) -> Array:
