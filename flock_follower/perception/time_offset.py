@@ -111,7 +111,7 @@ class TimeOffset:
         :param time: of the exposure by the camera's clock, s.
         :param camera_point: a point of the neighbour, (3,), m, in the optical frame.
         """
-        if time < self._resting:
+        if self.fixed or time < self._resting:
             return 0.0
         path = self._paths.setdefault(name, [])
         if path and not 0.0 < time - path[-1][0] < 0.5 * BATCH:
@@ -158,7 +158,7 @@ class TimeOffset:
     def _apply(self) -> float:
         """Apply the estimate if it is significant; return by how much the applied one changed."""
         off = abs(self.estimate - self.applied)
-        if self.fixed or not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
+        if not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
             return 0.0
         self._found = True
         self.before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
