@@ -48,7 +48,7 @@ class Metrics:
     disagreement: Array
     """L, the length of the velocities' deviation from their mean, m/s."""
     order: Array
-    """Length of the mean heading: 1 if all move the same way, near 0 where none agree."""
+    """Length of the mean heading: 1 if all headings are equal, near 0 if they differ."""
     lyapunov: Array
     """W, infinite if a pair is outside the band."""
 

@@ -173,7 +173,7 @@ class Memory(NamedTuple):
     """When odometry was lost or returned last, s: the frame before is another one."""
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
-        """Return it in the frame of another odometry: what was known of places is forgotten."""
+        """Return the memory for another odometry frame, without positions of the old frame."""
         altitude = self.altitude
         if altitude is not None:
             altitude = Altitude.begun(own, None, params)._replace(thrust_bias=altitude.thrust_bias)
