@@ -52,6 +52,7 @@ _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
 _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
+_SKIN = 0.05  # m that agents may move before near pairs are searched again
 
 
 @dataclass(frozen=True)
@@ -180,10 +181,13 @@ class _Flock:
                                          self.near(before))
 
     def near(self, x: Array) -> flock_graph.Pairs:
-        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
-        if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
-            self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))
+        """Return at least the pairs with r^2 < d1; all, if they are few."""
+        few = len(x) <= _NEAR_BY_ALL
+        if self._near is None or not (few or np.abs(x - self._near[0]).max() <= _SKIN):
+            # Each of two agents may move by _SKIN along each of at most 3 axes.
+            distance = np.sqrt(self.params.d1) + 2.0 * np.sqrt(3.0) * _SKIN
+            self._near = (x, flock_graph.complete_graph(len(x)).edges if few
+                          else flock_graph.pairs_within(x, distance))
         return self._near[1]
 
     def looking_around(self, solve: Callable[[State, Array], Iterator[State]], start: State,
