@@ -160,24 +160,22 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
     """
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 
-    The search begins within ``coast_timeout``, if all other neighbors are only received: a vehicle
-    that has another one in view stays with that. The search ends when a leader is at hand again.
+    The search begins if no neighbor is in view: a vehicle that has another one in view stays with
+    that. The search ends when a leader is at hand again.
     """
     last = memory.leader
     if last is None or any(n.member.role == LEADER for n in neighbors.flock):
         return None
-    age = me.stamp - last.stamp
-    begins = age <= params.coast_timeout and all(n.received for n in neighbors.flock)
-    return last if (memory.looking or begins) and age <= params.resume_timeout else None
+    begins = all(n.received for n in neighbors.flock)
+    return last if (memory.looking or begins) and (
+        me.stamp - last.stamp <= params.resume_timeout) else None
 
 
 def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
-    """Return the newest estimate of a leader that it has seen and faced."""
-    faced, last = neighbors.faced, memory.leader
-    if faced is not None and not faced.received and faced.member.role == LEADER:
-        return faced
-    return next((n for n in neighbors.flock if last is not None and n.name == last.name
-                 and n.member.role == LEADER), last)
+    """Return the newest estimate of a leader, first of the faced one, then of the last one."""
+    names = [each.name for each in (neighbors.faced, memory.leader) if each]
+    return min((n for n in neighbors.flock if n.member.role == LEADER), default=memory.leader,
+               key=lambda n: names.index(n.name) if n.name in names else len(names))
 
 
 def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,

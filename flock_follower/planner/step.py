@@ -163,12 +163,15 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         lost=_loss(memory, flock, me, tracking, leader, params),
         home=me.position if memory.home is None else memory.home)
-    altitude, vertical = _altitude(memory, mode, me, neighbors, ground, coming, params, elapsed)
+    missed = leader or max((n for n in memory.flock.values() if n.member.role != AVOID and (
+        neighbors.faced is None)), key=lambda n: n.stamp, default=None)
+    altitude, vertical = _altitude(memory, mode, me, neighbors, missed, ground, coming, params,
+                                   elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - bias * params.period * UP, params)
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
+    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, missed, params, elapsed)
     stamp = mode.newest if tracking else (
         memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
     left = math.exp(-elapsed / params.response_time)
@@ -263,9 +266,17 @@ def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
     return flock
 
 
-def _awaited(leader: Neighbor, now: float, params: PlannerParams) -> Neighbor:
-    """Return the leader to look for, predicted by at most ``coast_timeout``."""
-    return at(leader, leader.stamp + min(now - leader.stamp, params.coast_timeout))
+def _awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
+    """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
+    age = min(now - n.stamp, params.coast_timeout)
+    it = expected(n, _acceleration(n, memory), age, params)
+    return n._replace(stamp=n.stamp + age, position=it.position, velocity=it.velocity)
+
+
+def _acceleration(n: Neighbor, memory: Memory) -> Array:
+    """Return the acceleration of a neighbor, as far as it is known (3,), m/s^2."""
+    motion = memory.motions.get(n.name)
+    return np.zeros(3) if n.received or motion is None else motion.acceleration
 
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
@@ -284,29 +295,36 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
     if not near:
         return Loss(towards, me.position)
     n = min(near, key=lambda n: math.dist(n.position, me.position))
-    there = _awaited(leader, me.stamp, params) if leader else at(n, me.stamp)
+    there = _awaited(n, memory, me.stamp, params)
     x, y, _ = there.position - me.position
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    motion = memory.motions.get(n.name)
-    a = np.zeros(3) if n.received or motion is None else motion.acceleration
-    soon = expected(n, a, TRUSTED_TIME, params)
+    soon = expected(n, _acceleration(n, memory), TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
     return Loss(towards, me.position, float(towards @ n.position), approach,
                 float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
 
 
 def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
-              ground: float | None, coming: Array, params: PlannerParams,
-              elapsed: float) -> tuple[Altitude, float]:
-    """Return the altitude to hold, and the vertical acceleration, m/s^2."""
+              missed: Neighbor | None, ground: float | None, coming: Array,
+              params: PlannerParams, elapsed: float) -> tuple[Altitude, float]:
+    """
+    Return the altitude to hold, and the vertical acceleration, m/s^2.
+
+    :param missed: the neighbor to look for; its height is followed as far as it is predicted.
+    """
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     follows = params.altitude_mode == 'follow'
+    level = neighbors.level
+    if level is None and missed is not None:
+        level = _awaited(missed, memory, me.stamp, params)
+        if level.stamp < me.stamp:
+            level = level._replace(velocity=np.zeros(3), acceleration=None)
     altitude = altitude.meeting(neighbors.peers, params, elapsed) if (
         follows and neighbors.peers) else altitude.following(
-        neighbors.level if follows else None, params, elapsed)
+        level if follows else None, params, elapsed)
     if not params.guard:
         return altitude.controlled(me, params, elapsed, coming=float(coming[2]))
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
@@ -358,23 +376,20 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
-         leader: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
+         missed: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw to command."""
     if params.yaw_mode != 'leader':
         return last
-    if leader is None and faced is not None:
+    if missed is not None:
+        since = me.stamp - missed.stamp - params.coast_timeout
+        there = _awaited(missed, memory, me.stamp, params)
+        return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
+            last, me, there, since, params, elapsed)
+    if faced is not None:
         return facing(last, me, faced, params, elapsed)
-    if leader is None and state is State.SEARCH:
-        # It looks round, anticlockwise.
+    if state is State.SEARCH:  # it looks round, anticlockwise
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
-    n = leader or max((n for n in memory.flock.values() if n.member.role != AVOID),
-                      key=lambda n: n.stamp, default=None)
-    if n is None:
-        return last
-    since = me.stamp - n.stamp - params.coast_timeout
-    there = _awaited(n, me.stamp, params)
-    return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
-        last, me, there, since, params, elapsed)
+    return last
 
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,

@@ -70,8 +70,7 @@ def test_one_that_comes_into_view_meanwhile_does_not_end_it() -> None:
 @pytest.mark.parametrize(('in_sight', 'received', 'then_seen', 'then_received'), [
     ('leader behind', '', 'behind', ''),  # another one is in view: it stays with that
     ('leader', 'behind', '', 'leader behind'),  # it is heard of
-    ('ahead', 'behind', '', 'behind'),  # whoever talks will be heard of again
-    ('', 'leader behind', '', 'behind')])  # never seen: others know better where it was
+    ('ahead', 'behind', '', 'behind')])  # no leader was known
 def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
                               then_received: str) -> None:
     follower, _ = fly(1.0, in_sight, received)
