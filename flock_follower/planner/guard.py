@@ -166,9 +166,16 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
-    """Return how far it may move out of the way of one that it no longer sees, m."""
+    """
+    Return how far it may move out of the way of one that it no longer sees, m.
+
+    One lost beyond the band has a longer way: the retreat is as much shorter.
+    """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
-    return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
+    distance = lost.free - float(lost.towards @ lost.origin)
+    beyond = max(distance - math.sqrt(params.law.d1), 0.0) if math.isfinite(distance) else 0.0
+    return max(params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond,
+               0.0)
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:

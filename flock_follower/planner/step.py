@@ -282,8 +282,6 @@ def _acceleration(n: Neighbor, memory: Memory) -> Array:
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
           leader: Neighbor | None, params: PlannerParams) -> Loss | None:
     """Return the loss of the neighbor that it followed or looks for."""
-    if leader and me.stamp - leader.stamp <= params.coast_timeout:
-        leader = None  # until then it is kept clear of on all sides, as any other
     if (tracking and leader is None) or memory.followed is None:
         return None
     if memory.lost is not None:
