@@ -54,10 +54,13 @@ from flock_follower.planner.limits import (
     COHESION,
     constrained,
     FENCE,
+    limit_command,
+    limit_horizontal,
     LimitedCommand,
     SEPARATION,
 )
 from flock_follower.planner.memory import Loss, Memory
+from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import Neighborhood
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.sight import View
@@ -210,17 +213,50 @@ def beside(velocity: Array, offset: Array) -> Array:
     return math.copysign(1.0, float(across @ offset)) * across
 
 
-def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-              neighbors: Neighborhood, view: View, blinded: bool,
+def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, state: State,
+              blinded: bool, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
               params: PlannerParams) -> LimitedCommand:
     """
-    Return the nearest command within all bounds.
+    Return the nearest command within all limits and bounds.
 
-    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
-
+    :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
+    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
+    :param blinded: whether no images are processed.
     :param velocity: own velocity when the command acts (3,), m/s.
     :param neighbors: the neighbors at hand in TRACK, else none.
-    :param blinded: whether no images are processed.
+    """
+    # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
+    lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
+    limits = lowered if state in (State.TRACK, State.COAST) else start
+    rising = max(abs(float(me.velocity[2])), abs(climb))
+    command = limit_horizontal(nominal, vertical, velocity, *limits, params.period, rising)
+    if params.guard and (state is not State.SEARCH or memory.flock):
+        bounds = _bounds(memory, me, velocity, neighbors, view, blinded, params)
+        allowed = constrained(command.acceleration, velocity, bounds, *lowered, params.period)
+        if start != lowered:
+            clear = constrained(allowed.acceleration, velocity, [
+                each for each in bounds if each.reason in (SEPARATION, FENCE)], *start,
+                params.period)
+            allowed = clear if clear.reason else allowed
+        if allowed.reason:
+            command = allowed._replace(reason=', '.join(filter(None, [
+                command.reason, allowed.reason])))
+    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
+    if SEPARATION in command.reason or FENCE in command.reason:
+        limits = start
+    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
+                          command.separation_axis)
+    reason = command.reason if final.reason in command.reason else ', '.join(
+        filter(None, [final.reason, command.reason]))
+    return command._replace(acceleration=final.acceleration, reason=reason)
+
+
+def _bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
+            blinded: bool, params: PlannerParams) -> list[Bound]:
+    """
+    Return all bounds in their order.
+
+    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
     """
     near = list[Bound]()
     for name, n in memory.ranged.items():
@@ -230,20 +266,8 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (blinded and not n.received)):
             near += _neighbor_bounds(n, memory, me, velocity, neighbors, here, params)
-    bounds = ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
-                     _sight_bounds(memory, me, velocity, neighbors, view, params))
-    allowed = constrained(command.acceleration, velocity, bounds, params.a_max, params.v_max,
-                          params.period)
-    if (params.strongest, params.fastest) != (params.a_max, params.v_max):
-        # Limits lowered in flight bind the nominal command, and nothing that keeps clear.
-        clear = constrained(allowed.acceleration, velocity, [
-            each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
-            params.fastest, params.period)
-        allowed = clear if clear.reason else allowed
-    if not allowed.reason:
-        return command
-    reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
-    return LimitedCommand(allowed.acceleration, reasons, allowed.separation_axis)
+    return ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
+                   _sight_bounds(memory, me, velocity, neighbors, view, params))
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,

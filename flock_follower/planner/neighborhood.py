@@ -41,8 +41,9 @@ from flock_follower.flock.neighbor_graph import graph_law, HELD
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
-from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.limits import brake, limit_norm
 from flock_follower.planner.memory import Memory, SmoothedMotion
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
 GAP_MIN = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
@@ -195,9 +196,19 @@ def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
             ] if missing else []
 
 
-def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
-            params: PlannerParams) -> tuple[Array, tuple[Array, float] | None]:
-    """Return the command of the law (3,), m/s^2, or of the fade-in to it, and the fade-in."""
+def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
+            neighbors: Neighborhood, params: PlannerParams
+            ) -> tuple[Array, tuple[Array, float] | None]:
+    """
+    Return the acceleration (3,), m/s^2, without limits, and the fade-in to that of the law.
+
+    In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes.
+
+    :param velocity: own velocity when the command acts (3,), m/s.
+    """
+    if state is not State.TRACK:
+        return (np.zeros(3) if state is State.COAST else brake(
+            velocity, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
     offsets = np.array([_offset(n, me, params) for n in flock])
     differences = np.array([n.velocity - me.velocity for n in flock])

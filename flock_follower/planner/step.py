@@ -44,15 +44,7 @@ from flock_follower.planner.inputs import (
     too_slow,
     TRUSTED_TIME,
 )
-from flock_follower.planner.limits import (
-    brake,
-    FENCE,
-    limit_command,
-    limit_horizontal,
-    LimitedCommand,
-    REASONS,
-    SEPARATION,
-)
+from flock_follower.planner.limits import REASONS, SEPARATION
 from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, observed, off
 from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.neighborhood import (
@@ -168,8 +160,13 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     altitude, vertical = _altitude(memory, mode, me, neighbors, missed, ground, coming, params,
                                    elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
-    command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
-                               me.velocity + coming - bias * params.period * UP, params)
+    velocity = me.velocity + coming - bias * params.period * UP
+    wanted, fading = nominal(memory, mode.state, me, velocity, neighbors, params)
+    command = constrain(wanted, vertical, altitude.climb, memory, mode.state, mode.blinded, me,
+                        velocity, neighbors, view, params)
+    if me.stamp - memory.switched < relative.SETTLING:
+        command = command._replace(
+            acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, missed, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -335,42 +332,6 @@ def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood
         me, params, elapsed, *climb_range(near, me, params), float(coming[2]))
     # The climb lasts as long as the loss: the next one begins at the altitude held before.
     return controlled._replace(held=altitude.held), vertical
-
-
-def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood, view: View,
-             vertical: float, climb: float, velocity: Array, params: PlannerParams
-             ) -> tuple[LimitedCommand, tuple[Array, float] | None]:
-    """
-    Return the nominal acceleration within all limits and bounds, and its fading.
-
-    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param velocity: own velocity when the command acts (3,), m/s.
-    """
-    unlimited: Array = np.zeros(3)
-    fading = None
-    # Limits lowered in flight do not bind braking and keeping clear.
-    strongest = params.strongest, params.fastest
-    limits = params.a_max, params.v_max
-    if mode.state is State.TRACK:
-        unlimited, fading = nominal(memory, me, neighbors, params)
-    elif mode.state is not State.COAST:
-        limits = strongest
-        unlimited = brake(velocity, params.strongest, params.brake_time_constant)
-    rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(unlimited, vertical, velocity, *limits, params.period, rising)
-    if params.guard and (mode.state is not State.SEARCH or memory.flock):
-        command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
-    if SEPARATION in command.reason or FENCE in command.reason:
-        limits = strongest
-    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
-                          command.separation_axis)
-    reason = command.reason if final.reason in command.reason else ', '.join(
-        filter(None, [final.reason, command.reason]))
-    a = final.acceleration
-    if me.stamp - memory.switched < relative.SETTLING:
-        a = relative.without_step(a, memory.command)
-    return command._replace(acceleration=a, reason=reason), fading
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
