@@ -101,19 +101,6 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
         assert not known.yaws_disagree(LIMITS) and known.contradiction(LIMITS) == ''
 
 
-@pytest.mark.parametrize(('disagreeing_for', 'what'), [
-    (-math.inf, ''), (-0.01, ''), (math.nan, ''),
-    (0.0, 'velocities of odom and of the autopilot disagree'),
-    (9.0, 'velocities of odom and of the autopilot disagree')])
-def test_velocities_disagree_from_the_moment_that_is_told(disagreeing_for, what):
-    known = by(ODOM, disagreeing_for=disagreeing_for)
-    assert known.contradiction(LIMITS) == what
-    assert (braking(known) is None) == bool(what)
-    # Yaws are told first: they explain it.
-    turned = replace(known, odom=SLOW._replace(yaw=2.0))
-    assert turned.contradiction(LIMITS).startswith('yaws')
-
-
 @pytest.mark.filterwarnings('error')
 def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
     own, stale = SLOW._replace(velocity=(0.0, 0.3, 0.0)), SLOW._replace(**LATE)
@@ -249,15 +236,6 @@ def test_what_is_old_or_interrupted_is_not_compared():
     for path in (first, second):
         path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
     assert difference(first, second, 0.0, 9.0) is None
-
-
-def test_motion_at_the_reported_velocity_is_no_jump_and_a_jump_in_motion_is_one():
-    velocity = np.array([0.0, 8.0, 0.0])
-    moving, _ = paths(2.0, lambda t: 8.0 * t * np.eye(3)[1], still, velocity=velocity)
-    assert moving.jumps == 0
-    moving, other = paths(2.0, lambda t: (8.0 * t + 1.5 * (t > 1.0)) * np.eye(3)[1],
-                          lambda t: 8.0 * t * np.eye(3)[1], velocity=velocity)
-    assert moving.jumps == 1 and np.linalg.norm(difference(moving, other, 0.0, 2.0)) < 1e-9
 
 
 @pytest.mark.parametrize(('axis', 'drift', 'std', 'height', 'contradicts'), [
