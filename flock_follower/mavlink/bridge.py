@@ -120,7 +120,7 @@ class Bridge:
         self._blind_action = blind_action
         self._last_command: AcceptedCommand | None = None
         self._armed: bool | None = None
-        self._stopping_since: float | None = None
+        self._stopping_since = math.inf
         self._vehicle = 0, 0  # reboots, and changes of the vehicle
         self._takers: dict[str, Callable[[Any, float], object]] = {
             'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
@@ -129,7 +129,7 @@ class Bridge:
 
     def status(self, now: float) -> VehicleStatus | None:
         """Return the vehicle's status, None while the link is not alive."""
-        return self.telemetry.status if self.alive(now) else None
+        return self.telemetry.current(now, self.gate.limits.link_timeout)
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is connected."""
@@ -319,9 +319,8 @@ class Bridge:
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
-        speed, since = self.gate.speed(now), self._stopping_since
-        return (not self.gate.flies or speed is None or speed < REST_SPEED
-                or (since is not None and now - since >= STOP_TIMEOUT))
+        return not self.gate.flies or (self.gate.speed(now) or 0.0) < REST_SPEED or (
+            now - self._stopping_since >= STOP_TIMEOUT)
 
     def finish(self, now: float) -> None:
         """

@@ -151,9 +151,7 @@ class Requests:
             self._gate.permit(OffboardFailed(request.outcome.message))
 
     def _status(self, now: float) -> VehicleStatus | None:
-        telemetry = self._link.telemetry
-        alive = telemetry.alive(now, self._gate.limits.link_timeout)
-        return telemetry.status if alive else None
+        return self._link.telemetry.current(now, self._gate.limits.link_timeout)
 
     def offboard_obstacle(self, now: float, in_air: bool = True) -> tuple[str, bool]:
         """
@@ -221,19 +219,19 @@ class Requests:
         :param obstacle: why it is refused at once, or ''.
         :param why: why the bridge itself requests it; '' for a request by a person.
         """
-        if self.stopping and not goal.ends_flight:
-            obstacle = 'the bridge is stopping'
         permit, pending, superseded = self._gate.permit, self.pending, None
-        if goal.ends_flight and self._link.telemetry.dialect is None:
-            obstacle = NOT_RECEIVED  # nor is it known how to ask
+        obstacle = first_reason(
+            # Nor is it known how to ask.
+            (goal.ends_flight and self._link.telemetry.dialect is None, NOT_RECEIVED),
+            (self.stopping and not goal.ends_flight, 'the bridge is stopping'),
+            (obstacle, obstacle),
+            (pending is not None and not goal.ends_flight,
+             f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
             # From here on only braking goes out, even if the autopilot refuses.
             permit(EndRequested(why or f'{goal.name} requested'))
-        elif pending is not None:
-            obstacle = obstacle or f'still waiting for {pending.goal.name}'
-        if pending is not None and goal.ends_flight:
-            pending.refuse(f'superseded by {goal.name}')
-            superseded = pending.goal
+            if pending is not None:
+                superseded = pending.refuse(f'superseded by {goal.name}').goal
         if obstacle:
             return Request(goal, now).refuse(obstacle)
         self.newest = request = Request(goal, now, superseded, own=bool(why))

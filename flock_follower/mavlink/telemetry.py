@@ -212,6 +212,10 @@ class Telemetry:
         """Return whether the autopilot has not been missing for longer than ``link_timeout``."""
         return self.silence(now) <= link_timeout
 
+    def current(self, now: float, link_timeout: float) -> VehicleStatus | None:
+        """Return the vehicle's status, None while the link is not alive."""
+        return self.status if self.alive(now, link_timeout) else None
+
     def flying(self, now: float) -> bool | None:
         """Return whether the vehicle reports that it is in the air; None if it reports neither."""
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)

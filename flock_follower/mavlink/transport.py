@@ -23,7 +23,7 @@ there yet.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import errno
 import fcntl
@@ -35,10 +35,11 @@ import socket
 import struct
 import termios
 import tty
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flock_follower.ranges import Range
 
+T = TypeVar('T')
 #: Time between two attempts to reopen a lost port, s.
 RETRY_PERIOD: Final[float] = 0.5
 #: A line is congested if what waits to be sent takes longer than this, s.
@@ -84,11 +85,15 @@ class _Line:
         """Return a new descriptor."""
         raise NotImplementedError
 
-    def _lost(self, error: BaseException) -> bool:
-        """Close the line unless an error passes by itself; return False."""
-        if not isinstance(error, BlockingIOError | InterruptedError):
+    def _call(self, call: Callable[[], T]) -> T | None:
+        """Return the result of a system call; None if it has to wait, or the line is lost."""
+        try:
+            return call()
+        except (BlockingIOError, InterruptedError):
+            return None
+        except OSError as error:
             self._lose(reason_of(error))
-        return False
+            return None
 
     def _lose(self, fault: str) -> None:
         self.close()
@@ -108,35 +113,26 @@ class _Line:
         """Yield the bytes that have arrived."""
         if self._fd < 0:
             return
-        try:
-            # No more than is taken in one call; what follows waits in the kernel.
-            data = os.read(self._fd, MOST_READ)
-        except OSError as error:
-            self._lost(error)
-            return
+        # No more than is taken in one call; what follows waits in the kernel.
+        data = self._call(lambda: os.read(self._fd, MOST_READ))
         if data:
             yield data, self.peer
-        else:
+        elif data is not None:
             self._lose('closed by the other end')
 
     def write(self, data: bytes) -> bool:
         """Send; return whether it goes out whole. What begins to go out always does."""
         if self._fd < 0 or self._waits():
             return False
-        try:
-            taken = os.write(self._fd, data)
-        except OSError as error:
-            return self._lost(error)
+        taken = self._call(lambda: os.write(self._fd, data))
         self._waiting = data[taken:] if taken else b''
-        return taken > 0
+        return bool(taken)
 
     def _waits(self) -> bool:
         """Send the rest of the last message; return whether some of it still waits."""
         if self._waiting and self._fd >= 0:
-            try:
-                self._waiting = self._waiting[os.write(self._fd, self._waiting):]
-            except OSError as error:
-                self._lost(error)
+            taken = self._call(lambda: os.write(self._fd, self._waiting))
+            self._waiting = self._waiting[taken or 0:]
         return bool(self._waiting)
 
     def congested(self) -> bool:
