@@ -38,7 +38,6 @@ import sys
 import textwrap
 from typing import Any
 
-from flock_follower.bags.bag import BagError
 from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import (
@@ -99,8 +98,6 @@ def main(args: Sequence[str] | None = None) -> int:
         seen, findings = _observe(options)
         if options.report:
             _report(options, seen, findings)
-    except BagError as error:
-        return _refuse(error)
     except OSError as error:
         return _refuse(f'{error.filename}: {error.strerror}' if error.strerror else error)
     except ValueError as error:
