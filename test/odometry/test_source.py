@@ -129,16 +129,6 @@ def test_until_the_readings_differ_nothing_is_decided(reported: float) -> None:
     assert derived[20:] == [reported == 0.0] * 980
 
 
-@pytest.mark.parametrize('rate', [30.0, 200.0])
-@pytest.mark.parametrize('kind', [Source(twist='odom')], ids=str)
-def test_the_likelier_reading_is_used_from_the_first_window_on(kind: Source, rate: float) -> None:
-    _, states = first_second(kind, 2.0, rate, 1.0)
-    for t, state in states[round(0.65 * rate):]:
-        assert not state.derived
-        if t > 2.9:  # the difference to the derived velocity is faded out
-            np.testing.assert_allclose(state.velocity, motion(t)[2], atol=0.05)
-
-
 def test_it_starts_from_the_child_frame_where_the_reading_does_not_matter() -> None:
     source = OdometrySource()
     _, states = first_second(Source(), 0.0, 100.0, 0.1)
@@ -165,32 +155,6 @@ def test_a_wrong_start_is_small_soon_over_and_admitted(kind: Source, rate: float
         if t - start > 1.1:
             assert np.abs(off).max() < 0.1
             assert source.twist.found == kind.twist
-
-
-@pytest.mark.parametrize('twist', ['odom'])
-def test_processes_that_start_at_other_times_read_the_same(twist: str) -> None:
-    """Planner and bridge each read odom for themselves: one restarts, one misses messages."""
-    readers = [first_second(Source(twist=twist), start, rate, 8.0 - start)
-               for start, rate in ((0.0, 200.0), (3.1, 200.0), (5.0, 50.0))]
-    assert {source.twist.found for source, _ in readers} == {twist}
-    velocities = [{round(t * 50.0): state.velocity for t, state in states}
-                  for _, states in readers]
-    for k in range(round(6.5 * 50.0), round(7.9 * 50.0)):
-        for other in velocities[1:]:
-            np.testing.assert_allclose(other[k], velocities[0][k], atol=0.1)
-
-
-def test_when_the_vehicle_turns_before_the_frame_is_known_the_velocity_is_derived() -> None:
-    source = OdometrySource()
-    for k in range(600):
-        t = 0.01 * k
-        yaw = max(0.0, t - 4.0)
-        state = taken(source, odometry(
-            empty, START + round(t * 1e9), 'odom', 'base_link', [0.5 * t, 0.0, 1.0],
-            quaternion_from_rpy(0.0, 0.0, yaw), [0.5, 0.0, 0.0]), t)
-        if t > 0.5:  # the twist is in odom; by how much the readings may differ
-            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.11)
-    assert source.twist.found == 'odom'
 
 
 @pytest.mark.parametrize('twist', ['child', 'odom', 'none'])
