@@ -75,8 +75,8 @@ def pictures(**fields: Any) -> Change:
     return lambda seen: [vars(picture).update(fields) for picture in seen.pictures]
 
 
-def rows(columns: slice, values: list[float]) -> Change:
-    return lambda seen: [row.__setitem__(columns, values) for row in seen.rows]
+def columns(which: slice, values: list[float]) -> Change:
+    return lambda seen: [row.__setitem__(which, values) for row in seen.rows]
 
 
 def bridge(key: str, value: str) -> Change:
@@ -211,14 +211,14 @@ FAULTS: list[Fault] = [
           pictures(brightness=3.0, contrast=1.0, markers={})),
     Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
-          rows(slice(9, 12), [1.5, 1.5, 0.0])),
+          columns(slice(9, 12), [1.5, 1.5, 0.0])),
     Fault('no angular rates', BOTH, WARNING, 'odom angular rate', 'always zero', 'derived from',
-          rows(slice(12, 15), [0.0] * 3)),
+          columns(slice(12, 15), [0.0] * 3)),
     Fault('no covariances', BOTH, WARNING, 'odom covariances', 'pose and twist', 'odom_std',
-          rows(slice(15, 27), [0.0] * 12)),
+          columns(slice(15, 27), [0.0] * 12)),
     Fault('a source that is lost', BOTH, ERROR, 'odom', '250 of 250 say nothing: quaternion = 0',
           'publish_null_when_lost',
-          rows(slice(5, 9), [0.0] * 4)),
+          columns(slice(5, 9), [0.0] * 4)),
     Fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', 'ms later',
           'middle of the exposure, by one clock; else set time_offset:=-0.05',
           change(shifts=shift_rows(offset=0.05))),
@@ -412,21 +412,6 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
     assert ready(findings) is all(finding.level != ERROR for finding in findings)
 
 
-def test_an_offset_that_relative_pose_is_told_is_none() -> None:
-    seen = healthy()
-    seen.shifts = shift_rows(offset=0.05)
-    seen.parameters['relative_pose']['time_offset'] = -0.05
-    findings = seen.judged()
-    assert [finding.line for finding in findings if finding.level != OK] == []
-
-
-def test_the_pose_that_tf_static_tells_is_used() -> None:
-    seen = healthy()
-    child_axes(*OPTICAL)(seen)
-    seen.static_child = Transform.from_quaternion(np.zeros(3), quaternion_from_rpy(*OPTICAL))
-    assert [finding.line for finding in seen.judged() if finding.level != OK] == []
-
-
 def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:
     free, locked, young = (tmp_path / f'fastrtps_{name}_el' for name in ('a', 'b', 'c'))
     for path in (free, locked, young):
@@ -445,52 +430,10 @@ def test_the_share_of_the_processors_that_idles() -> None:
     assert idle_share(after, after) is None
 
 
-def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:
-    seen = healthy(live=False)
-    seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
-    findings = seen.judged()
-    assert [f.level for f in findings if f.what == 'planner says'] == [WARNING]
-    assert ready(findings)
-
-
 def test_an_empty_graph_is_one_line() -> None:
     (finding,) = judge_all(Observations())
     assert finding.level == ERROR and 'no node is seen on domain 0' in finding.measured
     assert 'ROS_DOMAIN_ID' in finding.advice
-
-
-def test_of_a_leader_that_moves_no_size_is_told() -> None:
-    seen = healthy()
-    for n, row in enumerate(seen.sightings):
-        row[2] += 0.3 * math.sin(0.4 * n)
-    measured = {finding.what: finding.measured for finding in seen.judged()}
-    assert measured['marker size'] == 'the leader moves'
-    assert measured['camera mounting'] == 'off by 0 deg'  # by the motion of the images
-
-
-def test_an_axis_that_does_not_move_is_named() -> None:
-    seen = healthy()
-    for row in seen.rows:
-        up = quaternion_to_matrix(row[5:9])
-        row[4], row[9:12] = 1.5, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
-    found = next(finding for finding in seen.judged() if finding.what == 'odom positions')
-    assert found.level == UNMEASURED and found.measured.startswith('z moved too little')
-    for row in seen.rows:
-        row[4] = -1.5
-    assert rows(seen)['odom positions'] == WARNING
-
-
-def test_at_rest_nothing_is_guessed() -> None:
-    seen = healthy()
-    seen.rows = [row[:2] + seen.rows[0][2:9] + [0.0] * 3 + [1e-3] * 3 + row[15:]
-                     for row in seen.rows]
-    seen.shifts = [[*row[:2], *[0.1, -0.1, 0.9] * 6] for row in seen.shifts]
-    findings = seen.judged()
-    assert {f.what: f.measured.split(':')[0] for f in findings if f.level == UNMEASURED} == {
-        'odom velocity': 'moved too little', 'odom ahead': 'turned too little',
-        'camera time offset': 'turned too little', 'focal length': 'turned too little',
-        'marker size': HOW, 'camera mounting': HOW}
-    assert {f.level for f in findings} == {OK, UNMEASURED} and ready(findings)
 
 
 def rows(seen: Observed) -> dict[str, str]:
@@ -517,26 +460,67 @@ def test_one_cause_has_one_row() -> None:
     assert not {'marker size', 'camera mounting', 'camera time offset'} & rows(seen).keys()
 
 
-def test_without_what_is_essential_it_is_never_ready() -> None:
-    seen = healthy()
-    del seen.statuses['planner']
-    findings = seen.judged()
-    assert still_needed(findings) == ['planner says'] and not ready(findings)
+def level(height: float) -> Change:
+    """Return a change to a vehicle that stays at a height, m, and sees no marker."""
+    def make(seen: Observed) -> None:
+        seen.sightings = []
+        for row in seen.rows:
+            up = quaternion_to_matrix(row[5:9])
+            row[4], row[9:12] = height, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
+    return make
 
+
+#: Changes of a live system: the level of each row that is not OK then, and what was measured.
+ROWS: dict[str, tuple[Change, dict[str, tuple[str, str]]]] = {
+    'an offset that relative_pose is told is none': (
+        together(change(shifts=shift_rows(offset=0.05)),
+                 parameter('relative_pose', 'time_offset', -0.05)), {}),
+    'the pose that tf_static tells is used': (
+        together(child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
+            np.zeros(3), quaternion_from_rpy(*OPTICAL)))), {}),
+    # The mounting is known by the motion of the images.
+    'of a leader that moves no size is told': (
+        lambda seen: [row.__setitem__(2, row[2] + 0.3 * math.sin(0.4 * n))
+                      for n, row in enumerate(seen.sightings)],
+        {'marker size': (UNMEASURED, 'the leader moves')}),
+    'an axis that does not move is named': (level(1.5), {
+        'odom positions': (UNMEASURED, 'z moved too little')}),
+    'a height below the ground may be an axis': (level(-1.5), {
+        'odom positions': (WARNING, 'z moved too little: carry it, and lift it; z is -1.5 m')}),
+    'at rest nothing is guessed': (
+        lambda seen: vars(seen).update(
+            rows=[row[:2] + seen.rows[0][2:9] + [0.0] * 3 + [1e-3] * 3 + row[15:]
+                  for row in seen.rows],
+            shifts=[[*row[:2], *[0.1, -0.1, 0.9] * 6] for row in seen.shifts]),
+        {'odom velocity': (UNMEASURED, 'moved too little'),
+         'odom ahead': (UNMEASURED, 'turned too little'),
+         'camera time offset': (UNMEASURED, 'turned too little'),
+         'focal length': (UNMEASURED, 'turned too little'), 'marker size': (UNMEASURED, HOW),
+         'camera mounting': (UNMEASURED, HOW)}),
+    'ten hertz is told and flies': (
+        together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0))),
+        {'odom rate': (WARNING, '10.0 Hz'), 'camera time offset': (UNMEASURED, 'odometry')}),
+    'a status is essential': (lambda seen: seen.statuses.pop('planner'), {
+        'planner says': (UNMEASURED, 'nothing received')}),
+}
+
+
+@pytest.mark.parametrize(('make', 'expected'), ROWS.values(), ids=ROWS)
+def test_of_a_live_system_these_rows_are_not_ok(
+        make: Change, expected: dict[str, tuple[str, str]]) -> None:
+    seen = healthy()
+    make(seen)
+    findings = seen.judged()
+    assert {finding.what: finding.level for finding in findings if finding.level != OK} == {
+        what: level for what, (level, _) in expected.items()}
+    for finding in findings:
+        assert finding.measured.startswith(expected.get(finding.what, ('', ''))[1])
+    assert ready(findings) is ('planner says' not in expected)
+
+
+def test_faults_of_the_recorded_nodes_do_not_spoil_a_bag_but_too_few_messages_do() -> None:
     seen = healthy(live=False)
-    seen.topic('odom').arrivals = seen.topic('odom').arrivals[:2]
-    seen.topic('odom').stamps = seen.topic('odom').stamps[:2]
-    seen.rows = seen.rows[:2]
-    findings = seen.judged()
-    assert still_needed(findings) == ['odom rate'] and not ready(findings)
-
-
-def test_ten_hertz_is_told_and_flies() -> None:
-    seen = healthy()
-    kept('odom', slice(None, None, 5))(seen)
-    seen.rows = odometry_rows(10.0)
-    findings = seen.judged()
-    assert {f.what: f.level for f in findings if f.level != OK} == {
-        'odom rate': WARNING, 'camera time offset': UNMEASURED}
-    measured = next(f.measured for f in findings if f.level == WARNING)
-    assert np.isclose(float(measured.split()[0]), 10.0)
+    seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
+    assert rows(seen)['planner says'] == WARNING and ready(seen.judged())
+    kept('odom', slice(2))(seen)
+    assert still_needed(seen.judged()) == ['odom rate'] and not ready(seen.judged())
