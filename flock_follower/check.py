@@ -168,10 +168,9 @@ def table(seen: Observations, findings: Sequence[Finding], colours: bool = False
     for finding in findings:
         lines += _rows(finding, colours)
     levels = [finding.level for finding in findings]
-    if ready(findings):
-        verdict = 'ready to fly' if seen.live else 'usable'
-    else:
-        verdict = 'not ready to fly' if seen.live else 'not usable as it is'
+    verdict = {(True, True): 'ready to fly', (True, False): 'not ready to fly',
+               (False, True): 'usable', (False, False): 'not usable as it is'}[
+                   seen.live, ready(findings)]
     counts = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
         ('error', levels.count(ERROR)), ('warning', levels.count(WARNING))))
     unknown = [finding.what for finding in findings if finding.level == UNMEASURED]
