@@ -28,7 +28,7 @@ from rclpy.parameter import Parameter
 from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
-from flock_follower.nodes.support.node_parameters import ValidatedNode
+from flock_follower.nodes.support.parameters import ValidatedNode
 from flock_follower.parameters.files import files_in, given, read_parameters, TABLE
 from flock_follower.parameters.planner_table import SPECS
 

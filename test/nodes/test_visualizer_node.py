@@ -39,8 +39,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
 from flock_follower.messages import Command, set_quaternion, trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
-from flock_follower.nodes.support.transforms import StaticChild, TransformBroadcaster
-from flock_follower.nodes.visualizer import LATCHED_QOS, MARKERS_TOPIC, Visualizer
+from flock_follower.nodes.support.inputs import LATCHED_QOS, StaticChild
+from flock_follower.nodes.visualizer import MARKERS_TOPIC, TransformBroadcaster, Visualizer
 
 pytestmark = pytest.mark.usefixtures('ros')
 DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time

@@ -200,7 +200,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     # As evaluate: the vehicle of a bag does not obey, so no wind can be told from that.
     node = mavlink_bridge.MavlinkBridge(parameter_overrides=[
         Parameter('wind_compensation', value='never')])
-    node._simulated = True
+    node._even_clock.simulated = True
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)
     in_air = mavlink.MAVLink_extended_sys_state_message(
@@ -214,9 +214,12 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     node._bridge.gate.permit(OffboardRequested(-math.inf))
     beat()
 
+    def take_odom(message: Odometry) -> None:
+        node._take_odom(message, clock.nanoseconds)
+
     expected = published(result, '/setpoint')
     with open_bag(bag) as messages:
-        events = [(m.stamp_ns, 1, node._take_odom, m.data, Odometry)
+        events = [(m.stamp_ns, 1, take_odom, m.data, Odometry)
                   for m in messages.messages(['/odom'])]
 
     def take_command(message: MultiDOFJointTrajectory) -> None:
