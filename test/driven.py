@@ -11,6 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
+
 """One node without an executor: a test calls its callbacks, and keeps what it publishes."""
 
 from __future__ import annotations
@@ -92,7 +93,8 @@ class Driven:
 
     def call(self, name: str, **fields: Any) -> Any:
         """Call a service; return its response."""
-        service = next(s for s in self.node.services if s.srv_name.endswith(f'/{name}'))
+        service = next(
+            s for s in self.node.services if f'/{s.srv_name}'.endswith(f'/{name}'))
         return service.callback(service.srv_type.Request(**fields), service.srv_type.Response())
 
     def problems(self, ahead: float = 0.0) -> str:

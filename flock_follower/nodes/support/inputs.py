@@ -11,6 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
+
 """Inputs of the nodes: the own state from ``odom``, static frames, and steps of the clock."""
 
 from __future__ import annotations
