@@ -67,6 +67,7 @@ from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets what backing off leaves
+DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is made up for
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
@@ -228,15 +229,18 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sta
     # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
     lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
     limits = lowered if state in (State.TRACK, State.COAST) else start
+    more = _lost_to_drag(memory, velocity, params)
     rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(nominal, vertical, velocity, *limits, params.period, rising)
+    command = limit_horizontal(nominal, vertical, velocity, limits[0], limits[1] + more,
+                               params.period, rising)
     if params.guard and (state is not State.SEARCH or memory.flock):
         bounds = _bounds(memory, me, velocity, neighbors, view, blinded, params)
-        allowed = constrained(command.acceleration, velocity, bounds, *lowered, params.period)
+        allowed = constrained(command.acceleration, velocity, bounds, params.a_max,
+                              params.v_max + more, params.period)
         if start != lowered:
             clear = constrained(allowed.acceleration, velocity, [
-                each for each in bounds if each.reason in (SEPARATION, FENCE)], *start,
-                params.period)
+                each for each in bounds if each.reason in (SEPARATION, FENCE)],
+                params.strongest, params.fastest + more, params.period)
             allowed = clear if clear.reason else allowed
         if allowed.reason:
             command = allowed._replace(reason=', '.join(filter(None, [
@@ -249,6 +253,13 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sta
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
     return command._replace(acceleration=final.acceleration, reason=reason)
+
+
+def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> float:
+    """Return the speed, m/s, by which the one predicted is too high, because of drag."""
+    speed = math.hypot(*velocity.tolist())
+    slower = params.response_time * float(memory.drag @ velocity) / speed if speed > 0.0 else 0.0
+    return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
 
 
 def _bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
