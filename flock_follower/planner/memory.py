@@ -158,7 +158,7 @@ class Memory(NamedTuple):
     pending: Array = np.zeros(3)
     """Velocity that has been commanded and not yet been flown (3,), m/s."""
     drag: Array = np.zeros(3)
-    """Acceleration that is flown and does not show in the velocity, by drag or wind (3,), m/s^2."""
+    """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
     params: PlannerParams | None = None
     """Parameters with which the law was followed in the last step; None if it was not."""
     fading: tuple[Array, float] | None = None
