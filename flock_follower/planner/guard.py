@@ -320,12 +320,10 @@ def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
     """Return what to expect of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
-    if not n.received:  # errors of own sightings are part of the guard's margin
-        return expected(n, memory.motions[n.name].acceleration, age, params)
-    it = expected(n, np.zeros(3), age, params)  # an acceleration from late messages is outdated
+    it = expected(n, memory.acceleration(n), age, params)
     offset = it.position - me.position
     distance = math.hypot(*offset.tolist())
-    if distance == 0.0:
+    if not n.received or distance == 0.0:  # errors of own sightings are part of the margin
         return it
     along = offset / distance
     variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along

@@ -175,6 +175,11 @@ class Memory(NamedTuple):
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
 
+    def acceleration(self, n: Neighbor) -> Array:
+        """Return a neighbor's acceleration (3,), m/s^2; of a received one it is outdated: zero."""
+        motion = self.motions.get(n.name)
+        return np.zeros(3) if n.received or motion is None else motion.acceleration
+
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""
         altitude = self.altitude

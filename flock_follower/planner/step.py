@@ -266,14 +266,8 @@ def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
 def _awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
     """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
     age = min(now - n.stamp, params.coast_timeout)
-    it = expected(n, _acceleration(n, memory), age, params)
+    it = expected(n, memory.acceleration(n), age, params)
     return n._replace(stamp=n.stamp + age, position=it.position, velocity=it.velocity)
-
-
-def _acceleration(n: Neighbor, memory: Memory) -> Array:
-    """Return the acceleration of a neighbor, as far as it is known (3,), m/s^2."""
-    motion = memory.motions.get(n.name)
-    return np.zeros(3) if n.received or motion is None else motion.acceleration
 
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
@@ -294,7 +288,7 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
     x, y, _ = there.position - me.position
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    soon = expected(n, _acceleration(n, memory), TRUSTED_TIME, params)
+    soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
     return Loss(towards, me.position, float(towards @ n.position), approach,
                 float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
