@@ -86,27 +86,24 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the faced neighbour is occluded.
     """
-    if not engaged:
-        return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
     lost = State.SEARCH if followed is None else State.HOLD
-    if given_up:
-        return State.IDLE if waiting else lost, (
-            f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
-            f'call planner/engage to follow again{f" ({fault})" if fault else ""}')
-    if waiting:
-        return State.IDLE, f'engaged, waiting for {waiting}'
-    if fault:
-        return lost, fault
-    if youngest is not None and youngest <= params.predict_timeout:
-        return State.TRACK, ''
-    if received is not None and received <= params.heard_timeout:
-        return State.TRACK, 'no neighbor in sight: follows received states'
-    if followed is None:
-        return State.SEARCH, 'no neighbor seen since engaging'
-    if occluded:
-        return State.HOLD, f'neighbor occluded, seen {followed:.1f} s ago'
-    reason = f'no neighbor seen for {followed:.1f} s'
-    return State.COAST if followed <= params.coast_timeout else State.HOLD, reason
+    unseen = 0.0 if followed is None else followed
+    in_sight = youngest is not None and youngest <= params.predict_timeout
+    heard = received is not None and received <= params.heard_timeout
+    rules = (  # the first that applies counts
+        (not engaged, State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'),
+        (given_up, State.IDLE if waiting else lost,
+         f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
+         f'call planner/engage to follow again{f" ({fault})" if fault else ""}'),
+        (bool(waiting), State.IDLE, f'engaged, waiting for {waiting}'),
+        (bool(fault), lost, fault),
+        (in_sight, State.TRACK, ''),
+        (heard, State.TRACK, 'no neighbor in sight: follows received states'),
+        (followed is None, State.SEARCH, 'no neighbor seen since engaging'),
+        (occluded, State.HOLD, f'neighbor occluded, seen {unseen:.1f} s ago'),
+        (unseen <= params.coast_timeout, State.COAST, f'no neighbor seen for {unseen:.1f} s'),
+        (True, State.HOLD, f'no neighbor seen for {unseen:.1f} s'))
+    return next((state, reason) for applies, state, reason in rules if applies)
 
 
 def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> str:
