@@ -307,7 +307,7 @@ def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     follows = params.altitude_mode == 'follow'
     level = neighbors.level
-    if level is None and missed is not None:
+    if level is None and missed is not None and not mode.blinded:
         level = _awaited(missed, memory, me.stamp, params)
         if level.stamp < me.stamp:
             level = level._replace(velocity=np.zeros(3), acceleration=None)
