@@ -255,10 +255,10 @@ class Flight:
                 errors.odometry(self.own[-1])
         elif topic == '/truth/odom':
             for errors in self.errors.values():
-                errors.true_odometry(from_odometry(message))
+                errors.truth(from_odometry(message), own=True)
         elif topic == '/truth/neighbors':
             for errors in self.errors.values():
-                errors.true_neighbor(from_odometry(message))
+                errors.truth(from_odometry(message))
         elif topic == '/camera_info':
             self.info = message
             if self.perceiver.take_camera_info(message):

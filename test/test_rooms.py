@@ -73,7 +73,7 @@ ROOMS = {
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
                    'mavlink messages nodes parameters perception planner runs scenarios '
-                   'sensors support vehicles', 'ROS cv2 numpy yaml'),
+                   'sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy', 'tqdm'}  # not on a drone
 IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')

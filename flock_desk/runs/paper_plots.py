@@ -378,8 +378,7 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
     """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column
-            for who, places in (('leader', flight.leader), ('follower', flight.follower))
-            for name, column in zip('xy', places.T)}
+            for who, places in flight.paths.items() for name, column in zip('xy', places.T)}
     return with_gaps({**flight.table, **true})
 
 

@@ -60,12 +60,13 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD, GroundStationReport
+from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.permission import Phase, SecondCommander
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
+from flock_follower.mavlink.velocity_check import ODOM
 from flock_follower.messages import (
     from_trajectory,
     OdometryState,
@@ -143,7 +144,7 @@ class MavlinkBridge(FlockNode):
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
-            ground_station=GroundStationReport() if values['report_to_gcs'] else None)
+            report_to_gcs=values['report_to_gcs'])
         self._even_clock = EvenClock(self)
         self._odom_frame = 'odom'
         self._new_odom: list[tuple[OdometryState, float, float]] = []
@@ -187,7 +188,9 @@ class MavlinkBridge(FlockNode):
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        if (ground_station := self._bridge.ground_station) is not None:
+        if values['report_to_gcs']:
+            ground_station = self._bridge.ground_station
+
             def take(action: Callable[..., None], *value: Any) -> None:
                 self._stream.submit(partial(action, *value, time.monotonic()))
             self.subscribe(String, 'planner/state', lambda message: take(
@@ -300,14 +303,12 @@ class MavlinkBridge(FlockNode):
     def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
         """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
         for state, age, now in taken:
-            refusals = [self._bridge.on_odometry(
-                state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
-                math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
+            refusals = [self._bridge.gate.update_velocity(
+                ODOM, state.velocity, age, now, yaw=yaw_from_quaternion(state.quaternion),
+                position=state.position,
+                std=math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
             if self._settings.values['forward_odometry']:
-                refusals.append(self._bridge.forward(ForwardedOdometry(
-                    now - age, state.position, state.quaternion, state.velocity,
-                    state.angular_velocity, state.pose_covariance, state.velocity_covariance,
-                    state.twist_covariance[3:, 3:]), now))
+                refusals.append(self._bridge.forward(state, now - age, now))
             for refused in filter(None, refusals):
                 self._report.refused(f'odom {refused}', f'stamp {age:.3f} s old')
 
