@@ -46,12 +46,11 @@ from flock_desk.runs.record import FlightRecord, read_replayed
 from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.files import resource, whole_file
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.resources import resource
-from flock_follower.whole_file import whole_file
 
 # The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
 # faster than the 0.5 m/s of a first flight.

@@ -55,8 +55,8 @@ from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import evaluation_figures
 from flock_follower.checks.findings import ERROR, ready, WARNING
 from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.files import resource
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
-from flock_follower.resources import resource
 
 _OPTIONS = {
     'bag': {'type': Path, 'nargs': '+', 'help': '.mcap, .db3, .bag or ROS 2 bag folder'},

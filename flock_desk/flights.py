@@ -58,9 +58,9 @@ from flock_desk.scenarios.scenario_file import (
     ScenarioError,
     with_flock,
 )
+from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21

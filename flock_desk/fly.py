@@ -46,8 +46,8 @@ from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
+from flock_follower.files import whole_file
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 BUSY = 0.02  # of the images, not rendered in time: the machine was too slow

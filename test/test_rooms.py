@@ -34,7 +34,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'geometry', 'live_line', 'ranges', 'resources', 'whole_file'}
+SHARED = {'files', 'geometry', 'ranges'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
@@ -48,16 +48,15 @@ ROOMS = {
     'bags': ('', 'mcap numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
-    'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
     'follower': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
-    'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink yaml'),
-    'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
-              'planner support visualization', 'ROS numpy'),
+    'support': ('checks mavlink messages odometry parameters planner',
+                'ROS numpy pymavlink yaml'),
+    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support',
+              'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),
     'external': ('mavlink', 'numpy pymavlink'),

@@ -23,7 +23,7 @@ import sys
 from typing import Any
 
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
-from flock_follower.live_line import LOG_PERIOD, TERMINAL_PERIOD
+from flock_follower.bags.live_line import LOG_PERIOD, TERMINAL_PERIOD
 from flock_follower.ranges import Range
 
 WIDTH = 100  # characters of a bar

@@ -40,9 +40,9 @@ import numpy as np
 from flock_desk.flocks.agents import Simulation
 from flock_desk.runs.plots import with_gaps
 from flock_desk.runs.record import LiveRecord
+from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.

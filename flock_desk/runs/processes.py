@@ -38,7 +38,7 @@ from types import FrameType, TracebackType
 from typing import TypeVar
 
 from flock_follower.checks.system import dead_segments
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 #: A flight is not judged if its processes, ready to run, wait for a processor for more than this
 #: share of the time for which they wait or run, over so long, s.

@@ -47,8 +47,8 @@ import yaml
 from flock_desk.scenarios.courses import course
 from flock_desk.scenarios.flock import Flock
 from flock_desk.scenarios.scenario import Scenario
+from flock_follower.files import resource
 from flock_follower.ranges import Range
-from flock_follower.resources import resource
 
 FOLDER = 'config/scenarios'
 _VARIANTS = 'variants'

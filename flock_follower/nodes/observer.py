@@ -50,6 +50,7 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
@@ -61,7 +62,6 @@ from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import files_in, given, shared, unheeded
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
-from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics

@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
+from flock_follower.files import resource
 from flock_follower.parameters.files import (
     files_in,
     given,
@@ -36,7 +37,6 @@ from flock_follower.parameters.files import (
 from flock_follower.parameters.planner_table import build
 from flock_follower.perception import markers as neighbors
 from flock_follower.planner.params import Member, RADIUS, ROLES
-from flock_follower.resources import resource
 
 
 def of(node: str, **values: Any) -> dict[str, Any]:

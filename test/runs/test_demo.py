@@ -31,9 +31,9 @@ from flock_desk.runs.summary import evaluation_figures, replay_figures
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import read_parameters, TABLE
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 
