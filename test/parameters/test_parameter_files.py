@@ -156,19 +156,6 @@ def reported(path: Path, node: str, document: Any) -> str:
     return warning.replace(str(path), 'warning')
 
 
-@pytest.mark.parametrize('node', ['/planner', '/drone1/planner'])
-@pytest.mark.parametrize(('section', 'root', 'drone'), [
-    # Whom rclpy 7.1.6 gives what is in a section; see test_parameters for the proof.
-    ('planner', True, False), ('/planner', True, False), ('/**', True, True),
-    ('/*', True, False), ('**', True, True), ('/**/planner', True, True),
-    ('/*/planner', False, True), ('drone1/planner', False, True), ('/drone1/*', False, True),
-    ('/drone1/**', False, True), ('/*/**', True, True), ('/a/**/planner', False, False)])
-def test_a_file_passes_in_silence_where_ros_takes_something_from_it(
-        tmp_path: Path, section: str, root: bool, drone: bool, node: str) -> None:
-    heeded = drone if 'drone' in node else root
-    assert (reported(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
-
-
 def test_namespaces_may_nest(tmp_path: Path) -> None:
     nested = {'drone1': {'planner': PARAMETERS, 'camera': PARAMETERS}}
     assert reported(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
