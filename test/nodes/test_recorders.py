@@ -235,7 +235,7 @@ def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
     process = vehicle.start('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
                             '/vio/odom:nav_msgs/msg/Odometry')
     wait_until(vehicle.odom.get_subscription_count, 20.0, 'the recorder')
-    vehicle.fly(0.2)
+    vehicle.fly(1.0)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=20.0)
     assert (process.returncode, 'Traceback' in error) == (0, False), error
