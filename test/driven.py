@@ -54,11 +54,19 @@ class Driven:
         self.now = START
         self.sent: dict[str, list[Any]] = defaultdict(list)
         self.diagnostics = node.diagnostics
-        self.counters, self.values = node.diagnostics.counters, node.diagnostics.values
+        self.counters = node.diagnostics.counters
         space = node.get_namespace().rstrip('/')
         for publisher in node.publishers:
             name = publisher.topic_name.removeprefix(f'{space}/').lstrip('/')
             publisher.publish = self.sent[name].append
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Return the values of /diagnostics."""
+        found = dict(self.diagnostics.values)
+        for part in self.diagnostics.parts.values():
+            found |= part
+        return found
 
     def give(self, topic: str, message: Any, number: int | None = None,
              received: int | None = 0) -> None:

@@ -144,9 +144,8 @@ class BridgeReport:
         self._log_link(now)
         self._log_parameters()
         self._log_own_requests()
-        self._diagnostics.values.pop(NOT_READY, None)
-        self._diagnostics.values.update({
-            **self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)})
+        self._diagnostics.parts['bridge'] = {
+            **self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)}
         return None
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
@@ -235,21 +234,20 @@ class BridgeReport:
 
     def _log_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
-        check, values = self._bridge.housekeeping.parameters, self._diagnostics.values
+        check = self._bridge.housekeeping.parameters
         result = check.result()
         if result is None:
             return
-        values['parameters'] = (
-            f'{result.differing} of {result.answered} differ, {result.unanswered} unanswered')
+        lines = {name: rest for name, _, rest in (line.partition(' ') for line in result.lines)}
+        self._diagnostics.parts['parameters'] = {
+            'parameters': f'{result.differing} of {result.answered} differ, '
+                          f'{result.unanswered} unanswered',
+            **{f'{PARAMETER}{name}': rest for name, rest in lines.items()}}
         if check is self._reported_check:
             return
         self._reported_check = check
-        for key in [key for key in values if key.startswith(PARAMETER)]:
-            del values[key]
         for line in result.lines:
             self._node.get_logger().warning(f'parameter {line}')
-            name, _, rest = line.partition(' ')
-            values[f'{PARAMETER}{name}'] = rest
         if result.answered and not result.lines:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')

@@ -160,15 +160,16 @@ class Diagnostics:
     """
     The diagnostics of one node.
 
-    ``values`` holds key-value pairs, ``counters`` the rejections by reason, ``checks`` functions
-    that return a problem ``(level, message)`` or None and are asked at each publication; one that
-    raises is an internal error and hides no other. The status shows the worst problem; every
-    problem is also logged at most once per 5 s.
+    ``values`` holds key-value pairs, ``parts`` those that are replaced together, ``counters`` the
+    rejections by reason, ``checks`` functions that return a problem ``(level, message)`` or None
+    and are asked at each publication; one that raises is an internal error and hides no other. The
+    status shows the worst problem; every problem is also logged at most once per 5 s.
     """
 
     def __init__(self, node: Node, period: float = 1.0) -> None:
         self._node = node
         self.values: dict[str, Any] = {}
+        self.parts: dict[str, dict[str, Any]] = {}
         self.counters: Counter[str] = Counter()
         self.rates: dict[str, Rate] = {}
         self.latencies: dict[str, Latency] = {}
@@ -251,10 +252,11 @@ class Diagnostics:
             name=self._node.get_fully_qualified_name().lstrip('/'),
             level=problems[0][0] if problems else OK,
             message='; '.join(message for _, message in problems) or 'running')
-        values = {**self.values,
-                  **{name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}}
-        for name, latency in self.latencies.items():
-            values |= latency.values(name)
+        values = dict(self.values)
+        for part in (*self.parts.values(), *(
+                latency.values(name) for name, latency in self.latencies.items())):
+            values |= part
+        values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
         values |= {f'rejected: {reason}': n for reason, n in self.counters.items()}
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
