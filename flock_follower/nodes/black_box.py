@@ -33,7 +33,6 @@ import time
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from flock_follower.bags.bag import deserialize, serialize
@@ -45,7 +44,7 @@ from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.diagnostics import ERROR, Problem
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory_for_images,
@@ -140,8 +139,7 @@ class BlackBox(FlockNode):
         for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
             deserialize(serialize(empty(msgtype), msgtype), msgtype)
         self._flown = FlownParameters(self, OURS, self._notes.__setitem__)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
+        self.create_timer(ASK_PERIOD, self._flown.ask, clock=STEADY)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
         if shares_memory():

@@ -47,7 +47,6 @@ from typing import Any
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from sensor_msgs.msg import Range
 from std_msgs.msg import String
@@ -75,7 +74,12 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
-from flock_follower.nodes.support.diagnostics import internal_error, listed, publishers
+from flock_follower.nodes.support.diagnostics import (
+    internal_error,
+    listed,
+    publishers,
+    STEADY,
+)
 from flock_follower.nodes.support.inputs import (
     best_effort,
     EvenClock,
@@ -178,7 +182,7 @@ class MavlinkBridge(FlockNode):
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
         self.create_timer(1.0 / rate, self._hand_over_odom,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+                          clock=STEADY)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for name, kind in SERVICES.items():

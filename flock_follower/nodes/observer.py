@@ -31,8 +31,6 @@ from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
-from rclpy.clock import Clock as SteadyClock
-from rclpy.clock import ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -55,6 +53,7 @@ from flock_follower.checks.topic_names import (
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
 from flock_follower.nodes.support.parameters import RemoteParameters
@@ -99,9 +98,8 @@ class Observer(Node):
         self._remote: dict[str, RemoteParameters] = {}
         self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
-        steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(POLL_PERIOD, self._ask_nodes, clock=steady)
-        self.create_timer(POLL_PERIOD, self._subscribe, clock=steady)
+        self.create_timer(POLL_PERIOD, self._ask_nodes, clock=STEADY)
+        self.create_timer(POLL_PERIOD, self._subscribe, clock=STEADY)
 
     def observe(self) -> Observations:
         """Listen, and return the observations."""

@@ -33,7 +33,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -63,7 +62,7 @@ from flock_follower.nodes.shapes import (
     Snapshot,
 )
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
-from flock_follower.nodes.support.diagnostics import publishers
+from flock_follower.nodes.support.diagnostics import publishers, STEADY
 from flock_follower.nodes.support.inputs import (
     BASE,
     best_effort,
@@ -130,8 +129,7 @@ class Visualizer(FlockNode):
         self._static = StaticChild(self)
         self._transforms = TransformBroadcaster(self, self._static, values['odom_tf'])
         self._markers = self.create_publisher(MarkerArray, MARKERS_TOPIC, 1)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=steady)
+        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=STEADY)
 
     def _take_odom(self, message: Odometry) -> None:
         self._own = from_odometry(message)

@@ -25,7 +25,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 import time
 import traceback
-from typing import Any
+from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -39,6 +39,8 @@ ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
 NONE_SENDING = 'none sending'
+#: The clock of timers that setting the system clock must not stop.
+STEADY: Final = Clock(clock_type=ClockType.STEADY_TIME)
 Problem = tuple[bytes, str]
 
 
@@ -178,8 +180,7 @@ class Diagnostics:
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(period, self.publish, clock=self._steady)
+        self._timer = node.create_timer(period, self.publish, clock=STEADY)
 
     def watch(self, topic: str, msg_type: Any, qos: QoSProfile, *, timeout: float = 2.0,
               required: bool = True, of: str = '') -> Input:
