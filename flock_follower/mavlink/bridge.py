@@ -35,7 +35,7 @@ from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD, LAND
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
-from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
@@ -252,7 +252,7 @@ class Bridge:
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
-                               self.link.target_system, self.link.target_component)
+                               self.link.target_system, AUTOPILOT_COMPONENT)
 
     def _boot_time(self, now: float) -> int:
         """Return the ``time_boot_ms`` of messages sent at ``now``, s: ms since the start."""
