@@ -32,7 +32,6 @@ from flock_follower.follower import Follower, ImageOutcome, Listener
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_range,
@@ -156,5 +155,5 @@ class RecordedFlight:
         if not self._began:
             self._began = True
             self.follower.engage(time, True)
-            self.follower.permit(time, OffboardRequested(-math.inf))
+            self.follower.permit(time, -math.inf)
             self.follower.vehicle(time, FLYING)

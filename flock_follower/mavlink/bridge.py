@@ -38,12 +38,7 @@ from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import (
-    EndRequested,
-    FELL_SILENT,
-    NO_AUTOPILOT,
-    Restarted,
-)
+from flock_follower.mavlink.permission import FELL_SILENT, NO_AUTOPILOT
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -315,7 +310,7 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.gate.permit(EndRequested('the bridge is stopping'))
+        self.gate.permit(self.gate.permission.ended('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
@@ -346,6 +341,6 @@ class Bridge:
         if before != self._vehicle:
             if before[1] != self._vehicle[1] and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
-            self.gate.permit(Restarted('the autopilot rebooted' if before[0] != self._vehicle[0]
-                                       else _OTHER_VEHICLE))
+            self.gate.permit(self.gate.permission.restarted(
+                'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
         self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

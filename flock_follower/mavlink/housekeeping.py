@@ -134,7 +134,6 @@ ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
 #: The rates of the other messages wanted from any autopilot, Hz.
 RATES: Final[Mapping[int, float]] = MappingProxyType({
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
     mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
@@ -166,6 +165,7 @@ WHY_WAIT: Final[float] = 3.0
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
     return {dialect.mode_message: dialect.mode_rate, dialect.estimator_status: 5.0,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
             **dict.fromkeys(ESTIMATE.values(), estimate_rate), **RATES}
 
 

@@ -33,7 +33,7 @@ from flock_follower.mavlink.envelope import (
     vertical_range,
 )
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.permission import Permission
 from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide
 from flock_follower.messages import Command
 
@@ -48,7 +48,7 @@ class FlownGate:
     def __init__(self, limits, height=3.0, thrust_error=0.0, climb_error=0.0, seed=0,
                  noise=NOISE):
         self.gate = Gate(limits, 'odom')
-        self.gate.permit(OffboardRequested(-1.0))
+        self.gate.permit(Permission().requested(-1.0))
         self.gate.see(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
         self.response, self.thrust_error = np.zeros(3), thrust_error
@@ -169,7 +169,7 @@ def test_the_bounds_are_those_of_the_approach_speeds():
 def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     limits = GateLimits()
     rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
-    gate.permit(OffboardRequested(-1.0))
+    gate.permit(Permission().requested(-1.0))
     gate.see(FLOWN, 0.0, airborne=None)
     sent = []
     for k in range(400):

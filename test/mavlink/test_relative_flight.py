@@ -26,7 +26,6 @@ from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import approach_speed, GateLimits, Location
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.relative_flight import LONGEST_STEP, Reckoning, Relative
 from flock_follower.mavlink.setpoint_rules import COMMAND, decide, encode_setpoint, LEVEL, NONE
 from flock_follower.mavlink.velocity_check import KnownMotion, Motion, ODOM
@@ -121,7 +120,7 @@ class Flown:
         self.flown = []  # times of commands on the marker alone
 
     def permit(self):
-        self.gate.permit(OffboardRequested(self.now - 0.001))
+        self.gate.permit(self.gate.permission.requested(self.now - 0.001))
 
     def cycle(self, relative, status=OFFBOARD, command=True):
         self.now += 0.05

@@ -36,7 +36,6 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import set_quaternion, set_vector, to_array
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
@@ -156,7 +155,7 @@ class Bench:
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
         self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
         gate = self.bridge.gate
-        self.node._stream.submit(lambda: gate.permit(OffboardRequested(time.monotonic())))
+        self.node._stream.submit(lambda: gate.permit(gate.permission.requested(time.monotonic())))
         self.wait(lambda: gate.permission.streams)
         self.beat()
         self.wait(self.node._flying)
