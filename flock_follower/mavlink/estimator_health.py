@@ -206,13 +206,21 @@ class AskAgain:
     def __init__(self) -> None:
         self._asked = self._low = -math.inf
         self._vain = 0
+        self._absent = False
 
     def asked(self, now: float) -> None:
         """Begin afresh: everything was asked for at ``now``, s."""
         self._asked, self._vain = now, 0
 
-    def due(self, low: bool, now: float) -> bool:
-        """Return whether to ask at ``now``, s, where messages come too seldom (``low``) or not."""
+    def due(self, low: bool, now: float, comes: bool = True) -> bool:
+        """
+        Return whether to ask at ``now``, s.
+
+        :param low: whether messages come too seldom; ``comes``: whether any comes.
+        """
+        if comes and self._absent:
+            self.asked(now)  # in vain before, since there was no estimate to send
+        self._absent = not comes
         if not low:
             if now - max(self._low, self._asked) >= SHORTEST_WAIT:
                 self._vain = 0

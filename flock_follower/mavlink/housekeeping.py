@@ -197,7 +197,6 @@ class Housekeeping:
         self._reboots = 0
         self._was_alive = False
         self._request_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
-        self._absent: set[int] = set()
         self._watched_since = math.inf
 
     def take_timesync(self, message: Any, now: float) -> None:
@@ -281,15 +280,14 @@ class Housekeeping:
                 'set signing_key_file')
 
     def _request_streams(self, now: float) -> None:
-        telemetry = self._link.telemetry
-        dialect = telemetry.dialect
+        telemetry, dialect = self._link.telemetry, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
         # These must not come less often, Hz: what braking and the pilot's switch rest on.
-        watched = {message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status)} | {
-                dialect.mode_message: dialect.least_mode_rate}
+        watched = {**{message_id: wanted[message_id] for message_id in (
+            *ESTIMATE.values(), dialect.estimator_status)},
+            dialect.mode_message: dialect.least_mode_rate}
         unreported = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
@@ -299,16 +297,12 @@ class Housekeeping:
             for message_id in watched:
                 self._request_again[message_id].asked(now)
             return
-        arrivals, due = telemetry.arrivals, {}
-        for message_id, least in watched.items():
-            again = self._request_again[message_id]
-            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
-            if comes and message_id in self._absent:
-                again.asked(now)  # in vain before, since there was no estimate to send
-            (self._absent.discard if comes else self._absent.add)(message_id)
-            if again.due(arrivals.too_seldom(message_id, least, now), now):
-                due[message_id] = wanted[message_id]
-        self._link.request_streams(due)
+        arrivals = telemetry.arrivals
+        self._link.request_streams({
+            message_id: wanted[message_id] for message_id, least in watched.items()
+            if self._request_again[message_id].due(
+                arrivals.too_seldom(message_id, least, now), now,
+                arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0)})
 
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin
