@@ -26,7 +26,6 @@ from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
@@ -35,10 +34,9 @@ from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
+from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 
-# Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
 
@@ -62,8 +60,9 @@ class BridgeOutputs:
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
             bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
-        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', STATE_QOS)
+        self._states = node.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
+        self._armed_at = node.create_publisher(
+            PointStamped, 'mavlink_bridge/armed_at', LATCHED_QOS)
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
         self.place: tuple[OdometryState, float] | None = None
