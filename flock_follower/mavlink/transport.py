@@ -241,7 +241,8 @@ class TcpTransport(_Line):
             connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
-            connection.connect_ex(self._address)
+            with contextlib.suppress(BlockingIOError):  # under way
+                connection.connect(self._address)
             return connection.detach()
 
 
