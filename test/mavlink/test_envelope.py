@@ -34,7 +34,8 @@ from flock_follower.mavlink.envelope import (
 )
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import Permission
-from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide
+from flock_follower.mavlink.relative_flight import Relative
+from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, Held
 from flock_follower.messages import Command
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
@@ -183,7 +184,8 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
         sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
                            command_age=0.0, link_age=0.0, armed=True, airborne=False,
-                           place=gate.place(now)))
+                           place=gate.place(now), withheld='', unplaced='', held=Held(),
+                           relative=Relative(), wind=np.zeros(3), offset=0.0))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
 
