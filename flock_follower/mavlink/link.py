@@ -97,28 +97,19 @@ class Framer:
         buffer = self._waiting + data
         messages: list[Any] = []
         unused: Counter[str] = Counter()
-        start, incomplete, whole = 0, -1, 0
-        self.looks = 0
+        start, rest, whole, self.looks = 0, len(buffer), 0, 0
         while (start := _next_marker(buffer, start)) >= 0:
             if self.looks >= most or self.looks - whole > MOST_FALSE_STARTS:
-                incomplete = -1
+                rest = len(buffer)
                 break
             self.looks += 1
             end = start + frame_length(buffer, start)
             if end > len(buffer):
                 # Either the rest has not arrived yet, or this byte was no start. Look on: a whole
                 # message behind it shows that it was none.
-                incomplete = start if incomplete < 0 else incomplete
-                start += 1
+                rest, start = min(rest, start), start + 1
                 continue
-            self.codec.refusal = WRONG_SIGNATURE  # of a message without a signature
-            try:
-                message = self.codec.decode(buffer[start:end])
-                # Another dialect's, or garbage: an unknown kind has no checksum.
-                fault = UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
-            except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
-                signed = 'signature' in str(error).lower()
-                fault = self.codec.refusal if signed else UNDECODABLE
+            message, fault = self._decode(buffer[start:end])
             if fault:
                 unused[fault] += 1
             else:
@@ -126,11 +117,22 @@ class Framer:
             if fault in (UNDECODABLE, UNKNOWN_MESSAGE):
                 start += 1
             else:
-                start, incomplete, whole = end, -1, whole + 1
-        if not messages and not unused and incomplete < 0:
-            unused[UNDECODABLE] += bool(buffer)
-        self._waiting = buffer[incomplete:] if incomplete >= 0 else bytearray()
+                start, rest, whole = end, len(buffer), whole + 1
+        self._waiting = buffer[rest:]
+        if buffer and not messages and not unused and not self._waiting:
+            unused[UNDECODABLE] += 1
         return messages, unused
+
+    def _decode(self, data: bytearray) -> tuple[Any, str]:
+        """Return a message, and why it cannot be used, or ''."""
+        self.codec.refusal = WRONG_SIGNATURE  # of a message without a signature
+        try:
+            message = self.codec.decode(data)
+        except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
+            signed = 'signature' in str(error).lower()
+            return None, self.codec.refusal if signed else UNDECODABLE
+        # Another dialect's, or garbage: an unknown kind has no checksum.
+        return message, UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
 
 
 def frame_length(buffer: bytearray, start: int) -> int:
