@@ -202,7 +202,7 @@ class Requests:
              'no LOCAL_POSITION_NED: the height reached would be unknown'),
             (name and name not in values,
              f'{name} is not known yet: {climbs} that high at least'),
-            (height < least - TOLERANCE,
+            (not height >= least - TOLERANCE,
              f'{climbs} to {name} = {least:g} m, above takeoff_height = {height:g} m'),
             (reached < limits.height_min, f'{above}height_min = {limits.height_min:g} m'),
             (reached > limits.height_max, f'{above}height_max = {limits.height_max:g} m'))
