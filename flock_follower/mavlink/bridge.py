@@ -222,8 +222,8 @@ class Bridge:
             self._look(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
-        self.gate.distrust(self.distrusted(now), now)
-        setpoint, accepted = self.gate.decide(now, self.telemetry.silence(now), self.withheld())
+        setpoint, accepted = self.gate.decide(
+            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
         if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
@@ -331,7 +331,8 @@ class Bridge:
             self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
         if self.withheld():
             return
-        setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
+        setpoint, _ = self.gate.decide(
+            now, self.telemetry.silence(now), distrusted=self.distrusted(now))
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 

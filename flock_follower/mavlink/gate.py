@@ -212,10 +212,6 @@ class Gate:
         """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
         return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
-    def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity of the autopilot is invalid, or ''."""
-        self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
-
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
         self._sources[source].take_yaw(yaw, time)
@@ -294,7 +290,7 @@ class Gate:
         ) or envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, setpoint_rules.HANDOVER_TIME)
 
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, s, and the command it comes from, if any.
@@ -304,9 +300,11 @@ class Gate:
 
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
+        :param distrusted: why the velocity of the autopilot is invalid, or ''.
         """
         self.new_command = False
         self._notice_landing(now)
+        self._distrusted_since = min(self._distrusted_since, now) if distrusted else math.inf
         active = self.permission.phase is Phase.ACTIVE
         self.active_since = min(self.active_since, now) if active else math.inf
         status, withheld = self._status, withheld or self.withheld

@@ -120,11 +120,6 @@ class TimeSync:
         """Return the best of the recent answers, None without one."""
         return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
 
-    def forget(self) -> None:
-        """Drop all samples: the autopilot's clock has restarted."""
-        self._samples.clear()
-        self._asked.clear()
-
 
 #: Telemetry is requested again after this, s, until the vehicle reports whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
@@ -215,7 +210,7 @@ class Housekeeping:
         reboots = self._link.telemetry.reboots
         if reboots != self._reboots or (alive and not self._was_alive):
             self._reboots = reboots
-            self.timesync.forget()
+            self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._streams_requested, self.parameters = -math.inf, self._new_check()
             self._watched_since = now
             self.alive_since = min(self.alive_since, now)
@@ -302,7 +297,7 @@ class Housekeeping:
             message_id: wanted[message_id] for message_id, least in watched.items()
             if self._request_again[message_id].due(
                 arrivals.too_seldom(message_id, least, now), now,
-                arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0)})
+                bool(arrivals.recent(message_id, now, STREAM_REQUEST_PERIOD)))})
 
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin
