@@ -56,7 +56,6 @@ from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
@@ -191,7 +190,7 @@ class RecordedFlight:
         if not self._began:
             self._began = True
             self.follower.engage(time, True)
-            self.follower.permit(time, OffboardRequested(-math.inf))
+            self.follower.permit(time, -math.inf)
             self.follower.vehicle(time, FLYING)
         if name == 'camera_info':
             calibration = data[_AFTER_STAMP:]
