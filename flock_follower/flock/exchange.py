@@ -28,7 +28,7 @@ sender repeatedly do not fit, its frame has changed and is aligned again.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 import math
 
 from flock_follower.flock.alignment import FrameAlignment, in_own_frame, PairedFrames
@@ -93,7 +93,8 @@ class Sharing:
         self.senders: dict[str, Sender] = {}
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
-        self._tracks: dict[tuple[str, str], Track] = {}  # by frame and vehicle
+        # By frame and vehicle.
+        self._tracks: dict[str, dict[str, Track]] = defaultdict(lambda: defaultdict(Track))
         self._pairs: dict[tuple[str, str], PairedFrames] = {}
         self._related: dict[tuple[str, str, str], int] = {}
         self._last_round: int | None = None
@@ -119,7 +120,7 @@ class Sharing:
                 self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
                 self._align_all_anew(forget_senders=back > 0)
         self._own = state
-        self._remember(self.name, self.name, track_point(state, True))
+        self._tracks[self.name][self.name].add(track_point(state, True))
         return None
 
     def take_seen(self, state: OdometryState) -> None:
@@ -215,12 +216,9 @@ class Sharing:
         return (f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
                 f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
 
-    def _remember(self, frame: str, vehicle: str, point: TrackPoint) -> None:
-        self._tracks.setdefault((frame, vehicle), Track()).add(point)
-
     def _relate(self, frame: str, vehicle: str, point: TrackPoint) -> bool:
         """Remember a vehicle in a frame, relate that to another; return whether that fits."""
-        self._remember(frame, vehicle, point)
+        self._tracks[frame][vehicle].add(point)
         other = self._other_frame(frame, vehicle, point.stamp)
         if other is None or self._own is None:
             return True
@@ -253,14 +251,14 @@ class Sharing:
         """
         best: tuple[float, str, TrackPoint] | None = None
         for name in (self.name, *self.senders):
-            if name == frame or (name, vehicle) not in self._tracks:
+            if name == frame or vehicle not in self._tracks[name]:
                 continue
             doubt = self.frames.stds(name)[0]
             if name == self.name or (name == vehicle and name in self.frames):
                 doubt = -2.0 if name == self.name else -1.0
             if best is not None and doubt >= best[0]:
                 continue
-            point = self._tracks[name, vehicle].at(stamp)
+            point = self._tracks[name][vehicle].at(stamp)
             if point is not None:
                 best = doubt, name, point
         return None if best is None else best[1:]
@@ -292,7 +290,7 @@ class Sharing:
 
     def _forget_frame(self, name: str) -> None:
         self.frames.drop(name)
-        self._tracks = {key: each for key, each in self._tracks.items() if key[0] != name}
+        self._tracks.pop(name, None)
         self._pairs = {names: each for names, each in self._pairs.items() if name not in names}
         self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
 
@@ -302,11 +300,11 @@ class Sharing:
         self._seen.clear()
         self._pairs.clear()
         self._related.clear()
-        self._tracks = {key: each for key, each in self._tracks.items()
-                        if key[0] != self.name and not forget_senders}
+        self._tracks.pop(self.name, None)
         for sender in self.senders.values():
             sender.refused = 0
         if forget_senders:
+            self._tracks.clear()
             self.senders.clear()
 
     # Out.
