@@ -50,6 +50,7 @@ from flock_follower.flock.peers import (
     sender_of,
     SENDERS_MAX,
     SenderStatus,
+    TOO_FAST,
     too_fast,
     Track,
     track_point,
@@ -107,7 +108,7 @@ class Sharing:
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
         if problem := too_fast(state):
-            return self._refuse(f'own odometry {problem[0]}', problem[1])
+            return self._refuse(f'own odometry {TOO_FAST}', problem)
         before = self._own
         if before is not None:
             back = before.stamp - state.stamp
@@ -132,7 +133,7 @@ class Sharing:
             return self._refuse('sighting before own odometry', name)
         problem = too_fast(state)
         if problem or name == self.name or state.frame != own.frame:
-            return self._refuse('unusable sighting', problem[1] if problem else (
+            return self._refuse('unusable sighting', problem or (
                 f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
         before = self._seen.get(name)
         if before is not None and 0 <= before.stamp - state.stamp <= STALE:
