@@ -129,7 +129,7 @@ class FrameAlignment:
         """Return the own-frame position (3,) of a position, and the frame's share (3, 3) in it."""
         frame = self.frames[name]
         lever = frame.lever(position)
-        H = _lever_matrix(lever)
+        H = _lever_matrix(lever)[:3]
         return frame.place + lever, H.dot(self.covariance(name)).dot(H.T)
 
     def drop(self, name: str) -> None:
@@ -199,44 +199,32 @@ class FrameAlignment:
 
         :param first: the frame and the track point in it.
         """
-        columns: list[int] = []
-        parts: list[Array] = []
-        gap: Array = np.zeros(3)
-        noise: Array = np.zeros((3, 3))
-        yaw_gap, yaw_noise = 0.0, 0.0
+        H = np.zeros((_SIZE, len(self._covariance)))
+        gap, noise = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))  # of position and yaw
         for sign, (name, there) in ((1.0, first), (-1.0, second)):
-            frame, part = self.frames[name], self._part(name)
-            lever, rotation = frame.lever(there.position), frame.rotation
-            columns += range(part.start, part.stop)
-            parts.append(sign * np.vstack([_lever_matrix(lever), [1.0, 0.0, 0.0, 0.0]]))
-            gap = gap + sign * (frame.place + lever)
-            noise = noise + rotation.dot(there.covariance).dot(rotation.T)
-            yaw_gap = yaw_gap + sign * (there.yaw + frame.yaw)
-            yaw_noise = yaw_noise + there.yaw_variance
-        H = np.hstack(parts)
-        known = self._covariance[np.ix_(columns, columns)]
-        spread = H.dot(known).dot(H.T)
-        S = spread[:3, :3] + noise
-        doubt = float(gap.dot(np.linalg.solve(S, gap))) / GATE
+            frame, rotation = self.frames[name], self.frames[name].rotation
+            lever = frame.lever(there.position)
+            H[:, self._part(name)] = sign * _lever_matrix(lever)
+            gap += sign * np.append(frame.place + lever, there.yaw + frame.yaw)
+            noise[:3, :3] += rotation.dot(there.covariance).dot(rotation.T)
+            noise[3, 3] += there.yaw_variance
+        gap[3] = wrap_angle(float(gap[3]))
+        across = self._covariance.dot(H.T)
+        variance = float(H[3].dot(across[:, 3]))
+        S = H.dot(across) + noise
+        doubt = float(gap[:3].dot(np.linalg.solve(S[:3, :3], gap[:3]))) / GATE
         if not doubt <= 1.0:  # NaN is refused
             return doubt
-        innovation: Array = gap
-        rows = 3
         # Attitudes err by how markers are mounted, always alike: no average is better than that.
-        variance = float(spread[3, 3])
-        if (math.isfinite(yaw_noise) and variance > ATTITUDE_NOISE ** 2
-                and wrap_angle(yaw_gap) ** 2 <= YAW_GATE * (variance + yaw_noise)):
-            innovation, rows = np.append(gap, wrap_angle(yaw_gap)), 4
-            S = spread.copy()
-            S[:3, :3] += noise
-            S[3, 3] += yaw_noise
-        across = self._covariance[:, columns].dot(H[:rows].T)
-        gain = np.linalg.solve(S, across.T)  # (rows, 4 n), symmetric S
+        turned_alike = (math.isfinite(S[3, 3]) and variance > ATTITUDE_NOISE ** 2
+                        and gap[3] ** 2 <= YAW_GATE * S[3, 3])
+        rows = slice(4 if turned_alike else 3)
+        gain = np.linalg.solve(S[rows, rows], across[:, rows].T)  # (rows, 4 n), symmetric S
         for frame, (yaw, *place) in zip(self.frames.values(),
-                                        -innovation.dot(gain).reshape(-1, _SIZE)):
+                                        -gap[rows].dot(gain).reshape(-1, _SIZE)):
             frame.yaw = wrap_angle(frame.yaw + float(yaw))
             frame.place = frame.place + place
-        P = self._covariance - across.dot(gain)
+        P = self._covariance - across[:, rows].dot(gain)
         self._covariance = 0.5 * (P + P.T)
         return doubt
 
@@ -246,9 +234,9 @@ class FrameAlignment:
 
 
 def _lever_matrix(lever: Array) -> Array:
-    """Return the Jacobian (3, 4) of a point's position at a lever (3,), m, to yaw and place."""
-    H = np.zeros((3, _SIZE))
-    H[:, 0], H[:, 1:] = sideways(lever), np.eye(3)
+    """Return the Jacobian (4, 4) of position and yaw at a lever (3,), m, to yaw and place."""
+    H = np.zeros((_SIZE, _SIZE))
+    H[:3, 0], H[:3, 1:], H[3, 0] = sideways(lever), np.eye(3), 1.0
     return H
 
 
