@@ -240,8 +240,8 @@ def _lever_matrix(lever: Array) -> Array:
     return H
 
 
-#: Pairs kept, and for how long, ns: drift makes older ones worthless.
-MOST, LONGEST = 100, 20 * NANOSECONDS
+#: Pairs kept, and for how long, s: drift makes older ones worthless.
+MOST, LONGEST = 100, 20.0
 FEWEST = 5
 #: Errors of sightings are correlated in time: factor on the variances of a fit.
 WARINESS = 4.0
@@ -251,23 +251,28 @@ START_YAW = 0.35
 OUTLIER, AGREEING = 25.0, 0.7
 
 
-Pair = tuple[TrackPoint, TrackPoint]
-"""One vehicle in two frames, at one stamp."""
-
-
 class PairedFrames:
-    """Collects the common vehicles of two frames until the first fit."""
+    """
+    Collects the common vehicles of two frames until the first fit.
+
+    A row (10,) holds a stamp, s; the positions in both frames (3, 3), m, and their variance, m^2;
+    the difference of the yaws, rad, and its variance, infinite if a yaw is unknown.
+    """
 
     def __init__(self) -> None:
-        self._pairs: deque[Pair] = deque(maxlen=MOST)
+        self._rows: deque[Array] = deque(maxlen=MOST)
         self.yaw_std = math.pi
         """Standard deviation of the yaw between the frames, rad, at the last fit."""
 
     def add(self, one: TrackPoint, other: TrackPoint) -> None:
         """Add the track points of one vehicle in both frames, at one stamp."""
-        while self._pairs and one.stamp - self._pairs[0][0].stamp > LONGEST:
-            self._pairs.popleft()
-        self._pairs.append((one, other))
+        stamp = one.stamp / NANOSECONDS
+        while self._rows and stamp - self._rows[0][0] > LONGEST:
+            self._rows.popleft()
+        self._rows.append(np.array([
+            stamp, *one.position, *other.position,
+            (one.covariance + other.covariance).trace() / 3.0, one.yaw - other.yaw,
+            one.yaw_variance + other.yaw_variance]))
 
     def first_fit(self, swapped: bool = False) -> tuple[Frame, Array] | None:
         """
@@ -275,66 +280,52 @@ class PairedFrames:
 
         :param swapped: the first in the second.
         """
-        if len(self._pairs) < FEWEST:
+        if len(self._rows) < FEWEST:
             return None
-        pairs = [(other, one) if swapped else (one, other) for one, other in self._pairs]
-        found, covariance = _fit(pairs)
-        agreeing = [pair for pair, chi2 in zip(pairs, _misfit(pairs, found)) if chi2 < OUTLIER]
-        if len(agreeing) < max(FEWEST, AGREEING * len(pairs)):
-            if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
-                for _ in range(len(pairs) // 2):
-                    self._pairs.popleft()
+        rows = np.array(self._rows)
+        if swapped:
+            rows[:, 1:7], rows[:, 8] = rows[:, [4, 5, 6, 1, 2, 3]], -rows[:, 8]
+        found, covariance = _fit(rows)
+        agreeing = rows[_misfit(rows, found) < OUTLIER]
+        if len(agreeing) < max(FEWEST, AGREEING * len(rows)):
+            if len(rows) > 4 * FEWEST:  # the older ones may be wrong
+                for _ in range(len(rows) // 2):
+                    self._rows.popleft()
             return None
-        if len(agreeing) < len(pairs):
+        if len(agreeing) < len(rows):
             found, covariance = _fit(agreeing)
         self.yaw_std = math.sqrt(min(covariance[0, 0], math.pi ** 2))
         return (found, covariance) if self.yaw_std <= START_YAW else None
 
 
-def _variances(pairs: list[Pair]) -> Array:
+def _variances(rows: Array) -> Array:
     """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
-    age = (pairs[-1][0].stamp - np.array([one.stamp for one, _ in pairs])) / NANOSECONDS
-    return np.array([float((one.covariance + other.covariance).trace()) / 3.0
-                     for one, other in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
+    variances: Array = rows[:, 7] + 2.0 * POSITION_DRIFT ** 2 * (rows[-1, 0] - rows[:, 0])
+    return variances
 
 
-def _positions(pairs: list[Pair]) -> tuple[Array, Array]:
-    """Return the positions in both frames, (n, 3) each, m."""
-    return np.array([one.position for one, _ in pairs]), np.array([
-        other.position for _, other in pairs])
-
-
-def _fit(pairs: list[Pair]) -> tuple[Frame, Array]:
-    weights = 1.0 / _variances(pairs)
+def _fit(rows: Array) -> tuple[Frame, Array]:
+    one, other, turns = rows[:, 1:4], rows[:, 4:7], rows[:, 8]
+    weights, sure = 1.0 / _variances(rows), 1.0 / rows[:, 9]
     total = float(weights.sum())
-    one, other = _positions(pairs)
     place, anchor = weights @ one / total, weights @ other / total
     x, y = (one - place)[:, :2], (other - anchor)[:, :2]
-    along = float(weights @ (y * x).sum(axis=1))
-    across = float(weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]))
+    # A marker is always mounted alike: no number of attitudes is worth more than one.
+    sure *= min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / max(float(sure.sum()), 1e-9))
+    along = weights @ (y * x).sum(axis=1) + sure @ np.cos(turns)
+    across = weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) + sure @ np.sin(turns)
     # Noise alone spreads points by their variance on two axes.
-    known = max(0.0, float(weights @ (y * y).sum(axis=1)) - 2.0 * (len(pairs) - 1))
-    turns = [(a.yaw - b.yaw, 1.0 / (a.yaw_variance + b.yaw_variance)) for a, b in pairs
-             if a.yaw_variance + b.yaw_variance < math.inf]
-    if turns:
-        # A marker is always mounted alike: no number of attitudes is worth more than one.
-        sure = sum(weight for _, weight in turns)
-        share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
-        along += share * sum(weight * math.cos(turn) for turn, weight in turns)
-        across += share * sum(weight * math.sin(turn) for turn, weight in turns)
-        known += share * sure
+    known = sure.sum() + max(0.0, weights @ (y * y).sum(axis=1) - 2.0 * (len(rows) - 1))
     covariance = np.diag([WARINESS / max(known, 1e-6),
                           *[WARINESS / total + SIGHTING_NOISE ** 2] * 3])
     return Frame(math.atan2(across, along), place, anchor), covariance
 
 
-def _misfit(pairs: list[Pair], fit: Frame) -> Array:
+def _misfit(rows: Array, fit: Frame) -> Array:
     """Return chi^2 (n,) of the distance and attitudes of each pair from a fit."""
-    one, other = _positions(pairs)
-    gap = one - fit.place - (other - fit.anchor) @ fit.rotation.T
-    turns = np.array([wrap_angle(a.yaw - b.yaw - fit.yaw) ** 2 / (a.yaw_variance + b.yaw_variance)
-                      for a, b in pairs])
-    return np.maximum((gap * gap).sum(axis=1) / _variances(pairs), turns)
+    gap = rows[:, 1:4] - fit.place - (rows[:, 4:7] - fit.anchor) @ fit.rotation.T
+    turns = (rows[:, 8] - fit.yaw + math.pi) % (2.0 * math.pi) - math.pi
+    return np.maximum((gap * gap).sum(axis=1) / _variances(rows), turns ** 2 / rows[:, 9])
 
 
 #: Of a received velocity without covariance, m/s.
