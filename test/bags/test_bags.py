@@ -303,11 +303,20 @@ def test_a_missing_bag_an_unknown_format_and_an_empty_one_are_one_line(tmp_path)
                                                      'read')
 
 
-def test_a_broken_metadata_file_is_one_line(tmp_path):
+def shortened(path):
+    shorter = write_strings(path.parent / 'other' / 'bag', count=299)
+    shutil.copy(storage_file(shorter), storage_file(path))
+
+
+@pytest.mark.parametrize(('damage', 'said'), [
+    *((lambda path, text=text: (path / 'metadata.yaml').write_text(text),
+       'bag: corrupt, truncated or unsupported')
+      for text in ('', 'a: [', 'a: 1', 'rosbag2_bagfile_information: 3')),
+    (shortened, '299 of 300 announced messages found')])
+def test_a_folder_that_contradicts_its_files_is_one_line(tmp_path, damage, said):
     path = write_strings(tmp_path / 'bag')
-    for text in ('', 'a: [', 'a: 1', 'rosbag2_bagfile_information: 3'):
-        (path / 'metadata.yaml').write_text(text)
-        assert 'bag: corrupt, truncated or unsupported' in error_of(path)
+    damage(path)
+    assert said in error_of(path)
 
 
 def test_only_a_file_without_its_end_needs_the_library_mcap(tmp_path, monkeypatch):
@@ -316,13 +325,6 @@ def test_only_a_file_without_its_end_needs_the_library_mcap(tmp_path, monkeypatc
     assert len(read_all(tmp_path / 'bag')) == 300
     file.write_bytes(file.read_bytes()[:-200])
     assert error_of(file).endswith('needs the library mcap: pip install mcap')
-
-
-def test_a_storage_file_shorter_than_its_index_says_is_noticed(tmp_path):
-    path = write_strings(tmp_path / 'bag', count=20)
-    shorter = write_strings(tmp_path / 'other' / 'bag', count=15)
-    shutil.copy(storage_file(shorter), storage_file(path))
-    assert error_of(path).endswith('15 of 20 announced messages found')
 
 
 def test_an_unclosed_sqlite3_recording_is_noticed(tmp_path):
