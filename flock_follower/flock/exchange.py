@@ -107,81 +107,78 @@ class Sharing:
 
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
-        if problem := too_fast(state):
-            return self._refuse(f'own odometry {TOO_FAST}', problem)
-        before = self._own
+        fast, before = too_fast(state), self._own
+        if self._refused((fast, f'own odometry {TOO_FAST}', fast)):
+            return
         if before is not None:
             back = before.stamp - state.stamp
             if 0 <= back <= STALE:
-                return None  # repeated, or out of order
+                return  # repeated, or out of order
             leap = 'in time' if back > 0 else leapt(before, state)
             if before.frame != state.frame:
                 leap = f'from frame {before.frame!r} to {state.frame!r}'
-            if leap:
-                self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
+            if self._refused((leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
                 self._align_all_anew(forget_senders=back > 0)
         self._own = state
         self._tracks[self.name][self.name].add(track_point(state, True))
-        return None
 
     def take_seen(self, state: OdometryState) -> None:
         """Take an own sighting of another vehicle, as on ``neighbors``."""
-        own, name = self._own, state.child
-        if DUPLICATE in name:
-            return None  # a print is no vehicle
-        if own is None:
-            return self._refuse('sighting before own odometry', name)
-        problem = too_fast(state)
-        if problem or name == self.name or state.frame != own.frame:
-            return self._refuse('unusable sighting', problem or (
-                f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
-        before = self._seen.get(name)
-        if before is not None and 0 <= before.stamp - state.stamp <= STALE:
-            return None
-        if before is None and len(self._seen) >= SEEN_MAX:
-            return self._refuse('too many vehicles', name)
-        if not is_covariance(state.pose_covariance[:3, :3]):
-            return self._refuse('sighting without a covariance', name)
+        name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
+        frame = None if self._own is None else self._own.frame
+        # A second print of a marker is no vehicle.
+        if DUPLICATE in name or self._refused(
+                (frame is None, 'sighting before own odometry', name),
+                (fast, 'unusable sighting', fast),
+                (name == self.name or state.frame != frame, 'unusable sighting',
+                 f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')):
+            return
         doubt = float(position_covariance(state, False).trace())
-        if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
-            return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
+        if (before is not None and 0 <= before.stamp - state.stamp <= STALE) or self._refused(
+                (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
+                (not is_covariance(state.pose_covariance[:3, :3]), 'sighting without a covariance',
+                 name),
+                # It is known by its ranges alone, for a while.
+                (doubt > POSITION_STD_MAX ** 2, 'known too vaguely',
+                 f'{name}: to {math.sqrt(max(doubt, 0.0)):.2f} m')):
+            return
         self._seen[name] = state
         self._relate(self.name, name, track_point(state, False))
-        return None
 
     def take_message(self, state: OdometryState, received: int) -> None:
         """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
         name = sender_of(state.frame)
-        if not name:
-            return self._refuse(
-                'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
-                f'NAME{FRAME}, where NAME is the sending vehicle')
-        if name == self.name:
-            if _key(state) not in self._echoes:  # else an own message that came back
-                self._refuse('another vehicle uses this name',
-                             f'{name} sends {state.child[:70]!r}')
-            return None
-        sender = self.senders.get(name)
+        known = name in self.senders
+        # An own message may come back.
+        if self._refused(
+                (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
+                 f'NAME{FRAME}, where NAME is the sending vehicle'),
+                (name == self.name and _key(state) not in self._echoes,
+                 'another vehicle uses this name', f'{name} sends {state.child[:70]!r}')) or (
+                     name == self.name):
+            return
         if refused := refusal(state, received):
-            if refused[0] == FUTURE and sender is not None:
-                sender.ban(received, 'has a clock that is ahead')
-            return self._refuse(*refused)
-        if sender is None:
-            if len(self.senders) >= SENDERS_MAX:
-                return self._refuse('too many senders', name)
-            sender = self.senders[name] = Sender(name)
+            if refused[0] == FUTURE and known:
+                self.senders[name].ban(received, 'has a clock that is ahead')
+            self._refuse(*refused)
+            return
+        if self._refused((not known and len(self.senders) >= SENDERS_MAX, 'too many senders',
+                          name)):
+            return
+        sender = self.senders.setdefault(name, Sender(name))
         sender.received = received
-        if why := sender.banned(received):
-            return self._refuse('ignored for a while', f'{name} {why}')
-        return self._take_from(sender, state, received)
+        why = sender.banned(received)
+        if not self._refused((why, 'ignored for a while', f'{name} {why}')):
+            self._take_from(sender, state, received)
 
     def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:
         """Take a valid message of a sender."""
         of_itself, before = state.child == sender.name, sender.states.get(state.child)
-        if before is not None and state.stamp <= before.stamp:
-            return self._refuse('message out of order', f'{sender.name} sends {state.child}')
-        if before is None and len(sender.states) >= SEEN_MAX:
-            return self._refuse('too many vehicles', f'{sender.name} sends {state.child}')
+        what = f'{sender.name} sends {state.child}'
+        if self._refused(
+                (before is not None and state.stamp <= before.stamp, 'message out of order', what),
+                (before is None and len(sender.states) >= SEEN_MAX, 'too many vehicles', what)):
+            return
         leap = '' if before is None else leapt(before, state)
         if of_itself:
             if leap:
@@ -196,9 +193,8 @@ class Sharing:
             sender.doubted.add(state.child)
         else:
             sender.doubted.discard(state.child)
-        if why := self.unusable(sender):
-            self._refuse(f'not aligned with {sender.name}', why)
-        return None
+        why = self.unusable(sender)
+        self._refused((why, f'not aligned with {sender.name}', why))
 
     # Relations between frames.
 
@@ -390,6 +386,18 @@ class Sharing:
             return 'no other sender'
         return '' if any(not s.why for s in active) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in active)
+
+    def _refused(self, *cases: tuple[object, str, str]) -> bool:
+        """
+        Report the first case that holds; return whether one does.
+
+        :param cases: whether it holds, the reason, and the detail.
+        """
+        for holds, reason, detail in cases:
+            if holds:
+                self._refuse(reason, detail)
+                return True
+        return False
 
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
