@@ -246,19 +246,15 @@ class Sharing:
 
         The own frame is best, then the vehicle's, then the most certain; only one counts.
         """
-        best: tuple[float, str, TrackPoint] | None = None
-        for name in (self.name, *self.senders):
-            if name == frame or vehicle not in self._tracks[name]:
-                continue
-            doubt = self.frames.stds(name)[0]
-            if name == self.name or (name == vehicle and name in self.frames):
-                doubt = -2.0 if name == self.name else -1.0
-            if best is not None and doubt >= best[0]:
-                continue
+        names = [name for name in (self.name, *self.senders)
+                 if name != frame and vehicle in self._tracks[name]]
+        for name in sorted(names, key=lambda name: (
+                name != self.name, name != vehicle or name not in self.frames,
+                self.frames.stds(name)[0])):
             point = self._tracks[name][vehicle].at(stamp)
             if point is not None:
-                best = doubt, name, point
-        return None if best is None else best[1:]
+                return name, point
+        return None
 
     def _begin(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> None:
         """Collect a relation of an unknown frame, and start its estimate if that is possible."""
