@@ -327,9 +327,3 @@ def test_bad_states_are_refused_with_what_to_change(positions: Any, velocities: 
             function(positions, velocities, PAPER)
     with pytest.raises(ValueError, match=f'relative_{message}'.replace(' velocities ', ' .*')):
         acceleration(positions, velocities, PAPER)
-
-
-def test_an_unknown_model_is_refused_with_the_known_ones() -> None:
-    model: Any = 'vicsek'
-    with pytest.raises(ValueError, match=r"^model = 'vicsek': must be one of flocking, cucker_d"):
-        accelerations(*LEADERLESS, PAPER, model)

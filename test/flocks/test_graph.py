@@ -81,12 +81,12 @@ def test_edges_begin_at_once_below_d1_and_later_below_four_fifths_of_the_band() 
         return np.array([[0.0, 0.0], [np.sqrt(r2), 0.0]])
 
     assert len(initial_graph(at(7.99), FLIGHT_PARAMS).edges) == 1
-    alone = initial_graph(at(8.01), FLIGHT_PARAMS)
+    alone, pair = initial_graph(at(8.01), FLIGHT_PARAMS), edges((0, 1))
     assert len(alone.edges) == 0
-    assert grown(alone, at(6.61), FLIGHT_PARAMS, edges((0, 1))) is alone  # d0 + 0.8 (d1 - d0) = 6.6
-    joined = grown(alone, at(6.59), FLIGHT_PARAMS, edges((0, 1)))
+    assert grown(alone, at(6.61), FLIGHT_PARAMS, pair) is alone  # d0 + 0.8 (d1 - d0) = 6.6
+    joined = grown(alone, at(6.59), FLIGHT_PARAMS, pair)
     assert joined.edges.tolist() == [[0, 1]]
-    assert grown(joined, at(7.9), FLIGHT_PARAMS, edges((0, 1))) is joined  # never dropped, nor joined twice
+    assert grown(joined, at(7.9), FLIGHT_PARAMS, pair) is joined  # never dropped, nor joined twice
 
 
 @pytest.mark.parametrize(('count', 'pairs', 'connected'), [

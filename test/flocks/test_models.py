@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_desk.flocks.laws import accelerations, nearest, pairs_within
+from flock_desk.flocks.laws import accelerations, nearest
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -56,35 +56,6 @@ def test_blocks_give_the_sums_of_the_plain_law(model: Any, dimension: int) -> No
         assert u == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
-def test_blocks_smaller_and_larger_than_the_flock_agree() -> None:
-    rng = np.random.default_rng(0)
-    x, v = 100.0 * rng.random((1500, 2)), rng.normal(size=(1500, 2))  # several blocks
-    params = FlockingParams(d0=0.0, d1=1e4, theta=1.0)
-    assert accelerations(x, v, params, method='blocked') == pytest.approx(
-        accelerations(x, v, params, method='whole'), rel=1e-8, abs=1e-6)
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'method': 'fast'}, r"^method = 'fast': must be one of auto, whole, blocked$"),
-    ({'model': 'vicsek'}, r"^model = 'vicsek': must be one of flocking, cucker_dong, cucker_s"),
-    ({'velocities': np.zeros((3, 3))}, r'^positions has shape \(3, 2\) and velocities \(3, 3\)'),
-])
-def test_bad_input_is_refused(change: dict[str, Any], message: str) -> None:
-    usual: dict[str, Any] = {'positions': np.eye(3, 2), 'velocities': np.eye(3, 2),
-                             'params': FlockingParams()}
-    with pytest.raises(ValueError, match=message):
-        accelerations(**{**usual, **change})
-
-
-@pytest.mark.parametrize('dimension', [2, 3])
-def test_pairs_within_a_distance_are_all_found_once(dimension: int) -> None:
-    x = np.random.default_rng(1).random((60, dimension)) * 4.0
-    expected = [[i, j] for i in range(60) for j in range(i + 1, 60)
-                if np.linalg.norm(x[i] - x[j]) < 1.2]
-    assert sorted(pairs_within(x, 1.2).tolist()) == expected
-    assert pairs_within(x[:1], 1.2).shape == (0, 2)
-
-
 def test_the_nearest_are_found_without_oneself() -> None:
     x = np.random.default_rng(2).random((40, 3))
     found = nearest(x, 7)
@@ -95,9 +66,3 @@ def test_the_nearest_are_found_without_oneself() -> None:
         assert sorted(others) == sorted(np.argsort(distances)[:7])
     assert nearest(x[:3], 7).shape == (3, 2)
     assert nearest(x[:1], 7).shape == (1, 0)
-
-
-def test_agents_in_one_place_do_not_find_themselves() -> None:
-    found = nearest(np.zeros((12, 2)), 3)
-    assert found.shape == (12, 3)
-    assert not np.any(found == np.arange(12)[:, None])

@@ -175,15 +175,6 @@ def test_the_page_is_the_smallest_from_a4_or_the_one_asked_for(
     assert (found.width, found.height) == pytest.approx(PAGES[page], abs=1e-4)
 
 
-def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for dictionary in ('DICT_4X4_50', 'DICT_7X7_1000'):
-        arguments = ['--id', '0', '--dictionary', dictionary, '--output', str(tmp_path / 'm.pdf')]
-        assert main([*arguments, '--size', '0.2']) == 0
-        largest = re.search(r'A4 holds up to (\S+) m', capsys.readouterr().err)[1]
-        assert main([*arguments, '--size', largest, '--page', 'A4']) == 0
-        assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
-
-
 @pytest.mark.ros
 def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
     first, second = tmp_path / 'a.pdf', tmp_path / 'b.pdf'
@@ -201,17 +192,6 @@ def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
     main([*ISSUE, '--output', str(tmp_path / 'm.pdf')])
     catalog = objects_of((tmp_path / 'm.pdf').read_bytes())[0]
     assert b'/Version /1.6' in catalog and b'/PrintScaling /None' in catalog
-
-
-def test_several_markers_are_pages_and_entries(tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / 'm.pdf'
-    assert main(['--id', '3', '0', '49', '--size', '0.1', '--output', str(path)]) == 0
-    pages = pages_of(path.read_bytes())
-    assert [seen(rasterize(page))[0] for page in pages] == [[3], [0], [49]]
-    document = yaml.safe_load(capsys.readouterr().out)
-    assert [entry['marker_id'] for entry in document['neighbors']] == [3, 0, 49]
-    neighbors.parse(document)
 
 
 def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,
