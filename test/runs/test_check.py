@@ -170,6 +170,25 @@ def test_a_fault_in_a_bag_is_named(change: Change, row: tuple[str, str, str, str
     assert code == (row[0] == 'error')
 
 
+def configured(tmp_path: Path, text: str) -> Path:
+    """Return a file of parameters."""
+    config = tmp_path / 'mine.yaml'
+    config.write_text(f'/**: {{ros__parameters: {{{text}}}}}')
+    return config
+
+
+def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def longer(message: Any) -> None:
+        message.k = message.k * np.array([1.2, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0, 1.0, 1.0])
+    bag = excerpt(tmp_path / 'bag', 12.0, of('/camera_info', longer))
+    config = configured(tmp_path, 'camera_rpy: [0.0, 0.1745, 0.0]')
+    code, found = checked(capsys, bag, '--config', config)
+    assert code == 1
+    assert_told(found, ('error', 'focal length', '0.8', 'this lens'))
+    assert_told(found, ('error', 'camera mounting', 'looks higher', 'camera_rpy:=['))
+
+
 def test_topics_are_taken_by_the_names_they_have(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = excerpt(tmp_path / 'bag', 1.5, altered(IMAGES, topic='/a/image'))
