@@ -276,3 +276,8 @@ def _nees(errors: Array, covariances: Array) -> Array:
     solved = np.linalg.solve(covariances[known], errors[known][:, :, None])[:, :, 0]
     nees[known] = np.einsum('ni,ni->n', errors[known], solved)
     return nees
+
+
+def by_axis(table: Table, kind: str) -> Array:
+    """Return the columns (n, 3) of a kind along x, y and z."""
+    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)

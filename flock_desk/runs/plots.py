@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation
-from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.frame_errors import by_axis, STAGES, Table
 from flock_desk.runs.record import Flight, REPLAYED
 from flock_desk.runs.report import Chapter, Illustration
 from flock_desk.runs.summary import consistency, sight_figures
@@ -112,7 +112,7 @@ def flight_picture(flight: Flight, title: str = '') -> bytes:
         figures = sight_figures([flight.table], params.max_velocity_std)
         for kind, unit in (('position', 'cm'), ('velocity', 'cm/s')):
             rms = figures['position_rms_m' if kind == 'position' else 'velocity_rms_m_s']
-            errors = 100.0 * _norms(_by_axis(table, kind))
+            errors = 100.0 * _norms(by_axis(table, kind))
             axes[kind].plot(table['time'], errors, color=FOLLOWER, linewidth=0.9)
             axes[kind].set(ylabel=f'{kind} error [{unit}]',
                            ylim=(0.0, 1.2 * _usually(errors, 99.5)))
@@ -136,7 +136,7 @@ def error_picture(flight: Flight) -> bytes:
     axes = figure.subplots(3, 2, sharex=True)
     for column, (kind, unit) in enumerate((('position', 'cm'), ('velocity', 'cm/s'))):
         # One scale for the three axes, which makes them comparable.
-        errors, sigmas = 100.0 * _by_axis(table, kind), 100.0 * _by_axis(table, f'{kind}_sigma')
+        errors, sigmas = 100.0 * by_axis(table, kind), 100.0 * by_axis(table, f'{kind}_sigma')
         limit = 1.15 * max(_usually(np.abs(errors), 99.0), _usually(2.0 * sigmas, 90.0))
         for row, axis in enumerate(('x, forward', 'y, left', 'z, up')):
             plot: Axes = axes[row, column]
@@ -286,11 +286,6 @@ def add_key(axis: Axes) -> None:
 
 def _has_truth(table: Table) -> bool:
     return bool(np.any(np.isfinite(table['true_distance'])))
-
-
-def _by_axis(table: Table, kind: str) -> Array:
-    """Return the columns (n, 3) of a kind."""
-    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
 
 
 def _norms(vectors: Array) -> Array:
