@@ -240,13 +240,14 @@ def one_flock(options: argparse.Namespace) -> list[str]:
 def row(scenario: str, name: str, run: Simulation) -> Row:
     """Return the line of the table that a simulation fills."""
     m = run.metrics
-    least, greatest = (extremum(m.time, values, least=side)
-                       for values, side in ((m.min_r2, True), (m.max_r2, False)))
+    (nearest_at, nearest), (farthest_at, farthest) = (
+        extremum(m.time, values, least=side)
+        for values, side in ((m.min_r2, True), (m.max_r2, False)))
     mean = run.velocities[-1].mean(axis=0)
     heading = np.degrees(np.arctan2(mean[1], mean[0]))
-    kept = least.value > run.params.d0 and greatest.value < run.params.d1
-    return (scenario, name, _text(least.value, 6), _text(least.time, 3), _text(greatest.value, 6),
-            _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
+    kept = nearest > run.params.d0 and farthest < run.params.d1
+    return (scenario, name, _text(nearest, 6), _text(nearest_at, 3), _text(farthest, 6),
+            _text(farthest_at, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
             _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
             _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
 

@@ -93,9 +93,8 @@ def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> li
     apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=plots.LEADER, alpha=0.08, lw=0)
     for (name, distance), colour in zip(distances.items(), cycle(plots.COLOURS)):
         apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
-    apart.set(xlabel=plots.TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])))
-    apart.set_ylim(bottom=0.0)
-    apart.set_title('distances; shaded: the band')
+    apart.set(xlabel=plots.TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])),
+              ylim=(0.0, None), title='distances; shaded: the band')
     plots.add_key(apart)
     return [Chapter(
         'The column', 'In the frame of the first follower. Each has a page of its own: '

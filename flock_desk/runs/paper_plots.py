@@ -232,13 +232,11 @@ def flock(run: Simulation) -> Figure:
                    label='longest edge' if on_graph else 'greatest')
     below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
     draw_bounds(below, run.params)
-    below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]))
-    below.set_ylim(bottom=0.0)
+    below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     agreeing.plot(m.time, m.order, color=INK, label='order parameter')
     agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
                   linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
-    agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]))
-    agreeing.set_ylim(bottom=0.0)
+    agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     for axis in figure.axes:  # above the axis, where no data can be
         axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
     figure.align_ylabels([below, agreeing])

@@ -104,8 +104,7 @@ def flight_picture(flight: Flight, title: str = '') -> bytes:
     for label, (times, speeds) in flight.speeds.items():
         axes['speed'].plot(times, speeds, linewidth=1.1, label=label,
                            color=_SPEED_COLOURS.get(label, FOLLOWER))
-    axes['speed'].set(ylabel='speed [m/s]')
-    axes['speed'].set_ylim(bottom=0.0)
+    axes['speed'].set(ylabel='speed [m/s]', ylim=(0.0, None))
     add_key(axes['speed'])
     _draw_states(axes['state'], flight)
     if truth:
@@ -169,8 +168,8 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
                         markersize=13, markeredgewidth=1.2)
-    stages.set_title('stage that measured the neighbour in each image, and CPU time of perception')
-    stages.set(ylabel='stage', ylim=(-0.6, 3.6))
+    stages.set(ylabel='stage', ylim=(-0.6, 3.6), title='stage that measured the neighbour in '
+               'each image, and CPU time of perception')
     stages.set_yticks(range(len(STAGES)), STAGES)
     cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
     cpu.set(ylabel='CPU time [ms]', xlabel=TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
@@ -207,9 +206,9 @@ def draw_distance(axis: Axes, flight: Flight, table: Table) -> None:
                   linestyle=(0, (5, 3)), label='true')
     shown = np.concatenate([table['distance'], table['true_distance']])
     shown = shown[np.isfinite(shown)]
-    axis.set(ylabel='distance [m]', ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
-                                          max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
-    axis.set_title(f'distance to {flight.name}')
+    axis.set(ylabel='distance [m]', title=f'distance to {flight.name}',
+             ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
+                   max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
     _shade(axis, flight.blind, 'leader not visible')
     add_key(axis)
 
