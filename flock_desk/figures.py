@@ -43,7 +43,7 @@ from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
-from flock_desk.runs.console import aligned, guarded, parsed, Progress
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
 from flock_desk.runs.record import last_flight, read_flown
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.bag import BagError, failures
@@ -63,13 +63,13 @@ FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 
 
-_OPTIONS = {
+_OPTIONS: Options = {
     '--out': {'type': Path, 'default': Path('build/figures'), 'help': '%(default)s'},
     '--flights': {'type': Path, 'default': Path('build/fly'), 'metavar': 'FOLDER',
                   'help': 'folder of the flights of fly; %(default)s'},
     '--campaign': {'type': Path, 'default': Path('build/flights/flights.json'), 'metavar': 'FILE',
                    'help': 'results of flights; %(default)s'}}
-_FLOCK = {
+_FLOCK: Options = {
     '--agents': {'type': int, 'metavar': 'N', 'help': 'how many, instead of the paper'},
     '--dim': {'type': int, 'choices': (2, 3), 'default': 2, 'help': '%(default)s'},
     '--seed': {'type': int, 'default': 1, 'help': 'of the start; %(default)s'},

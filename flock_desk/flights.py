@@ -45,7 +45,7 @@ from flock_desk.closed_loop.flight_metrics import (
     of_runs,
     summary,
 )
-from flock_desk.runs.console import aligned, guarded, parsed, Progress
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
 from flock_desk.runs.processes import mapped, pooled
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
@@ -106,7 +106,7 @@ class Flown(NamedTuple):
     """Which runs left the band, when and why, one line each."""
 
 
-_OPTIONS = {
+_OPTIONS: Options = {
     '--scenario': {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
                    'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is '
                    'the default'},

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.runs.console import guarded, parsed, Progress
+from flock_desk.runs.console import guarded, Options, parsed, Progress
 from flock_desk.runs.processes import pooled
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
@@ -261,7 +261,7 @@ def _seconds(stamp_ns: int) -> float:
     return (stamp_ns - START_NS) * 1e-9
 
 
-_OPTIONS = {
+_OPTIONS: Options = {
     '--variant': {'nargs': '+', 'choices': [*VARIANTS, 'all'], 'default': ['sample'],
                   'metavar': 'NAME', 'help': f'which: {", ".join(VARIANTS)} or all '
                   '(default: sample)'},

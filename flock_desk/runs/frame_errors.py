@@ -182,9 +182,10 @@ class FrameErrors:
         position, _, rotation = _relative(true, true_own)
         visible = np.zeros(len(position), dtype=bool)
         for name, model in self.models.items():
-            for marker in neighbor.markers if model else ():
-                visible |= (cameras == name) & _marker_visible(
-                    marker, model, self._T_camera_body[name], position, rotation)
+            if model is not None:
+                for marker in neighbor.markers:
+                    visible |= (cameras == name) & _marker_visible(
+                        marker, model, self._T_camera_body[name], position, rotation)
         return np.where(np.isfinite(position[:, 0]), visible, np.nan)
 
 

@@ -21,8 +21,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flock_desk.fly import cautions, main
-from flock_desk.runs.column import column_figures, spacing
+from flock_desk.fly import cautions, column_figures, main, nearest, scenario_bounds
 from flock_desk.runs.flight import (
     ended_by_bridge,
     External,
@@ -31,9 +30,10 @@ from flock_desk.runs.flight import (
     namespaces,
     own,
     parameters_of_nodes,
+    spacing,
 )
 from flock_desk.runs.frame_errors import COLUMNS
-from flock_desk.runs.judge import flat, judge, nearest, scenario_bounds
+from flock_desk.runs.judge import flat, judge
 from flock_desk.runs.processes import Processes
 from flock_desk.runs.record import LiveRecord, read_flown
 from flock_desk.runs.summary import scenario_figures
