@@ -84,6 +84,12 @@ def test_the_other_models_lose_the_papers_leader(model: Any) -> None:
     assert np.abs(error).max() < (0.5 if 'vicsek' in model else 1e-9)
 
 
+@pytest.mark.parametrize('dt', [0.01, 0.1])
+def test_semi_implicit_euler_keeps_the_band_behind_the_leader(dt: float) -> None:
+    run = led('flocking', integrator='semi_implicit', dt=dt, sample_period=dt)
+    assert PARAMS.d0 < run.metrics.min_r2.min() and run.metrics.max_r2.max() < PARAMS.d1
+
+
 def test_semi_implicit_euler_converges_to_the_adaptive_solution_in_first_order(
         law: Simulation) -> None:
     errors = [np.abs(leaderless('flocking', duration=2.0, integrator='semi_implicit', dt=dt,

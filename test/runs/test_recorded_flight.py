@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bag_excerpts import Change, SAMPLE
-import pytest
 
 from flock_desk.runs.evaluation import RecordedFlight
 from flock_follower.bags.bag import BagMessage, open_bag
@@ -74,19 +73,6 @@ def messages(seconds: float = 1.2, change: Change | None = None) -> list[BagMess
         return [m for m in changed if m is not None]
 
 
-@pytest.fixture(scope='module')
-def log() -> Log:
-    return play(messages())
-
-
-def test_ticks_and_setpoints_come_at_their_rates_from_one_interval_on(log: Log) -> None:
-    start = messages(0.01)[0].stamp_ns
-    assert [t.time - start for t in log.ticks] == [k * TENTH for k in range(1, len(log.ticks) + 1)]
-    assert len(log.ticks) == 11
-    assert [s.time - start for s in log.setpoints] == [
-        k * TENTH // 2 for k in range(1, len(log.setpoints) + 1)]
-
-
 def test_where_odometry_stops_images_wait_then_drop_and_setpoints_end() -> None:
     start = messages(0.01)[0].stamp_ns
     silent = start + 6 * TENTH
@@ -111,8 +97,3 @@ def test_when_images_cease_the_planner_brakes_at_once() -> None:
     assert 0 <= held.time - last - 200_000_000 < 20_000_000
     assert {t.decision.state.value for t in log.ticks if t.time > held.time} == {'HOLD'}
     assert sum((t.time - start) % TENTH != 0 for t in log.ticks) == 1
-
-
-def test_the_velocity_of_odom_stands_in_for_the_autopilots(log: Log) -> None:
-    other = play(messages(), velocity_source='autopilot')
-    assert [s.setpoint.kind for s in other.setpoints] == [s.setpoint.kind for s in log.setpoints]

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_desk import sample_bag as sample
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
+from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Sensor
 from flock_follower.bags.bag import deserialize, open_bag
@@ -89,33 +89,6 @@ def test_a_bag_does_not_depend_on_how_many_processes_render_it(tmp_path):
     assert files[0] == files[1]
     with open_bag(tmp_path / '1' / 'tiny') as opened:
         assert opened.topics['/image_raw'].count == 3
-
-
-@pytest.mark.parametrize('name', sample.VARIANTS)
-def test_the_marker_is_in_view_of_every_variant_from_its_front(name):
-    recording = sample.Recording(sample.VARIANTS[name])
-    camera, h = recording.variant.camera, SIDE_LENGTH / 6 * 4  # with its quiet zone
-    corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
-    for stamp in recording.image_stamps_ns[::6]:
-        time = (stamp - sample.START_NS) * 1e-9
-        flight = recording.flight
-        seen = ((flight.follower.pose(time) @ T_BODY_OPTICAL).inverse()
-                @ flight.leader.pose(time) @ T_BODY_MARKER)
-        u, v = project(camera, seen.apply(corners)).T
-        assert u.min() > 0 and u.max() < camera.width - 1
-        assert v.min() > 0 and v.max() < camera.height - 1
-        line = seen.translation / np.linalg.norm(seen.translation)
-        assert -seen.rotation[:, 2] @ line > np.cos(np.deg2rad(65))
-
-
-def project(camera, points):
-    """Return pixels (N, 2) of points (N, 3) in the optical frame, by OpenCV."""
-    matrix = np.array([[camera.focal_x, 0, camera.centre_x], [0, camera.focal_y, camera.centre_y],
-                       [0, 0, 1.0]])
-    lens = cv2.fisheye if camera.model == 'equidistant' else cv2
-    pixels, _ = lens.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix,
-                                   np.array(camera.distortion))
-    return pixels.reshape(-1, 2)
 
 
 def test_a_folder_that_is_no_bag_is_not_replaced(tmp_path, capsys):

@@ -53,6 +53,22 @@ def test_the_complete_graph_is_the_papers_law() -> None:
     assert u == pytest.approx(flocking.accelerations(x, v, PARAMS), rel=1e-12)
 
 
+@pytest.mark.parametrize('model', ['flocking', 'cucker_dong', 'cucker_smale'])
+def test_blocks_give_the_sums_of_the_plain_law(model: Any) -> None:
+    rng = np.random.default_rng(0)
+    x, v = 30.0 * rng.random((600, 2)), rng.normal(size=(600, 2))  # three blocks
+    for params in (FLIGHT_PARAMS, flocking.FlockingParams(beta=0.0, theta=1.5, d0=0.0)):
+        np.testing.assert_array_equal(laws.accelerations(x, v, params, model, 'blocked'),
+                                      flocking.accelerations(x, v, params, model))
+
+
+def test_the_nearest_are_found_without_oneself() -> None:
+    x = np.random.default_rng(2).random((40, 3))
+    distances = np.linalg.norm(x - x[:, None], axis=2) + np.diag(np.full(40, np.inf))
+    np.testing.assert_array_equal(np.sort(nearest(x, 7)), np.sort(np.argsort(distances)[:, :7]))
+    assert nearest(x[:3], 7).shape == (3, 2) and nearest(x[:1], 7).shape == (1, 0)
+
+
 def test_for_two_agents_each_pairs_own_disagreement_is_the_papers() -> None:
     x, v = LEADER_FOLLOWER.positions, LEADER_FOLLOWER.velocities
     u = laws.graph_accelerations(x, v, PARAMS, complete_graph(2), 'pair')
