@@ -277,9 +277,7 @@ def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryStat
 
 def read_record(path: Path) -> dict[str, list[tuple[float, Any]]]:
     """
-    Return what the recorder wrote, by topic: messages, each with the time at which it came.
-
-    The times are s on the monotonic clock.
+    Return the messages that the recorder wrote, by topic, each with its monotonic time, s.
 
     :raises BagError: if it cannot be read.
     """
