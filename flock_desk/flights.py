@@ -26,7 +26,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
-import json
 import os
 from pathlib import Path
 import sys
@@ -47,6 +46,7 @@ from flock_desk.closed_loop.flight_metrics import (
 )
 from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
 from flock_desk.runs.processes import mapped, pooled
+from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
     key_tables,
@@ -57,7 +57,6 @@ from flock_desk.scenarios.scenario_file import (
 )
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
@@ -107,9 +106,6 @@ class Flown(NamedTuple):
 
 
 _OPTIONS: Options = {
-    '--scenario': {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
-                   'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is '
-                   'the default'},
     '--controllers': {'nargs': '+', 'choices': CONTROLLERS, 'default': list(CONTROLLERS),
                       'metavar': 'NAME', 'help': f'{", ".join(CONTROLLERS)}; a flock flies '
                       f'{" and ".join(IN_FLOCKS)} only (all)'},
@@ -133,7 +129,10 @@ def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='flights', description='Fly scenarios many times, with several controllers.')
-    options = parsed(parser, args, _OPTIONS,
+    scenario = {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
+                'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is the '
+                'default'}
+    options = parsed(parser, args, {'--scenario': scenario, **_OPTIONS},
                      valid={'runs': _COUNTS, 'jobs': _COUNTS, 'seed': _SEEDS})
     if options.keys:
         print(key_tables())
@@ -150,8 +149,7 @@ def _campaign(options: argparse.Namespace) -> int:
     results, cpu, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
                                   options.seed, options.scheduler)
     path = options.output / 'flights.json'
-    with whole_file(path) as file:
-        file.write((json.dumps(results, indent=2) + '\n').encode())
+    write_summary(results, path)
     print(table(results))
     print(COLUMN_NOTES)
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
