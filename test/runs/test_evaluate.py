@@ -257,25 +257,13 @@ def test_bad_files_are_exit_code_2_and_one_line(
         bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong, output = tmp_path / 'wrong.yaml', ['--output', str(tmp_path / 'out')]
     assert 'nowhere: no such bag' in refusal(['nowhere', *output], capsys)
-    assert 'nowhere.yaml: No such file' in refusal(
-        [str(bag), '--config', 'nowhere.yaml', *output], capsys)
     wrong.write_text('planner: {ros__parameters: {amax: 1.0}}')
     assert 'wrong.yaml: unknown parameter amax' in refusal(
-        [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('relative_pose: {ros__parameters: {neighbors_file: /nowhere.yaml}}')
-    assert '/nowhere.yaml: No such file' in refusal(
-        [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('/**: {ros__parameters: {d1: 0.5}}')
-    assert 'd1 = 0.5: must be a number in [d0 + 0.001, 10000] m^2' in refusal(
         [str(bag), '--config', str(wrong), *output], capsys)
     wrong.write_text('recal: {min: 0.9}')
     assert 'recal is no figure of the summary: did you mean recall?' in refusal(
         [str(bag), '--expect', str(wrong), *output], capsys)
     assert str(wrong) in refusal([str(bag), '--output', str(wrong)], capsys)
-    with pytest.raises(SystemExit) as stop:
-        main([])
-    assert stop.value.code == 2
-    capsys.readouterr()
 
 
 def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
@@ -306,9 +294,6 @@ def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
     assert main([str(path), '--output', str(tmp_path / 'cut')]) == 0
     assert f'warning: {path} is incomplete: {last.name} was cut short' in capsys.readouterr().err
     assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
-    (path / 'parameters.yaml').write_text('planner: {ros__parameters: {v_max: -1.0}}\n')
-    assert 'parameters.yaml: planner: v_max = -1.0: must be' in refusal(
-        [str(path), '--output', str(tmp_path / 'none')], capsys)
 
 
 def test_images_that_are_named_are_not_replaced_by_others(

@@ -125,17 +125,6 @@ def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path, arguments: l
     assert len(read(tmp_path / f'{name}.csv')) > least_rows
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--agents', '0'], 'error: count = 0: must be an integer in [1, inf)\n'),
-    (['--agents', '9', '--neighbors', 'graph', '--model', 'vicsek'], "error: neighbors = 'graph'"),
-    (['--agents', '9', '--neighbors', 'all'], 'error: agents 0 and '),
-    (['--agents', '9', '--dt', '-1'], 'error: dt = -1.0: must be a number in (0, inf)')])
-def test_bad_options_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
-                                     arguments: list[str], message: str) -> None:
-    assert figures.main(['--out', str(tmp_path), *arguments]) == 1
-    assert capsys.readouterr().err.splitlines(keepends=True)[-1].startswith(message)
-
-
 def write_flight(folder: Path, scenario: str = 'indoor') -> None:
     """Write what `fly` leaves of a flight in which the leader goes ahead, 2 to 2.3 m away."""
     folder.mkdir(parents=True)
