@@ -23,24 +23,20 @@ from typing import Any
 import zipfile
 
 from bag_excerpts import Change, edited, excerpt
-from carried_camera import SIDE_LENGTH, write_carried
-import cv2
 import numpy as np
 import pytest
-from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
 from flock_follower import check
 from flock_follower.bags import mcap_file
-from flock_follower.bags.bag import deserialize, open_bag, serialize, typestore
+from flock_follower.bags.bag import deserialize, open_bag, serialize
 from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
-from flock_follower.bags.message_types import empty
+from flock_follower.bags.message_types import empty, typestore
 from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.files import resource
-from flock_follower.perception.markers import draw_marker
 
 pytestmark = pytest.mark.slow
 SAMPLE = resource('bags/sample')
@@ -165,17 +161,6 @@ def altered(name: str, **fields: Any) -> Change:
     return lambda message: message._replace(**fields) if message.topic == name else message
 
 
-def with_marker(dictionary: str, number: int, corner: int, side: int, alone: bool) -> Change:
-    """Return a change that paints a marker with a margin, px; ``alone``: nothing else is left."""
-    def paint(message: Any) -> None:
-        image = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)
-        image[:] = 160 if alone else image
-        image[corner - 20:corner + side + 20, corner - 20:corner + side + 20] = 255
-        image[corner:corner + side, corner:corner + side] = draw_marker(dictionary, number, side)
-        message.data = cv2.imencode('.jpg', image)[1].ravel()
-    return of(IMAGES, paint)
-
-
 def unreadable(message: Any) -> None:
     message.data = np.zeros(9, np.uint8)
 
@@ -188,10 +173,6 @@ def lost(message: Any) -> None:
 #: what to do. The rules themselves are held by test/checks/test_every_check.py.
 FAULTS: dict[str, tuple[Change, tuple[str, str, str, str]]] = {
     'no images': (of(IMAGES, unreadable), ('error', 'images', '', 'mono8')),
-    'another dictionary': (with_marker('DICT_5X5_100', 7, 120, 160, True), (
-        'error', 'marker', 'marker 7 of DICT_5X5', 'config/neighbors.yaml')),
-    'a second print': (with_marker('DICT_4X4_50', 0, 40, 80, False), (
-        'warning', 'marker id', 'marker 0 twice', 'cover the print')),
     'a lost source': (of('/odom', lost), (
         'error', 'odom', 'say nothing: quaternion = 0', 'initialised'))}
 
@@ -218,19 +199,6 @@ def configured(tmp_path: Path, text: str) -> Path:
     return config
 
 
-def test_the_axes_of_an_imu_are_named_unless_they_are_configured(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = rewritten_bag(tmp_path / 'bag', Source(imu=True), image_offset=-0.05)
-    code, found = checked(capsys, bag)
-    assert code == 1
-    assert_told(found, ('error', 'odom up', '-y of base_link is up',
-                        'odom_child_rpy:=[-1.5708,0.0,-1.5708]'))
-    config = configured(tmp_path, f'odom_child_rpy: {list(map(float, IMU_RPY))}')
-    _, found = checked(capsys, bag, '--config', config)
-    assert found['odom up']['level'] == found['odom ahead']['level'] == 'ok'
-    assert_told(found, ('error', 'camera time offset', 'ms earlier', 'exposure'))
-
-
 def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def longer(message: Any) -> None:
@@ -249,24 +217,6 @@ def test_topics_are_taken_by_the_names_they_have(
     assert checked(capsys, bag, '--remap', 'image_raw:=/a/image')[0] == 0
     assert main([str(bag), '--remap', '/a/image:=image_raw']) == 2
     assert 'did you mean image_raw:=/a/image?' in capsys.readouterr().err
-
-
-def test_size_and_mounting_of_a_marker_at_rest_are_checked(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag, neighbors = write_carried(tmp_path / 'bag'), tmp_path / 'neighbors.yaml'
-    default = resource('config/neighbors.yaml').read_text()
-    neighbors.write_text(default)
-    config = configured(tmp_path, f'neighbors_file: {neighbors}')
-    code, found = checked(capsys, bag, '--config', config)
-    assert code == 0
-    assert found['marker size']['measured'].startswith('moves 1.0')
-    assert found['camera mounting']['measured'] in ('off by 0 deg', 'off by 1 deg')
-    neighbors.write_text(default.replace(f'side_length: {SIDE_LENGTH}', 'side_length: 0.128'))
-    config = configured(tmp_path, f'neighbors_file: {neighbors}, camera_rpy: [0.0, -0.2, 0.0]')
-    code, found = checked(capsys, bag, '--config', config)
-    assert code == 1
-    assert_told(found, ('error', 'marker size', 'moves 0.80', '0.16'))
-    assert_told(found, ('error', 'camera mounting', 'looks lower by 11 deg', 'camera_rpy:=['))
 
 
 def test_the_table_is_narrow_and_ends_with_the_verdict(

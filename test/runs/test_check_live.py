@@ -173,22 +173,6 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(
                 '--params-file')
 
 
-def test_what_the_autopilot_says_against_flying_is_repeated(tmp_path: Path) -> None:
-    port = free_udp_port()
-    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
-        processes.start('autopilot', 'flock_desk.autopilot', [
-            '--connect', f'127.0.0.1:{port}', '--personality', 'arducopter', '--start', 'landed',
-            '--deny-arming', 'press the safety button'])
-        processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
-            '--ros-args', '-r', '__ns:=/drone1', '-p', f'connection:=udpin:127.0.0.1:{port}'])
-        processes.wait_for_log('mavlink_bridge', 'HEARTBEAT received', DEADLINE)
-        code, found = check(processes.environment, '--seconds', '5', '--namespace', 'drone1')
-    assert code == 1
-    assert_told(found, 'ready to arm', 'no: press the safety button', 'its own words')
-    assert_told(found, 'nodes', 'not running: relative_pose, planner', 'start:')
-    assert_told(found, 'ready for offboard', 'GUID_TIMEOUT = 3 s', 'refuse offboard')
-
-
 def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:
     environment = private_environment(int(os.environ['ROS_DOMAIN_ID']))
     code, found = check(environment, '--seconds', '1')
