@@ -51,6 +51,7 @@ _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
 _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
+_SKIN = 0.05  # m that agents may move before near pairs are searched again
 
 
 @dataclass(frozen=True)
@@ -189,10 +190,13 @@ class _GrowingGraph:
             yield state
 
     def _nearby(self, x: Array) -> Pairs:
-        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
-        if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
-            self._near = (x, laws.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else laws.pairs_within(x, np.sqrt(self._params.d1)))
+        """Return at least the pairs with r^2 < d1; all, if they are few."""
+        few = len(x) <= _NEAR_BY_ALL
+        if self._near is None or not (few or np.abs(x - self._near[0]).max() <= _SKIN):
+            # Each of two agents may move by _SKIN along each of at most 3 axes.
+            distance = np.sqrt(self._params.d1) + 2.0 * np.sqrt(3.0) * _SKIN
+            self._near = (x, laws.complete_graph(len(x)).edges if few
+                          else laws.pairs_within(x, distance))
         return self._near[1]
 
 

@@ -249,7 +249,10 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
 
 def squared_distances(positions: Array, pairs: Pairs) -> Array:
     """Return r^2 (m,), m^2, of the pairs (m, 2) among the positions (k, n)."""
-    return np.sum((positions[pairs[:, 1]] - positions[pairs[:, 0]]) ** 2, axis=1)
+    ends = positions.take(pairs, 0)
+    offset = ends[:, 1] - ends[:, 0]
+    squares: Array = np.einsum('ij,ij->i', offset, offset)
+    return squares
 
 
 def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
