@@ -57,6 +57,8 @@ NARROW = 0.01
 #: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
 MIN_INLIERS = 0.5
 MAX_RMS = 0.4
+#: Of a marker that is not tracked yet, more than this share of the edges must agree.
+FOUND_INLIERS = 0.8
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
 #: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
 SMEARED = 0.26
@@ -133,13 +135,13 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior, edges_only: bool = False) -> Measurement | None:
+           expected: PosePrior, confirmed: bool = False) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
-    :param edges_only: whether no pose is accepted that edges do not confirm.
+    :param confirmed: whether no pose is accepted that edges or the smeared print do not confirm.
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
@@ -147,10 +149,10 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     fits = [one for start in starts
             if (one := _good_fit(image, camera, alone, start)) is not None
-            and _shown(image, one).all()]
+            and one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
-        return None if edges_only else _without_edges(
-            image, camera, sought, index, corners, starts, expected)
+        return _without_edges(image, camera, sought, index, None if confirmed else corners, starts,
+                              expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
@@ -162,7 +164,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-                   corners: Array, starts: list[Transform],
+                   corners: Array | None, starts: list[Transform],
                    expected: PosePrior) -> Measurement | None:
     """Return a neighbour by the whole print of a detected marker, smeared, or by its corners."""
     marker, model = sought.neighbor.markers[index], sought.model
@@ -173,6 +175,8 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
         best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
                       expected)
         return widened(_of_smear(sought, index, best.chosen.fit), best)
+    if corners is None:
+        return None
     by_corners = from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
     if by_corners is None:
         return None
@@ -190,7 +194,7 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
         return None
     seen = model.only(turned)
     found = _good_fit(image, camera, seen, start, spacing)
-    shown = None if found is None else _shown(image, found)
+    shown = None if found is None else _shown(image, found, True)
     if shown is not None and shown.all():
         return found
     if len(seen.codes) == 1:
@@ -198,11 +202,11 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if shown is None:  # one that is covered spoils them all
         alone = [_good_fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
                            spacing) for k in range(len(seen.codes))]
-        shown = np.array([f is not None and bool(_shown(image, f)[0]) for f in alone])
+        shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return None
     found = _good_fit(image, camera, seen.only(shown), start, spacing)
-    return found if found is not None and _shown(image, found).all() else None
+    return found if found is not None and _shown(image, found, True).all() else None
 
 
 def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
@@ -246,12 +250,10 @@ def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Tr
     return found if good else None
 
 
-def _shown(image: GrayImage, found: EdgeFit) -> Any:
+def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines = found.lines
-    if len(lines.model.codes) == 1:
-        return np.array([shows_code(image, lines.cells, lines.model.codes[0])])
-    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code)
+    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
                      for k, code in enumerate(lines.model.codes)])
 
 

@@ -82,7 +82,8 @@ class SmearModel:
     for each of :data:`LENSES`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
     ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
-    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread.
+    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread: half of
+    those that can be corrected.
     ``cells``: number of cells along a side, with the black border.
     """
 
@@ -126,7 +127,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
         origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + REACH),
         printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
         turned[order].reshape(4 * len(words), -1).astype(float),
-        max(correctable_cells(dictionary), 1), n)
+        max(correctable_cells(dictionary) // 2, 1), n)
 
 
 def _with_slopes(level: Array) -> Any:

@@ -381,7 +381,7 @@ class Tracker:
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look,
                 measured: dict[str, Measurement], others: list[Measurement],
-                sighting: Sighting, edges_only: bool = False) -> None:
+                sighting: Sighting, confirmed: bool = False) -> None:
         """Turn detections that are not measured yet into measurements."""
         candidates: dict[str, list[Measurement]] = {}
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
@@ -395,7 +395,7 @@ class Tracker:
                 continue
             measurement = locate(image, look.model, self._targets[name],
                                  neighbor.markers.index(marker), corners, look.expected[name],
-                                 edges_only)
+                                 confirmed)
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
             elif not self._known(measurement, measured, others):
@@ -434,8 +434,9 @@ class Tracker:
         T_smooth_body = view.T_smooth_camera @ T_camera_body
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
-        covariance = turn.dot(measurement.covariance).dot(turn.T)
-        covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
+        covariance = camera.noise.covariance(
+            turn.dot(measurement.covariance).dot(turn.T),
+            T_smooth_body.apply(reference) - view.own.travel)
         outcome, candidate = self._hypotheses[name].take(
             time, T_smooth_body, reference, covariance, other and name in sighting.estimates)
         refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)

@@ -53,8 +53,8 @@ def places(code: CellCode, right: float = 0.0, down: float = 0.0) -> Array:
     return pixels
 
 
-def shown(cells: Any, code: CellCode, **levels: int) -> bool:
-    return shows_code(picture(cells, **levels), places(code), code)
+def shown(cells: Any, code: CellCode, tracked: bool = False, **levels: int) -> bool:
+    return shows_code(picture(cells, **levels), places(code), code, tracked)
 
 
 def with_flipped(cells: Any, *inner: int) -> Any:
@@ -97,8 +97,17 @@ def test_as_many_cells_as_can_be_corrected_may_be_wrong(dictionary: str) -> None
     for _ in range(20):
         flipped = rng.permutation(code.bits.size)
         if dictionary != 'DICT_ARUCO_ORIGINAL':  # there, a cell off may be another word
-            assert shown(with_flipped(cells, *flipped[:code.errors]), code)
-        assert not shown(with_flipped(cells, *flipped[:code.errors + 1]), code)
+            assert shown(with_flipped(cells, *flipped[:code.errors]), code, tracked=True)
+        assert not shown(with_flipped(cells, *flipped[:code.errors + 1]), code, tracked=True)
+        # A print with so many clearly wrong cells is not found in the first place.
+        assert not shown(with_flipped(cells, *flipped[:max(code.errors + 1 >> 1, 1)]), code)
+
+
+def test_a_mirrored_print_is_not_found_though_few_of_its_cells_differ() -> None:
+    cells, code = aruco.marker_code('DICT_5X5_100', 25), code_of(25, 'DICT_5X5_100')
+    alike = min((np.rot90(np.fliplr(cells), k) for k in range(4)), key=lambda c: (c ^ cells).sum())
+    assert np.count_nonzero(alike ^ cells) == 2 < code.errors
+    assert not shown(alike, code)
 
 
 @pytest.mark.parametrize('clarity', [0.1, 0.9])
@@ -113,7 +122,7 @@ def test_what_is_nearer_to_another_word_does_not_show_the_code(clarity: float) -
     for k in unclear:
         column, row = (code.grid[k] + AROUND) * PX
         image[row:row + PX, column:column + PX] = round(115.0 + 85.0 * clarity * code.bits[k])
-    assert shows_code(image, places(code), code) == (clarity > 0.5)
+    assert shows_code(image, places(code), code, tracked=True) == (clarity > 0.5)
 
 
 def test_contrast_must_be_enough_and_the_border_black() -> None:

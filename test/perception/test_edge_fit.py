@@ -75,6 +75,17 @@ def fitted(image: GrayImage, start: Transform, camera: CameraModel = CAMERA,
 
 
 @pytest.mark.slow
+def test_edges_in_a_shadow_count() -> None:
+    # Without them the attitude would rest on the lit half alone.
+    pose = facing((0.0, 0.0, 1.2), (0.02, 0.03, 0.0))
+    image = render(CAMERA, {3: pose}, black=10.0)
+    x = CAMERA.project(pose.translation[None])[0, 0]
+    shaded = np.where(np.arange(image.shape[1]) < x, image, 0.2 * image).astype(np.uint8)
+    found = fitted(shaded, pose)
+    assert found.inliers > 0.85
+    assert np.linalg.norm(error(found, pose)[3:]) < 0.05
+
+
 @pytest.mark.parametrize(('camera', 'conditions'), [
     (CAMERA, {}), (FISHEYE, {}), (make_camera('rational_polynomial', 240, 180), {}),
     (CAMERA, {'gamma': 2.2, 'black': 8.0}), (CAMERA, {'black': 60.0, 'white': 330.0, 'blur': 0.8}),
