@@ -306,20 +306,19 @@ class NeighborFilter:
         if not length > NEAREST:
             return UpdateOutcome.OUTLIER
         along, innovation = sight / length, distance - length
-        prior = turned_along(expected.covariance[None], self._line[None], along[None])[0]
+        prior = turned_along(expected.covariance, self._line, along)
         # However uncertain the attitude, the point is no farther from the body than its lever.
         swing = np.cross(lever, along)
         noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
                                float(lever.dot(lever)))
         spread = float(along.dot(prior[POSITION, POSITION]).dot(along)) + noise
-        used, widened, careful = self._range_gate.judge(np.array([innovation]), np.array([spread]))
-        if not used[0]:
+        verdict = self._range_gate.judge(innovation, spread)
+        if not verdict.used:
             return UpdateOutcome.OUTLIER
-        if widened[0] != 1.0:
-            prior = _widened(prior, _MOVING, float(widened[0]))
+        prior = _widened(prior, _MOVING, verdict.prior)
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
-        whole = float(careful[0]) * (expected_spread + noise)
+        whole = verdict.spread * (expected_spread + noise)
         gain = np.zeros(SIZE)
         for part in (POSITION, VELOCITY, ACCELERATION):
             gain[part] = float(along.dot(across[part])) / whole * along
@@ -327,12 +326,11 @@ class NeighborFilter:
         remain[:, POSITION] -= np.outer(gain, along)
         covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
             gain, gain)
-        covariance = bounded_across(covariance[None], along[None], np.array([length]),
-                                    self.params.initial_speed)[0]
         self.change, self._predicted, self._line = None, None, along
-        self.newest = expected.corrected(innovation * gain, covariance)
-        surprising = widened[0] != 1.0 or careful[0] != 1.0
-        return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED
+        self.newest = expected.corrected(innovation * gain, bounded_across(
+            covariance, along, length, self.params.initial_speed))
+        return (UpdateOutcome.USED if verdict.prior == verdict.spread == 1.0
+                else UpdateOutcome.SURPRISING)
 
     def _again(self, what: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""
