@@ -45,8 +45,14 @@ from flock_follower.perception.measurement import (
     widened,
     WIDENING,
 )
-from flock_follower.perception.print_model import edge_model, EdgeModel, shift_to_code, shows_code
-from flock_follower.perception.smear_fit import fit_smeared, smear_model, SmearFit, SmearModel
+from flock_follower.perception.print_model import edge_model, EdgeModel, shows_code
+from flock_follower.perception.smear_fit import (
+    fit_smeared,
+    seek,
+    smear_model,
+    SmearFit,
+    SmearModel,
+)
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
@@ -211,17 +217,11 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
 
 def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
              pose: Transform) -> Transform | None:
-    """Return a pose moved to where the cells of one of its markers resemble the image, if any."""
+    """Return a pose moved to where the print of one of its markers resembles the image, if any."""
     for k in np.flatnonzero(facing(sought.model, pose)).tolist():
-        lines = project(camera, sought.model.only(np.arange(len(sought.model.codes)) == k), pose)
-        shift = None if lines is None else shift_to_code(image, lines.cells,
-                                                         sought.model.codes[k])
-        if shift is not None:
-            marker = sought.neighbor.markers[k]
-            cell = marker.side_length / (sought.model.codes[k].bits.size**0.5 + 2.0)
-            # Right and down in the marker are along +x and -y of its frame.
-            step = marker.T_body_marker.rotation @ np.array([shift[0], -shift[1], 0.0]) * cell
-            return Transform(pose.rotation, pose.translation + pose.rotation @ step)
+        begin = seek(image, camera, sought.smears[k], pose)
+        if begin is not None:
+            return begin[0]
     return None
 
 

@@ -123,11 +123,6 @@ def read(brightness: Array, seen: Windows) -> Array:
 
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
-#: A marker is looked for this far from its place, cells, in steps of half a cell;
-_RANGE = 2.5
-_SHIFTS = np.arange(-_RANGE, _RANGE + 0.1, 0.5)
-#: it is there where its correlation with the pattern is above this.
-_LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Where else a cell is looked at, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
@@ -252,29 +247,6 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> 
 def _is_word(read: Array, code: CellCode) -> bool:
     """Return whether inner cells (b,), black -1 to white 1, resemble no other word as much."""
     return bool(code.bits.dot(read) > code.others.dot(read).max())
-
-
-def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:
-    """
-    Return by how many cells, to the right and down, a marker is off where it is expected.
-
-    Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
-    None if nothing resembles it.
-    """
-    pattern = np.concatenate([code.bits, -np.ones(code.border),
-                              np.ones(len(pixels) - code.bits.size - code.border)])
-    pattern -= pattern.mean()
-    axes = code.by_cell @ pixels
-    shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
-    at = pixels[None] + (shifts @ axes)[:, None]
-    brightness = grey_levels(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
-    spread = brightness.std(axis=1) * len(pixels)**0.5 * np.linalg.norm(pattern)
-    likeness = brightness @ pattern / np.maximum(spread, 1e-6)
-    best = int(np.argmax(likeness))
-    if likeness[best] < _LIKENESS:
-        return None
-    right, down = shifts[best].tolist()
-    return right, down
 
 
 def grey_levels(image: GrayImage, pixels: Array) -> Any:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether a marker shows its code, and where it is when it is not where it was expected."""
+"""Whether a marker shows its code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from flock_follower.geometry import Array, Transform
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker
-from flock_follower.perception.print_model import cell_code, CellCode, shift_to_code, shows_code
+from flock_follower.perception.print_model import cell_code, CellCode, shows_code
 
 DICTIONARY = 'DICT_4X4_50'
 DICTIONARIES = ('DICT_4X4_50', 'DICT_5X5_100', 'DICT_6X6_250', 'DICT_7X7_50',
@@ -186,33 +186,3 @@ def test_in_no_shade_does_another_marker_show_the_code(dictionary: str) -> None:
 def test_places_outside_the_image_show_nothing(off: tuple[float, float]) -> None:
     code, image = code_of(5), picture(aruco.marker_code(DICTIONARY, 5))
     assert not shows_code(image, places(code) + off, code)
-    assert shift_to_code(image, places(code) + off, code) is None
-
-
-@pytest.mark.parametrize('dictionary', DICTIONARIES)
-@pytest.mark.parametrize('shift', [
-    (0.0, 0.0), (1.0, 0.0), (-2.5, 2.5), (0.5, -2.0), (2.5, 2.5), (-1.5, -2.5)])
-def test_a_marker_off_by_up_to_two_and_a_half_cells_is_found_again(
-        dictionary: str, shift: tuple[float, float]) -> None:
-    image = picture(aruco.marker_code(dictionary, 2))
-    code = code_of(2, dictionary)
-    # Expected where it is not: it lies ``shift`` cells to the right and down of there.
-    found = shift_to_code(image, places(code, -shift[0], -shift[1]), code)
-    assert found == shift
-
-
-def test_a_shift_is_along_the_axes_of_the_marker_however_it_is_turned() -> None:
-    code, cells = code_of(2), aruco.marker_code(DICTIONARY, 2)
-    image = np.ascontiguousarray(np.rot90(picture(cells), -1))  # a quarter turn clockwise
-    size = image.shape[0]
-    x, y = places(code, -1.5, 2.0).T
-    assert shift_to_code(image, np.column_stack([size - 1.0 - y, x]), code) == (1.5, -2.0)
-
-
-@pytest.mark.parametrize('image', [
-    np.full((140, 140), 128, dtype=np.uint8),
-    np.random.default_rng(2).integers(0, 256, (140, 140), dtype=np.uint8),
-    255 - picture(aruco.marker_code(DICTIONARY, 2))], ids=['flat', 'noise', 'inverted'])
-def test_where_nothing_resembles_the_marker_there_is_no_shift(image: GrayImage) -> None:
-    code = code_of(2)
-    assert shift_to_code(image, places(code), code) is None
