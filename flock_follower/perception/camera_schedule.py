@@ -125,7 +125,7 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
     later = readout_time / camera.height * (rows[:-1] - rows[-1])
     moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
     found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
-    return T_camera_body if found is None else found.pose
+    return T_camera_body if found is None else found[0]
 
 
 def _faces(T_camera_marker: Transform) -> bool:

@@ -17,7 +17,7 @@ From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
 and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
-is fitted as it is smeared, and where that fails, four corners have to do.
+is fitted as it is smeared.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, ippe, moved, refit
-from flock_follower.perception.edges import facing, project
+from flock_follower.perception.edges import facing
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.measurement import (
     angle,
     Choice,
     choose,
-    from_corners,
     Hypothesis,
     Measurement,
     PosePrior,
@@ -141,13 +140,12 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior, confirmed: bool = False) -> Measurement | None:
+           expected: PosePrior) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
-    :param confirmed: whether no pose is accepted that edges or the smeared print do not confirm.
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
@@ -157,8 +155,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
             if (one := _good_fit(image, camera, alone, start)) is not None
             and one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
-        return _without_edges(image, camera, sought, index, None if confirmed else corners, starts,
-                              expected)
+        return _without_edges(image, camera, sought, index, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
@@ -170,26 +167,16 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-                   corners: Array | None, starts: list[Transform],
-                   expected: PosePrior) -> Measurement | None:
-    """Return a neighbour by the whole print of a detected marker, smeared, or by its corners."""
-    marker, model = sought.neighbor.markers[index], sought.model
+                   starts: list[Transform], expected: PosePrior) -> Measurement | None:
+    """Return a neighbour by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    if fits:
-        least = min(f.rms for f in fits)
-        best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
-                      expected)
-        return widened(_of_smear(sought, index, best.chosen.fit), best)
-    if corners is None:
+    if not fits:
         return None
-    by_corners = from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
-    if by_corners is None:
-        return None
-    alone = model.only(np.arange(len(model.codes)) == index)
-    lines = project(camera, alone, by_corners.T_camera_body)
-    shown = lines is not None and shows_code(image, lines.cells, model.codes[index])
-    return by_corners if shown else None
+    least = min(f.rms for f in fits)
+    best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
+                  expected)
+    return widened(_of_smear(sought, index, best.chosen.fit), best)
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,

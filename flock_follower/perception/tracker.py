@@ -373,15 +373,14 @@ class Tracker:
                     found = search.everywhere(image, self.config.dictionary, [
                         m for name in missing() for m in self._targets[name].neighbor.markers
                     ] if thorough else None)
-                    self._locate(found, 'full', image, look, measured, others, sighting,
-                                 thorough)
+                    self._locate(found, 'full', image, look, measured, others, sighting)
                     camera.thorough = not thorough
             sighting.stage, camera.searched = 'full', look.stamp
         camera.vain.update((name, look.stamp) for name in near if name not in measured)
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look,
                 measured: dict[str, Measurement], others: list[Measurement],
-                sighting: Sighting, confirmed: bool = False) -> None:
+                sighting: Sighting) -> None:
         """Turn detections that are not measured yet into measurements."""
         candidates: dict[str, list[Measurement]] = {}
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
@@ -394,8 +393,7 @@ class Tracker:
                                                         others):
                 continue
             measurement = locate(image, look.model, self._targets[name],
-                                 neighbor.markers.index(marker), corners, look.expected[name],
-                                 confirmed)
+                                 neighbor.markers.index(marker), corners, look.expected[name])
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
             elif not self._known(measurement, measured, others):
