@@ -80,22 +80,6 @@ def test_the_share_of_a_poses_variance_that_is_noise_is_learnt_down_to_a_limit(
     assert learnt.shares == [1.0, 1.0]
 
 
-def test_a_single_slip_does_not_make_it_large() -> None:
-    learnt = fed(0.0005, 0.0)
-    learnt.take(0.5 * ACROSS, expected(learnt), SIGHT)
-    assert learnt.attitude < 0.001
-
-
-def test_it_is_forgotten_where_it_ends() -> None:
-    learnt = fed(0.005, 0.01)
-    for _ in range(5 * LEARNT):
-        learnt.take(np.zeros(3), expected(learnt), SIGHT)
-    assert learnt.attitude < 0.001
-    assert learnt.distance < 0.001
-    learnt.restart()
-    assert (learnt.attitude, learnt.distance) == (0.0005, 0.0)
-
-
 def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
     noise = fed(0.005, 0.0)
     added = noise.covariance(np.zeros((6, 6)), SIGHT)

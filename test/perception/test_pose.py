@@ -153,16 +153,6 @@ def test_where_it_is_not_a_marker_is_not_tracked(expected: Transform | None) -> 
             assert track(image, SMALL, LEADER, PosePrior(pose), None, check) is None
 
 
-@pytest.mark.parametrize('other', [1, 7, 33, 49])
-def test_another_marker_in_its_place_is_not_tracked(other: int) -> None:
-    marker = facing((0.0, 0.0, 1.2), (0.1, 0.3, 0.0))
-    image = render(SMALL, {other: marker})
-    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, False) is None
-    codes = {0: np.fliplr(marker_code(0))}
-    image = render(SMALL, {0: marker}, codes=codes)
-    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, False) is None
-
-
 FINITE = st.floats(-5.0, 5.0)
 SHOWN = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
 
