@@ -437,12 +437,10 @@ class Follower:
         if state is not None:  # the newest since the last cycle: no other counts
             received = self._seconds(self._gate_received)
             age = stamp_age(state.stamp, self._gate_received)
-            if refused := control.update_velocity(self._source, state.velocity, age, received):
+            if refused := control.update_velocity(
+                    self._source, state.velocity, age, received,
+                    yaw=yaw_from_quaternion(state.quaternion), position=state.position):
                 self._listener.rejected(f'odom {refused}', '')
-            else:
-                time = received - max(age, 0.0)
-                control.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
-                control.update_position(self._source, state.position, time)
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
         if setpoint.kind != NONE and self._make is not None:

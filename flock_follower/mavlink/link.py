@@ -90,23 +90,20 @@ class Framer:
                 incomplete = start if incomplete < 0 else incomplete
                 start += 1
                 continue
-            fault = ''
             try:
                 message = self.codec.decode(buffer[start:end])
+                # Another dialect's, or garbage: an unknown kind has no checksum.
+                fault = UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
             except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
                 fault = WRONG_SIGNATURE if 'signature' in str(error).lower() else UNDECODABLE
-            else:
-                if message.get_type().startswith('UNKNOWN'):
-                    # Another dialect's, or garbage: an unknown kind has no checksum.
-                    fault = UNKNOWN_MESSAGE
             if fault:
                 unused[fault] += 1
             else:
                 messages.append(message)
-            if fault in (UNDECODABLE, UNKNOWN_MESSAGE):
-                start += 1
-            else:
+            if fault in ('', WRONG_SIGNATURE):
                 start, incomplete = end, -1
+            else:
+                start += 1
         if not messages and not unused and incomplete < 0:
             unused[UNDECODABLE] += bool(buffer)
         self._waiting = buffer[incomplete:] if incomplete >= 0 else bytearray()
@@ -164,8 +161,6 @@ class Signing:
     """A MAVLink 2 signing key and the time, s since 1970, to start its timestamps from."""
 
     def __init__(self, key: bytes, unix_time: float, link_id: int = 0) -> None:
-        if len(key) != SIGNING_KEY_SIZE:
-            raise ValueError(f'signing key of {len(key)} bytes: must be {SIGNING_KEY_SIZE} bytes')
         self.state = mavlink.MAVLinkSigning()
         self.state.secret_key = key
         self.state.sign_outgoing = True
@@ -266,17 +261,15 @@ class Link:
         self.autopilot_signs = False
         self.bytes_received = 0
         self.bytes_sent = 0
-        self._signing = signing
-        #: Whether sent messages are signed.
-        self.signs = signing is not None
+        self.signing = signing
         self._parsers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
     def _codec(self) -> Any:
         codec = _Codec(None, srcSystem=self.source_system,
                        srcComponent=self.source_component)
-        if self._signing is not None:
-            codec.signing = self._signing.state
+        if self.signing is not None:
+            codec.signing = self.signing.state
         return codec
 
     def receive(self, now: float) -> list[Any]:
@@ -294,11 +287,12 @@ class Link:
             parsed, pieces = self._parse(data, peer, budgets[ours], now)
             budgets[ours] -= pieces
             for message in parsed:
-                if self._is_for_us(message, peer, now):
-                    self.autopilot_signs = bool(
-                        message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
-                    self.telemetry.update(message, now)
-                    messages.append(message)
+                if unfit := self._unfit(message, peer, now):
+                    self.ignored[unfit] += 1
+                    continue
+                self.autopilot_signs = bool(message.get_header().incompat_flags & _SIGNED)
+                self.telemetry.update(message, now)
+                messages.append(message)
         return messages
 
     def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
@@ -309,8 +303,8 @@ class Link:
                 del self._parsers[next(iter(self._parsers))]
             self._parsers[peer] = Framer(self._codec())
         framer = self._parsers[peer]
-        if self._signing is not None:
-            framer.codec.latest = self._signing.latest(now)
+        if self.signing is not None:
+            framer.codec.latest = self.signing.latest(now)
         messages, unused = framer.feed(data, most)
         untimely = framer.codec.untimely
         self.ignored.update(
@@ -318,35 +312,30 @@ class Link:
         untimely.clear()
         return messages, 1 + framer.looks
 
-    def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
+    def _unfit(self, message: Any, peer: Any, now: float) -> str:
+        """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
         kind = message.get_type()
         system = message.get_srcSystem()
         vehicle = (message.get_srcComponent() == self.target_component
                    and (kind != 'HEARTBEAT' or is_autopilot(message)))
         if system != self.target_system:
-            self.ignored['other system'] += 1
-            if kind == 'HEARTBEAT' and vehicle:
-                self.other_autopilots[system] += 1
-            return False
+            self.other_autopilots[system] += kind == 'HEARTBEAT' and vehicle
+            return 'other system'
         if not vehicle:
-            self.ignored['other component'] += 1
-            return False
+            return 'other component'
         if kind == 'HEARTBEAT' and dialect_of(message, self.autopilot) is None:
-            self.ignored['other firmware'] += 1
             self.foreign = describe(message)
-            return False
-        if peer != self.transport.peer:
-            # Answer one vehicle only: a second one with the same id must be silent first.
-            if now - self.telemetry.heartbeat_time <= PEER_TIMEOUT:
-                self.ignored['second sender'] += 1
-                return False
-            if kind != 'HEARTBEAT':
-                self.ignored['before HEARTBEAT'] += 1
-                return False
-            if math.isfinite(self.telemetry.heartbeat_time):
-                self.peer_changes += 1
-            self.transport.peer = peer
-        return True
+            return 'other firmware'
+        if peer == self.transport.peer:
+            return ''
+        # Answer one vehicle only: a second one with the same id must be silent first.
+        if now - self.telemetry.heartbeat_time <= PEER_TIMEOUT:
+            return 'second sender'
+        if kind != 'HEARTBEAT':
+            return 'before HEARTBEAT'
+        self.peer_changes += math.isfinite(self.telemetry.heartbeat_time)
+        self.transport.peer = peer
+        return ''
 
     def send(self, message: Any) -> bool:
         """Send a message; return whether it was sent (False until a message was received)."""
@@ -384,17 +373,11 @@ class Link:
         ignored = self.ignored
         if self.foreign:
             return f'received {self.foreign}, which autopilot = {self.autopilot!r} does not send'
-        if self.other_autopilots:
-            ids = ', '.join(map(str, sorted(self.other_autopilots)))
-            return f'received system id {ids}, not target_system {self.target_system}'
-        for reason, text in _UNUSABLE.items():
-            if ignored[reason]:
-                return text
-        if ignored['other system'] or ignored['other component']:
-            return (f'received MAVLink, but no autopilot with system id {self.target_system} '
-                    f'and component {self.target_component}')
-        return 'received bytes are not MAVLink' if ignored[UNDECODABLE] else 'nothing arrives'
-
-    def close(self) -> None:
-        """Release the port."""
-        self.transport.close()
+        if others := sorted(+self.other_autopilots):
+            return (f'received system id {", ".join(map(str, others))}, '
+                    f'not target_system {self.target_system}')
+        none = (f'received MAVLink, but no autopilot with system id {self.target_system} '
+                f'and component {self.target_component}')
+        texts = {**_UNUSABLE, 'other system': none, 'other component': none,
+                 UNDECODABLE: 'received bytes are not MAVLink'}
+        return next((text for why, text in texts.items() if ignored[why]), 'nothing arrives')

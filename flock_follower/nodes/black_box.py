@@ -45,13 +45,13 @@ from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
-from flock_follower.nodes.support.flown_parameters import FlownParameters
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory_for_images,
     IMAGES_BUFFER,
     receive_buffer_max,
     shares_memory,
 )
+from flock_follower.nodes.support.parameters import FlownParameters
 from flock_follower.nodes.support.runtime import (
     FlockNode,
     LONGEST_WAIT,

@@ -38,7 +38,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, Range
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -49,12 +48,11 @@ from flock_follower.live_line import LiveLine
 from flock_follower.nodes.call import patience
 from flock_follower.nodes.observer import Observer
 from flock_follower.nodes.support.diagnostics import internal_error
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Pilot(Node):
@@ -83,9 +81,10 @@ class Pilot(Node):
                          for step, (service, value) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
         self.create_subscription(String, 'mavlink_bridge/state', lambda message: setattr(
-            self._reports, 'bridge', message.data), STATE_QOS)
-        self.create_subscription(Range, 'planner/distance', self._take_distance, NEWEST_QOS)
-        self.create_subscription(BatteryState, 'mavlink/battery', self._take_battery, NEWEST_QOS)
+            self._reports, 'bridge', message.data), LATCHED_QOS)
+        self.create_subscription(Range, 'planner/distance', self._take_distance, best_effort())
+        self.create_subscription(
+            BatteryState, 'mavlink/battery', self._take_battery, best_effort())
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:

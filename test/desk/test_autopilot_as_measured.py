@@ -102,7 +102,7 @@ def test_px4_reports_on_a_change_and_when_it_is_asked_to():
     assert flight.kinds().count('EVENT') == 10
     for message in flight.messages:
         if message.get_type() == 'EVENT':
-            checks.take(message, 1.0)
+            checks.take(message)
     assert checks.against('OFFBOARD') == []
 
 

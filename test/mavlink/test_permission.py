@@ -112,17 +112,6 @@ def test_it_flies_from_when_the_mode_is_seen_until_it_streams_no_more(events, fl
     assert after(*events).flies is flies
 
 
-def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
-    permission = after(ASKED, seen(PILOT), OffboardFailed('offboard refused: denied'))
-    assert permission.announced() == 'INACTIVE: offboard refused: denied'
-    assert next_permission(permission, seen(OURS)) is permission
-
-
-@pytest.mark.parametrize('received', [0.5, 1.0])
-def test_a_heartbeat_from_before_the_request_shows_nothing(received):
-    assert next_permission(after(ASKED), seen(OURS, received)) == after(ASKED)
-
-
 def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
     for obeying in (after(ASKED, seen(OURS)), after(ASKED, seen(OURS, airborne=None))):
         assert next_permission(obeying, OffboardFailed('late')) is obeying
@@ -149,15 +138,6 @@ def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
     assert next_permission(giving, seen(DISARMED)).announced() == (
         'INACTIVE: given back (hold requested)')
     assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
-
-
-def test_who_sees_no_velocity_any_more_falls_silent_until_asked_again():
-    for events in ((ASKED,), (ASKED, seen(OURS)), (ASKED, seen(OURS), ENDED)):
-        blinded = next_permission(after(*events), Blinded('velocity from odom stale'))
-        assert blinded.announced() == 'INACTIVE: fell silent: velocity from odom stale'
-        assert next_permission(blinded, seen(OURS, received=3.0)) is blinded
-    over = after(ASKED, seen(OURS), seen(PILOT))
-    assert next_permission(over, Blinded('velocity from odom stale')) is over
 
 
 def test_where_two_nodes_command_it_brakes_until_asked_again():

@@ -171,16 +171,6 @@ def test_by_default_it_never_begins_and_the_loss_ends_as_before(limits):
     assert vehicle.gate.permission.streams is limits.relative_flight
 
 
-def test_a_marker_that_is_lost_ends_the_stream():
-    vehicle = Flown()
-    vehicle.permit()
-    vehicle.for_seconds(1.0, False)
-    vehicle.odometry = False
-    vehicle.for_seconds(5.0, True)
-    assert vehicle.for_seconds(0.3, True, command=False).kind == NONE
-    assert vehicle.gate.permission.reason.startswith('fell silent')
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(['odometry', 'none', 'takeover', 'offboard', 'silent']),
                           st.floats(0.1, 15.0)), max_size=10))

@@ -159,23 +159,6 @@ def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
          'velocity from odom stale', (-0.4 / (0.3 + more), 0.0, 0.0))
 
 
-@pytest.mark.parametrize('age', [0.0, 0.05, 0.1, 0.2, 0.29])
-def test_however_late_the_velocity_neither_braking_nor_the_speed_limit_swings(age):
-    step, lag, v, a, past = 0.01, 0.1, 0.0, 0.0, [0.0] * 30
-    speeds = []
-    for n in range(1000):
-        if n % 5 == 0:  # 20 Hz
-            known = Motion((past[-1 - round(age / step)], 0.0, 0.0), age)
-            wanted = Command((2.5, 0.0, 0.0), 0.0) if n < 500 else None
-            setpoint = judge(command=wanted, odom=known, autopilot=UNKNOWN)
-        a += (setpoint.acceleration[0] - a) * step / lag
-        v += a * step
-        past.append(v)
-        speeds.append(v)
-    assert max(speeds) < 1.15 * LIMITS.v_max and min(speeds) > -0.1 * LIMITS.v_max
-    assert np.ptp(speeds[300:500]) < 0.02 and np.ptp(speeds[800:]) < 0.02
-
-
 @pytest.mark.parametrize(('ages', 'kind', 'reason'), [
     ((0.31, 0.31), LEVEL, 'velocity from odom stale'),
     ((2.31, 2.29), LEVEL, 'velocity from odom stale'),
@@ -185,13 +168,6 @@ def test_however_late_the_velocity_neither_braking_nor_the_speed_limit_swings(ag
 def test_without_any_velocity_it_is_level_then_silent(ages, kind, reason):
     odom, autopilot = (SLOW._replace(velocity_age=age) for age in ages)
     same(judge(odom=odom, autopilot=autopilot), kind, reason)
-
-
-@pytest.mark.parametrize('unknown', [None, math.nan, math.inf])
-def test_an_unknown_yaw_is_not_invented(unknown):
-    for change in ({'withheld': 'x'}, {'armed': False}, {'command': None},
-                   {'odom': UNKNOWN, 'autopilot': UNKNOWN}):
-        assert judge(held=Held(unknown), **change).yaw is None
 
 
 # Limits.
@@ -317,28 +293,6 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
         place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
     assert norm_on_wire(setpoint) <= (limits if commanded and axis is None else full).a_max
-
-
-COMPONENTS = st.floats(-3.0, 3.0)
-VECTORS = st.tuples(COMPONENTS, COMPONENTS, COMPONENTS)
-
-
-@settings(max_examples=300)
-@given(VECTORS, VECTORS, VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1),
-       st.floats(0.05, 3.0))
-def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted, velocity, axis,
-                                                                         v_max):
-    limits, direction = GateLimits(v_max=v_max), np.array(axis) / np.linalg.norm(axis)
-    known = Motion(velocity, 0.02)
-    command = Command(wanted, 0.0)
-    scaled = judge(limits, command=command, odom=known, autopilot=UNKNOWN).acceleration
-    kept = judge(limits, command=command._replace(separation_axis=direction), odom=known,
-                 autopilot=UNKNOWN).acceleration
-    assert np.linalg.norm(kept) <= limits.a_max
-    reached = np.linalg.norm(np.array(velocity) + limits.speed_horizon * kept)
-    assert reached <= max(v_max, np.linalg.norm(velocity)) + 1e-9
-    within = min(direction @ scaled, direction @ np.array(wanted))
-    assert direction @ kept >= within - 1e-6
 
 
 @pytest.mark.parametrize('axis', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0),

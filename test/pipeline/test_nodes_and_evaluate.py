@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 import math
 from pathlib import Path
 import time
@@ -24,17 +23,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from bag_excerpts import excerpt
+from driven import Driven, overrides
 from geometry_msgs.msg import AccelWithCovarianceStamped
 from memory_line import MemoryLine
 from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -48,10 +43,8 @@ from flock_follower.messages import Command, from_odometry, from_trajectory, tra
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
-from flock_follower.resources import resource
+from flock_follower.parameters.files import parse_parameters, TABLE
 
-DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
 PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage}
 
@@ -68,73 +61,23 @@ def result(bag: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def ros() -> Iterator[None]:
-    rclpy.init()
-    yield
-    rclpy.shutdown()
-
-
 def published(path: Path, topic: str) -> list[tuple[int, Any]]:
     with open_bag(path) as result:
         return [(m.stamp_ns, deserialize(m.data, m.msgtype)) for m in result.messages([topic])]
 
 
 def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result: Path) -> None:
-    node = RelativePose(parameter_overrides=[
-        Parameter('image_transport', value='compressed'),
-        *(Parameter(name, value=value) for name, value in PATIENT.items())])
-    player = Node('player')
-    found: list[Odometry] = []
-    player.create_subscription(Odometry, 'neighbors', found.append, 100)
-    outputs = {topic: player.create_publisher(kind, topic, qos_profile_sensor_data)
-               for topic, kind in PLAYED.items()}
-    executor = SingleThreadedExecutor()
-    for one in (node, player):
-        executor.add_node(one)
-
-    def wait(condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            node.poll_odom()  # odometry that nothing waits for is taken with the next image
-            executor.spin_once(timeout_sec=0.01)
-
-    wait(lambda: player.count_publishers('neighbors') and all(
-        output.get_subscription_count() for output in outputs.values()))
-    expected = [message for _, message in published(result, '/neighbors')]
+    node = Driven(RelativePose(parameter_overrides=overrides(
+        image_transport='compressed', **PATIENT)))
     with open_bag(bag) as messages:
         for topic, _, _, data in messages.messages(list(PLAYED)):
-            rate = node.diagnostics.rates[f'{topic[1:]}_hz']
-            count = rate.count
-            outputs[topic].publish(data)
-            wait(lambda rate=rate, count=count: rate.count > count)
-    wait(lambda: len(found) == len(expected))
-    executor.shutdown()
-    for one in (node, player):
-        one.destroy_node()
-
-    assert len(expected) == 60
-    for mine, theirs in zip(found, expected):
+            node.give(topic[1:], deserialize_message(data, PLAYED[topic]))
+    node.wait(lambda: len(node.sent['neighbors']) == 60)  # the last image waits for odometry
+    node.close()
+    for mine, (_, theirs) in zip(node.sent['neighbors'], published(result, '/neighbors'),
+                                 strict=True):
         for a, b in zip(from_odometry(mine), from_odometry(theirs)):
             assert np.array_equal(a, b)
-
-
-@pytest.mark.parametrize(('node', 'changed'), [(RelativePose, 'max_wait'), (Planner, 'v_max')])
-def test_nodes_take_the_parameter_file_of_all(
-        node: type[RelativePose | Planner], changed: str, tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / 'follower.yaml'
-    path.write_text(resource('config/follower.yaml').read_text().replace(
-        'v_max: 0.5', 'v_max: 0.4').replace('rectified:', 'max_wait: 0.02\n    rectified:'))
-    rclpy.init(args=['--ros-args', '--params-file', str(path)])
-    monkeypatch.setattr(node, 'parameter_files', [str(path)])  # as runtime.run sets them
-    made = node()
-    name, value = made.get_name(), made.get_parameter(changed).value
-    made.destroy_node()
-    rclpy.shutdown()
-    assert value == read_parameters(path, TABLE)[name][changed]
-    assert value == {'max_wait': 0.02, 'v_max': 0.4}[changed]
 
 
 class BagClock:
@@ -148,11 +91,9 @@ class BagClock:
 
 def test_planner_gives_the_same_commands_at_the_same_ticks(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Planner(parameter_overrides=[
-        Parameter('require_bridge', value=False), Parameter('use_sim_time', value=True)])
-    clock, sent = BagClock(), []
+    node = Planner(parameter_overrides=overrides(require_bridge=False, use_sim_time=True))
+    clock, sent = BagClock(), Driven(node).sent['command/trajectory']
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
-    monkeypatch.setattr(node._commands, 'publish', sent.append)
     node._loop.engage(True)
     expected = published(result, '/command/trajectory')
     with open_bag(bag) as messages:
@@ -198,9 +139,8 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     monkeypatch.setattr(SetpointThread, 'stop', lambda self: None)
     monkeypatch.setattr(SetpointThread, 'submit', lambda self, action: action() or True)
     # As evaluate: the vehicle of a bag does not obey, so no wind can be told from that.
-    node = mavlink_bridge.MavlinkBridge(parameter_overrides=[
-        Parameter('wind_compensation', value='never')])
-    node._simulated = True
+    node = mavlink_bridge.MavlinkBridge(parameter_overrides=overrides(wind_compensation='never'))
+    node._even_clock.simulated = True
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)
     in_air = mavlink.MAVLink_extended_sys_state_message(
@@ -214,9 +154,12 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     node._bridge.gate.permit(OffboardRequested(-math.inf))
     beat()
 
+    def take_odom(message: Odometry) -> None:
+        node._take_odom(message, clock.nanoseconds)
+
     expected = published(result, '/setpoint')
     with open_bag(bag) as messages:
-        events = [(m.stamp_ns, 1, node._take_odom, m.data, Odometry)
+        events = [(m.stamp_ns, 1, take_odom, m.data, Odometry)
                   for m in messages.messages(['/odom'])]
 
     def take_command(message: MultiDOFJointTrajectory) -> None:

@@ -48,7 +48,7 @@ from rclpy.waitable import Waitable
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
-from flock_follower.nodes.support.node_parameters import usage, ValidatedNode
+from flock_follower.nodes.support.parameters import usage, ValidatedNode
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.files import files_in
 

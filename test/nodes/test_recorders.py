@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The black box as a process: kills, a full disk, and what a recording of it holds."""
+"""Black box and recorder as processes: kills, a full disk, a slow end, contents."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from full_disk import disk_of
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -38,19 +39,33 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
+from flock_desk import recorder_node
 from flock_desk.runs.processes import wait_until
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.messages import NANOSECONDS
+from flock_follower.nodes import SHUTDOWN_TIMEOUT
 from flock_follower.parameters.files import parameters_flown, TABLE
 from flock_follower.perception.images import decode_compressed
 
-#: The black box as a program, after some lines of Python.
+#: A node as a program, after some lines of Python.
 PROGRAM = """
 import sys
-sys.argv = ['black_box', *sys.argv[1:]]
-from flock_follower.nodes import black_box
-{}
-sys.exit(black_box.main())
+sys.argv = ['flock_follower/{name}', *sys.argv[1:]]
+from {package} import {name}
+{patch}
+sys.exit({name}.main(sys.argv[1:]))
+"""
+#: A bag that takes long to close, as one of some gigabytes does.
+SLOW = f"""
+import time
+from flock_follower.bags import writer
+describe = writer.describe
+
+def slow(folder, files):
+    time.sleep({SHUTDOWN_TIMEOUT} + 0.5)
+    describe(folder, files)
+
+writer.describe = slow
 """
 #: A disk that is full until a file is there.
 FULL = """
@@ -91,9 +106,16 @@ class Vehicle:
             thread.start()
 
     def start(self, folder: Path, patch: str = '') -> subprocess.Popen[str]:
+        """Start a black box."""
+        return self.run(
+            'flock_follower.nodes', 'black_box', patch, '--ros-args', '-r', '__ns:=/drone1',
+            '-r', 'odom:=/vio/odom', '-p', f'record_folder:={folder}', '-p', 'disk_free:=10.0')
+
+    def run(self, package: str, name: str, patch: str,
+            *arguments: str) -> subprocess.Popen[str]:
+        program = PROGRAM.format(package=package, name=name, patch=patch)
         self.processes.append(subprocess.Popen(
-            [sys.executable, '-c', PROGRAM.format(patch), '--ros-args', '-r', '__ns:=/drone1',
-             '-r', 'odom:=/vio/odom', '-p', f'record_folder:={folder}', '-p', 'disk_free:=10.0'],
+            [sys.executable, '-c', program, *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return self.processes[-1]
 
@@ -223,3 +245,36 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
     assert np.all(np.diff(stamps) >= 0)
     values = parameters_flown(path, TABLE)
     assert values is not None and values['planner']['v_max'] == 0.5
+
+
+def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
+        vehicle: Vehicle, tmp_path: Path) -> None:
+    process = vehicle.run('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
+                          '/vio/odom:nav_msgs/msg/Odometry')
+    wait_until(lambda: vehicle.odom.get_subscription_count() > 0, 20.0, 'the recorder')
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=20.0)
+    assert (process.returncode, 'Traceback' in error) == (0, False), error
+    assert f'closing {tmp_path / "bag"}' in out
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete == '' and bag.message_count > 5
+
+
+def test_a_full_disk_ends_the_recorder_and_keeps_what_it_holds(
+        ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    recorder = recorder_node.Recorder(str(tmp_path / 'bag'), {'words': 'std_msgs/msg/String'})
+
+    def fill(node: recorder_node.Recorder) -> None:
+        for _ in range(10_000):
+            node._write('words', 'std_msgs/msg/String', random.randbytes(1000))
+    monkeypatch.setattr(recorder_node, 'spin', fill)
+    with disk_of(3_000_000):
+        assert recorder.record() == 1
+    recorder.destroy_node()
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f'error: {tmp_path / "bag"}: File too large; the recording so far is kept, '
+        'marked incomplete')
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete and bag.message_count > 100
