@@ -42,9 +42,10 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.vertical_yaw import Altitude, facing, turning
 
-#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
-#: leaves the rest of ``RELATIVE_MAX`` to the distance.
-CLIMB_MAX = 0.6
+#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust, and with it:
+#: the altitude leaves the rest of ``RELATIVE_MAX`` to the distance. The offset itself, and
+#: CLIMB_LEAST beside it, are never cut.
+CLIMB_MAX, UP_MAX, CLIMB_LEAST = 0.6, 0.8, 0.1
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
@@ -57,6 +58,9 @@ TIME = 0.6
 #: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
 #: PX4's tilt was seen to err by 1 m/s^2 for 10 s.
 BANDWIDTH, OFFSET_MAX = 0.8, 0.8
+#: So far beyond the band, m, an error of the tilt is larger than the acceleration that may offset
+#: it: the follower runs away, and commands nothing more.
+FARTHEST = 1.0
 #: Deviation of the gap to another neighbor that closes it no faster than this, s.
 CLOSING = 2.0
 
@@ -65,24 +69,25 @@ class Disturbance(NamedTuple):
     """Relative acceleration that is not commanded: by an error of the tilt, or the leader's."""
 
     velocity: Array | None = None
-    """Relative velocity, estimated (2,), m/s."""
-    response: Array = np.zeros(2)
-    """Acceleration commanded, as far as it is flown (2,), m/s^2."""
-    acceleration: Array = np.zeros(2)
-    """(2,), m/s^2."""
+    """Relative velocity, estimated (3,), m/s."""
+    response: Array = np.zeros(3)
+    """Acceleration commanded, as far as it is flown (3,), m/s^2."""
+    acceleration: Array = np.zeros(3)
+    """(3,), m/s^2."""
 
     def observed(self, velocity: Array, command: Array | None, elapsed: float,
                  response_time: float) -> Disturbance:
-        """Return it after a relative velocity (2,), m/s, was measured: a Luenberger observer."""
+        """Return it after a relative velocity (3,), m/s, was measured: a Luenberger observer."""
         if self.velocity is None or command is None:
             return self._replace(velocity=velocity)
-        response = self.response + (command[:2] - self.response) * -math.expm1(
+        response = self.response + (command - self.response) * -math.expm1(
             -elapsed / response_time)
         error = velocity - self.velocity
+        estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
+        up = min(max(float(estimate[2]), -OFFSET_MAX), OFFSET_MAX)
         return Disturbance(
             self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
-            response,
-            limit_norm(self.acceleration + elapsed * BANDWIDTH ** 2 * error, OFFSET_MAX))
+            response, np.array([*limit_norm(estimate[:2], OFFSET_MAX), up]))
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
@@ -101,25 +106,31 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     if leader is None:
         return 'no odometry, and no neighbor in sight'
     me, there = at(own, now), at(leader, now)
+    gap, _ = _gap(there.position, me, leader, params)
+    if gap > math.sqrt(params.law.d1) + FARTHEST:
+        return f'no odometry, and {leader.name} is {gap:.1f} m away'
     altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
         lowest=-math.inf, highest=math.inf)
     rising = me.velocity
     if params.altitude_mode == 'follow':
         altitude = altitude._replace(held=float(there.position[2]) + params.altitude_offset)
         rising = me.velocity - [0.0, 0.0, there.velocity[2]]
-    altitude, vertical = altitude._replace(climb=0.0).controlled(
+    before = memory.disturbance or Disturbance(
+        acceleration=np.array([0.0, 0.0, -altitude.thrust_bias]))
+    disturbance = before.observed(
+        me.velocity - there.velocity, memory.command, elapsed, params.response_time)
+    bias = -disturbance.acceleration
+    up = float(bias[2])
+    altitude, vertical = altitude._replace(climb=0.0, thrust_bias=up).controlled(
         me._replace(velocity=rising), params, elapsed)
+    most = max(UP_MAX, abs(up) + CLIMB_LEAST)
+    vertical = min(max(vertical, up - CLIMB_MAX, -most), up + CLIMB_MAX, most)
     others = [n for n in seen.values() if n is not leader]
-    disturbance = (memory.disturbance or Disturbance()).observed(
-        (me.velocity - there.velocity)[:2], memory.command, elapsed, params.response_time)
-    command = limited(
-        level(me, memory.pending, leader, others, params) - disturbance.acceleration, min(
-            max(vertical, altitude.thrust_bias - CLIMB_MAX), altitude.thrust_bias + CLIMB_MAX),
-        memory.command)
+    command = limited(level(me, memory.pending, leader, others, params) + bias[:2], vertical,
+                      memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
-    bias = np.array([*-disturbance.acceleration, altitude.thrust_bias])
     return memory._replace(
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
         disturbance=disturbance,
