@@ -332,15 +332,20 @@ def _relative(full: GateLimits, command: Command, against: Array, place: Locatio
     """
     Return the setpoint of a command that rests on the marker alone.
 
-    Heights go first, then the limit of the whole acceleration; the speed is not known.
+    Heights go first, then the limit of the acceleration; the speed is not known. The offset of an
+    error of the thrust does not count for RELATIVE_MAX: it moves nothing.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
     least, most = envelope.vertical_range(
         full, place, place.climb_rate, _bounded(offset), full.speed_horizon)
+    a_max = full.a_max * SENT_INSIDE
     strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
+    bias = _bounded(command.thrust_bias)
     within = min(max(float(wanted[2]), least), most)
-    up = min(max(within, -strongest), strongest)
-    level = limit_norm(wanted[:2], math.sqrt(strongest ** 2 - up ** 2))
+    lowest, highest = min(bias, 0.0) - strongest, max(bias, 0.0) + strongest
+    up = min(max(within, lowest, -a_max), highest, a_max)
+    rest = min(strongest ** 2 - (up - bias) ** 2, a_max ** 2 - up ** 2)
+    level = limit_norm(wanted[:2], math.sqrt(max(rest, 0.0)))
     limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
     if within != wanted[2]:
         limits.append(ENVELOPE)

@@ -40,12 +40,11 @@ from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, unti
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
-from flock_follower.planner.vertical_yaw import Altitude, facing, turning
+from flock_follower.planner.vertical_yaw import Altitude, facing, THRUST_BIAS_MAX, turning
 
-#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust, and with it:
-#: the altitude leaves the rest of ``RELATIVE_MAX`` to the distance. The offset itself, and
-#: CLIMB_LEAST beside it, are never cut.
-CLIMB_MAX, UP_MAX, CLIMB_LEAST = 0.6, 0.8, 0.1
+#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
+#: leaves the rest of ``RELATIVE_MAX`` to the distance.
+CLIMB_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
@@ -84,7 +83,7 @@ class Disturbance(NamedTuple):
             -elapsed / response_time)
         error = velocity - self.velocity
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
-        up = min(max(float(estimate[2]), -OFFSET_MAX), OFFSET_MAX)
+        up = min(max(float(estimate[2]), -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
         return Disturbance(
             self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
             response, np.array([*limit_norm(estimate[:2], OFFSET_MAX), up]))
@@ -123,11 +122,9 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     up = float(bias[2])
     altitude, vertical = altitude._replace(climb=0.0, thrust_bias=up).controlled(
         me._replace(velocity=rising), params, elapsed)
-    most = max(UP_MAX, abs(up) + CLIMB_LEAST)
-    vertical = min(max(vertical, up - CLIMB_MAX, -most), up + CLIMB_MAX, most)
     others = [n for n in seen.values() if n is not leader]
-    command = limited(level(me, memory.pending, leader, others, params) + bias[:2], vertical,
-                      memory.command)
+    command = limited(level(me, memory.pending, leader, others, params) + bias[:2],
+                      min(max(vertical - up, -CLIMB_MAX), CLIMB_MAX), up, memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
@@ -173,15 +170,18 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     return distance - params.radius - n.member.radius, towards
 
 
-def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
+def limited(horizontal: Array, vertical: float, thrust_bias: float, last: Array | None) -> Array:
     """
     Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
 
+    :param thrust_bias: upward acceleration, m/s^2, that offsets an error of the thrust: it is
+        added beyond the limit, because it moves nothing.
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
     up = min(max(vertical, -RELATIVE_MAX), RELATIVE_MAX)
     flat = limit_norm(horizontal, math.sqrt(RELATIVE_MAX ** 2 - up * up))
-    return without_step(np.array([*flat, up]), last)
+    return without_step(np.array([*flat, up + thrust_bias]),
+                        np.array([0.0, 0.0, thrust_bias]) if last is None else last)
 
 
 def without_step(acceleration: Array, last: Array | None) -> Array:
