@@ -108,13 +108,14 @@ def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
     assert math.hypot(north, east, down) <= a_max
     assert math.hypot(north, east, max(-down - most, least + down, 0.0)) <= min(1.0, a_max)
     # Towards a bound it never accelerates beyond the speed from which it stops.
-    reached = climb + limits.speed_horizon * (setpoint.acceleration[2] - min(
-        max(offset, -1.2), 1.2))
-    braking, full = 0.4 * a_max, min(1.0, a_max) * (1.0 - 1e-6)
-    if setpoint.acceleration[2] < full:
-        assert reached >= -approach_speed(height - 0.5, braking) - 1e-6
-    if setpoint.acceleration[2] > -full:
-        assert reached <= approach_speed(10.0 - height, braking) + 1e-6
+    up, own, strongest = setpoint.acceleration[2], min(max(offset, -1.2), 1.2), min(1.0, a_max)
+    full, braking = strongest * (1.0 - 1e-6), 0.4 * strongest * (1.0 - 1e-6)
+    if up < min(most + full, a_max * (1.0 - 1e-6)):
+        reached = climb + limits.speed_horizon * (up - max(own, bias))
+        assert reached >= -approach_speed(height - 1.0, braking) - 1e-5
+    if up > max(least - full, -a_max * (1.0 - 1e-6)):
+        reached = climb + limits.speed_horizon * (up - min(own, bias))
+        assert reached <= approach_speed(9.5 - height, braking) + 1e-5
 
 
 class Flown:
