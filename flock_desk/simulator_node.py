@@ -52,14 +52,13 @@ from flock_desk.closed_loop.real_time_flight import (
     STEP_NS,
 )
 from flock_desk.closed_loop.real_time_log import RealTimeLog
-from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.external_vehicles import ExternalVehicles
+from flock_desk.external.external_autopilot import ExternalAutopilot, ExternalVehicles
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs
 from flock_desk.vehicle_ahead import VehicleAhead
-from flock_follower.live_line import LiveLine
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN

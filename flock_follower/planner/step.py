@@ -197,7 +197,8 @@ def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, 
     memory, leader, yaw, yaw_rate = flown
     return memory, Decision(
         State.RELATIVE, 'no odometry: flies by the marker alone', memory.command, yaw, yaw_rate,
-        stamp=leader.stamp, rejected=rejected, known=(leader,))
+        stamp=leader.stamp, rejected=rejected,
+        thrust_bias=-float(memory.disturbance.acceleration[2]), known=(leader,))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
