@@ -42,8 +42,7 @@ from std_msgs.msg import String
 
 from flock_desk.autopilot import Endpoint, loopback_address
 from flock_desk.camera.renderer import render_in_one_thread
-from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.closed_loop.flown_vehicle import EmbeddedVehicle, ExternalVehicle
+from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
     LATEST_NS,

@@ -23,7 +23,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.qos import QoSProfile
 
-from flock_desk.closed_loop.flown_leader import ExternalLeader
+from flock_desk.closed_loop.flown import ExternalLeader
 from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_follower.geometry import normalize_quaternion
 from flock_follower.messages import from_odometry

@@ -32,8 +32,7 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
-from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.mavlink_vehicle import global_position, STEP
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 

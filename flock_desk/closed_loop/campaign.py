@@ -38,13 +38,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math
 
-from flock_desk.closed_loop.flights_log import Flights, FlightsLog
-from flock_desk.closed_loop.simulated_follower import SimulatedFollower
+from flock_desk.closed_loop.follower import SimulatedFollower
+from flock_desk.closed_loop.metrics import Flights, FlightsLog
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
-from flock_desk.sensors.radio import Radio
-from flock_desk.sensors.sensing import PerceptionNoise
+from flock_desk.sensors.sensing import PerceptionNoise, Radio
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState

@@ -29,12 +29,12 @@ import numpy as np
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import Flock, LEADER
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.sensing import (
     facing,
     hidden,
     in_view,
     PerceptionNoise,
+    Radios,
     relative_noise,
 )
 from flock_desk.sensors.vio import GaussMarkov, turned, Vio

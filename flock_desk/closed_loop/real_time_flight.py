@@ -30,16 +30,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
-from flock_desk.closed_loop.flown_vehicle import FlownVehicle
+from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import FlownLeader, FlownVehicle, ScenarioLeader
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.radio import Radios
+from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
-from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import STEP
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,

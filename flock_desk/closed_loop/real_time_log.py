@@ -25,8 +25,8 @@ import numpy as np
 
 from flock_desk.closed_loop.real_time_flight import RealTimeFlight, RenderedImage
 from flock_desk.sensors.vio import Odometry
+from flock_desk.vehicles.embedded import STEP
 from flock_desk.vehicles.flight_log import FlightLog
-from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.whole_file import whole_file
 

@@ -39,8 +39,8 @@ from flock_desk.scenarios.flock import facing_ahead, places
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
-from flock_desk.vehicles.equipment import Barometer
-from flock_desk.vehicles.vehicle import attitude, Quadrotor
+from flock_desk.vehicles.estimator import Barometer
+from flock_desk.vehicles.quadrotor import attitude, Quadrotor
 from flock_follower.geometry import Array, GRAVITY
 from flock_follower.messages import OdometryState
 from flock_follower.planner.inputs import OwnState

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER
+from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER
 from flock_desk.closed_loop.real_time_flight import real_time_camera, T_BODY_OPTICAL
 from flock_desk.runs.plots import equal_scales, FOLLOWER, LEADER, LIMIT
 from flock_desk.runs.record import LiveRecord

@@ -28,10 +28,9 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.autopilot_parameters import AutopilotParameters
 from flock_desk.vehicles.estimator import Estimator
-from flock_desk.vehicles.profiles import HOLD, LAND, Profile, SETPOINTS
-from flock_desk.vehicles.vehicle import Quadrotor
+from flock_desk.vehicles.profiles import AutopilotParameters, HOLD, LAND, Profile, SETPOINTS
+from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import Array, GRAVITY, ned_to_enu, wrap_angle, yaw_ned_to_enu
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])

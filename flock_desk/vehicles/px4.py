@@ -39,7 +39,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.estimator import GROUND_AMSL
 from flock_desk.vehicles.flight_controller import (
     ACCEPTED,
     ARRIVED,

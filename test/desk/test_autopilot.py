@@ -27,8 +27,8 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk import autopilot
-from flock_desk.vehicles.mavlink_vehicle import STEP
-from flock_desk.vehicles.vehicle import Quadrotor
+from flock_desk.vehicles.embedded import STEP
+from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import GRAVITY
 
 pytestmark = pytest.mark.slow

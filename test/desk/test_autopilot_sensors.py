@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.equipment import (
+from flock_desk.vehicles.estimator import (
     Barometer,
     BarometerErrors,
     GROUND_AMSL,

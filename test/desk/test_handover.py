@@ -20,10 +20,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from flock_desk.closed_loop import simulated_follower
+from flock_desk.closed_loop import follower
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure, summary
-from flock_desk.closed_loop.flights_log import STATES
+from flock_desk.closed_loop.metrics import measure, STATES, summary
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.planner.loop import PlannerLoop
 
@@ -69,7 +68,7 @@ def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called():
 
 def test_a_planner_that_does_not_wait_for_the_bridge_is_found_out(monkeypatch):
     # As it was: engaged on the ground it held that altitude, and dived when offboard came.
-    monkeypatch.setattr(simulated_follower, 'PlannerLoop',
+    monkeypatch.setattr(follower, 'PlannerLoop',
                         partial(PlannerLoop, require_bridge=False))
     found = summary(measure(fly(replace(load('handover'), duration=16.0), RUNS, True)))
     # It would still, had it not the leader's altitude to follow.

@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop import campaign
-from flock_desk.closed_loop.flight_metrics import measure
 from flock_desk.closed_loop.lookout import Lookout
+from flock_desk.closed_loop.metrics import measure
 from flock_desk.closed_loop.world import World
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
@@ -33,7 +33,7 @@ from flock_desk.scenarios.scenario import (
     Sensing,
 )
 from flock_desk.scenarios.scenario_file import load
-from flock_desk.sensors.radio import Radios
+from flock_desk.sensors.sensing import Radios
 
 
 def generators(count: int) -> list[np.random.Generator]:

@@ -21,9 +21,8 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.camera.leader import T_BODY_MARKER, T_BODY_OPTICAL
-from flock_desk.camera.renderer import Light
-from flock_desk.closed_loop.flown_vehicle import EmbeddedVehicle
+from flock_desk.camera.renderer import Light, T_BODY_MARKER, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import EmbeddedVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
     real_time_camera,

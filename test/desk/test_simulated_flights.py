@@ -31,8 +31,7 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import band_exits, joined, measure, summary
-from flock_desk.closed_loop.flights_log import Flights, STATES
+from flock_desk.closed_loop.metrics import band_exits, Flights, joined, measure, STATES, summary
 from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
