@@ -46,24 +46,7 @@ RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRID
                       'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 
 
-class _Flown:
-    """The vehicle of a flight: its motion, step by step."""
-
-    in_place: bool
-    """Whether it is where the scenario has it; else the scenario comes to where it is."""
-    log: FlightLog
-    """The setpoints it got, if that is known, and its motion."""
-    _rotation: Array
-
-    def _moved(self, time_ns: int, position: Array, velocity: Array, rotation: Array) -> Odometry:
-        """Return the motion; the rates are those of the attitude since the step before."""
-        before, self._rotation = self._rotation, rotation
-        return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
-                        rotation.T @ velocity,
-                        matrix_to_rotation_vector(before.T @ rotation) / STEP)
-
-
-class EmbeddedVehicle(_Flown):
+class EmbeddedVehicle:
     """
     The vehicle of an embedded PX4, which is stepped before each step here.
 
@@ -71,8 +54,6 @@ class EmbeddedVehicle(_Flown):
     :param altitude: m, at which it hovers then.
     :param system_id: its own, of MAVLink.
     """
-
-    in_place = True
 
     def __init__(self, now: float, altitude: float, system_id: int = 1) -> None:
         self.autopilot = autopilot = EmbeddedAutopilot(
@@ -88,26 +69,21 @@ class EmbeddedVehicle(_Flown):
     def step(self, time_ns: int) -> Odometry:
         """Return the true motion, without covariances, a step after that returned before."""
         vehicle = self.autopilot.vehicle
-        return self._moved(time_ns, vehicle.position, vehicle.velocity, vehicle.rotation)
+        before, self._rotation = self._rotation, vehicle.rotation
+        return _motion(time_ns, vehicle.position, vehicle.velocity, before, self._rotation)
 
     def knows(self, time_ns: int) -> bool:
         """Return True."""
         return True
 
-    def blow(self, wind: Array) -> None:
-        """Let the air move with a velocity (3,), m/s, from now on."""
-        self.autopilot.controller.wind = wind
 
-
-class ExternalVehicle(_Flown):
+class ExternalVehicle:
     """
     The vehicle of an external autopilot, in the ENU frame of that.
 
     :param start_ns: time zero of the flight on the clock of ``motion``.
     :param height: m above the ground, of its first reported place.
     """
-
-    in_place = False
 
     def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
         self.offboard = False
@@ -128,23 +104,27 @@ class ExternalVehicle(_Flown):
                        np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
                        self.mode)
         # Not the reported rates: poses arrive unevenly, and the camera sees that.
-        return self._moved(time_ns, position, motion.velocity,
-                           quaternion_to_matrix(motion.quaternion))
+        before, self._rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
+        return _motion(time_ns, position, motion.velocity, before, self._rotation)
 
     def knows(self, time_ns: int) -> bool:
         """Return whether poses were reported shortly before and after a time of the last 0.3 s."""
         return self._motion.knows(self._start_ns + time_ns)
 
-    def blow(self, wind: Array) -> None:
-        """Do nothing: the external simulator has its own wind."""
-
 
 FlownVehicle = EmbeddedVehicle | ExternalVehicle
 
 
+def _motion(time_ns: int, position: Array, velocity: Array, before: Array,
+            rotation: Array) -> Odometry:
+    """Return the motion; the rates are those of the attitude since the step before."""
+    return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
+                    rotation.T @ velocity, matrix_to_rotation_vector(before.T @ rotation) / STEP)
+
+
 class ScenarioLeader:
     """
-    A leader on the scenario's course; pose and motion are None before it appears.
+    A leader on the scenario's course; its motion is None before it appears.
 
     :param in_place: whether the follower starts at the scenario's place; else the scenario is
         moved to its place, height and heading once it is in offboard mode.
@@ -166,10 +146,6 @@ class ScenarioLeader:
                 quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
         if self._frame is not None:
             self._scenario.turn(time, self._frame.inverse().apply(follower.position))
-
-    def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return the pose on its course."""
-        return None if self._frame is None else self._frame @ self._scenario.leader(time)
 
     def motion(self, time_ns: int, time: float) -> Odometry | None:
         """Return the motion on its course."""
@@ -200,14 +176,8 @@ class ExternalLeader:
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
         """Do nothing: the leader flies by itself."""
 
-    def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return the reported pose; of a future moment, the newest one."""
-        leader = self.motion(time_ns, time)
-        return None if leader is None else Transform(
-            quaternion_to_matrix(leader.quaternion), leader.position)
-
     def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the reported motion at a time; None once its poses stall."""
+        """Return the reported motion; of a future moment, the newest; None once poses stall."""
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > LONGEST_GAP:
             return None

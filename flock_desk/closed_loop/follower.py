@@ -60,6 +60,7 @@ from flock_follower.messages import (
     to_nanoseconds,
     with_acceleration,
 )
+from flock_follower.perception.neighbor_motion import POSITION, VELOCITY
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
@@ -149,20 +150,20 @@ class SimulatedFollower(Listener):
             self._see(now, each)
         self.follower.advance(to_nanoseconds(now) + _AFTER)
 
-    def _see(self, now: float, n: Sighted) -> None:
-        to_frame = Transform() if n.relative else self._T_odom_world
+    def _see(self, now: float, sighted: Sighted) -> None:
+        name, n, yaw, relative = sighted
+        to_frame = Transform() if relative else self._T_odom_world
         axes, pose, twist = to_frame.rotation, np.zeros((6, 6)), np.zeros((6, 6))
-        pose[:3, :3] = axes @ n.position_covariance @ axes.T
-        twist[:3, :3] = axes @ n.velocity_covariance @ axes.T
-        pose[5, 5] = _ANY_YAW if n.yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
-        quaternion = quaternion_from_yaw((n.yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
+        pose[:3, :3] = axes @ n.covariance[POSITION, POSITION] @ axes.T
+        twist[:3, :3] = axes @ n.covariance[VELOCITY, VELOCITY] @ axes.T
+        pose[5, 5] = _ANY_YAW if yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
+        quaternion = quaternion_from_yaw((yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
         acceleration = quaternion_to_matrix(quaternion).T @ (axes @ n.acceleration)
         stamp = to_nanoseconds(n.stamp)
         self.follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
-            stamp, RELATIVE if n.relative else self._frame, n.name, to_frame.apply(n.position),
-            quaternion,
-            axes @ n.velocity, _ZERO, pose, twist, _LEVEL),
-            AccelerationState(stamp, n.name, acceleration)))
+            stamp, RELATIVE if relative else self._frame, name, to_frame.apply(n.position),
+            quaternion, axes @ n.velocity, _ZERO, pose, twist, _LEVEL),
+            AccelerationState(stamp, name, acceleration)))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array, altitude: float) -> tuple[Array, float | None]:

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_desk.closed_loop.follower import SimulatedFollower
+from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.world import World
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import places
@@ -95,8 +96,8 @@ class Flights:
 class FlightsLog:
     """Records the flights in a world."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, world: World, lookout: Lookout) -> None:
+        self._world, self._lookout = world, lookout
         self._rows: dict[str, list[Any]] = {}
         self._times: list[float] = []
         rows, m = len(world.starts), len(world.others)
@@ -137,13 +138,13 @@ class FlightsLog:
         distance = world.distances
         farthest, edges = self._along(distance)
         # The nearest that it follows.
-        followed = np.where(edges, distance, np.inf).argmin(axis=1)
-        lookout = world.lookout
+        met = self._others[rows, np.where(edges, distance, np.inf).argmin(axis=1)]
+        runs, lookout = rows // len(world.others), self._lookout
         self._times.append(now)
         add = {
-            'leader': world.of_others(world.positions)[rows, followed],
+            'leader': world.positions[runs, met],
             'follower': world.vehicle.position,
-            'leader_velocity': world.of_others(world.velocities)[rows, followed],
+            'leader_velocity': world.velocities[runs, met],
             'velocity': world.vehicle.velocity,
             'command': np.array([np.full(3, np.nan) if d.acceleration is None else d.acceleration
                                  for d in decisions]),

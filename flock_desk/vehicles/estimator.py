@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -152,19 +152,9 @@ SEA_LEVEL: Final[float] = 1013.25
 _TEMPERATURE: Final[float] = 288.15  # K at the mean sea level ...
 _LAPSE: Final[float] = 0.0065  # ... and how much less 1 m higher
 _EXPONENT: Final[float] = 5.25588  # of the international standard atmosphere below 11 km
-CAPACITY: Final[float] = 5.2  # Ah
-CURRENT: Final[float] = 18.0  # A in flight
-
-
-class BarometerErrors(NamedTuple):
-    """Errors of a barometer: standard deviations of its height, m."""
-
-    noise: float = 0.05
-    """White, of each sample."""
-    drift: float = 0.1
-    """Drift by weather and temperature, zero at the start; first-order Gauss-Markov ..."""
-    drift_time: float = 300.0
-    """... with this time constant, s."""
+#: Of a barometer: standard deviations, m, of the white noise of its height and of its drift,
+#: which is zero at the start, and the time constant of that, s.
+NOISE, DRIFT, DRIFT_TIME = 0.05, 0.1, 300.0
 
 
 class Barometer:
@@ -174,9 +164,7 @@ class Barometer:
     :param generators: of the random numbers, one for each vehicle.
     """
 
-    def __init__(self, generators: Sequence[np.random.Generator],
-                 errors: BarometerErrors | None = None) -> None:
-        self.errors = errors or BarometerErrors()
+    def __init__(self, generators: Sequence[np.random.Generator]) -> None:
         self.offset = 0.0
         """Added to every height, m: a step of the pressure, for tests."""
         self._generators = generators
@@ -185,35 +173,14 @@ class Barometer:
 
     def heights(self, true: Array, now: float) -> Array:
         """Return the heights (n,), m, measured at a time, s, of true ones (n,), m."""
-        errors, drawn = self.errors, np.stack([g.standard_normal(2) for g in self._generators])
-        passed = 0.0 if self._time is None else now - self._time
+        drawn = np.stack([g.standard_normal(2) for g in self._generators])
+        keep = 1.0 if self._time is None else math.exp(-(now - self._time) / DRIFT_TIME)
         self._time = now
-        keep = math.exp(-passed / errors.drift_time)
-        self._drift = (keep * self._drift
-                       + errors.drift * math.sqrt(1.0 - keep ** 2) * drawn[:, 0])
-        measured: Array = true + self.offset + self._drift + errors.noise * drawn[:, 1]
+        self._drift = keep * self._drift + DRIFT * math.sqrt(1.0 - keep ** 2) * drawn[:, 0]
+        measured: Array = true + self.offset + self._drift + NOISE * drawn[:, 1]
         return measured
 
 
-class Equipment:
-    """
-    Barometer and battery of one vehicle; a reboot does not touch them.
-
-    :param seed: of the noise.
-    """
-
-    def __init__(self, vehicle: Quadrotor, seed: int, errors: BarometerErrors | None) -> None:
-        self._vehicle = vehicle
-        self.barometer = Barometer([np.random.default_rng([seed, 1])], errors)
-        self.charge: float | None = 1.0
-        """Remaining charge of the battery, a share; None: unknown."""
-
-    def step(self, armed: bool, dt: float) -> None:
-        """Let the battery drain for ``dt``, s."""
-        if armed and self.charge is not None:
-            self.charge = max(0.0, self.charge - CURRENT / CAPACITY * dt / 3600.0)
-
-    def pressure(self, now: float) -> float:
-        """Return the measured pressure, hPa."""
-        height = self.barometer.heights(self._vehicle.position[2:] + GROUND_AMSL, now)[0]
-        return float(SEA_LEVEL * (1.0 - _LAPSE * height / _TEMPERATURE) ** _EXPONENT)
+def pressure(altitude: float) -> float:
+    """Return the pressure, hPa, of the standard atmosphere at an altitude above the sea, m."""
+    return float(SEA_LEVEL * (1.0 - _LAPSE * altitude / _TEMPERATURE) ** _EXPONENT)

@@ -81,6 +81,8 @@ class Profile:
     """Type and default by name."""
     encoding: int
     """MAV_PROTOCOL_CAPABILITY of integer parameters."""
+    landing_speed: tuple[str, float]
+    """Its parameter, and the unit of that, m/s."""
     rates: Mapping[int, float]
     """Hz, by message id; 0: once it is asked for."""
     arming: tuple[str, ...]
@@ -95,6 +97,12 @@ class Profile:
     """The frames of ODOMETRY that it takes."""
     oldest_vision: float
     """s; older odometry, by the estimated clock offset, is not used."""
+    position_timeout: float
+    """s without vision after which the position is not valid, besides EKF2_NOAID_TOUT ..."""
+    reports_for: float
+    """... and after which LOCAL_POSITION_NED is no longer sent."""
+    estimator_flags: Mapping[str, int]
+    """Bits of ESTIMATOR_STATUS or EKF_STATUS_REPORT, by condition."""
     drift: Array
     """Acceleration (3,), m/s^2, by which its estimate drifts without vision."""
     tilt_max: float
@@ -157,6 +165,7 @@ PX4: Final = Profile(
         'NAV_RCL_ACT': (INT32, 2),            # without a transmitter; 1: Hold, 2: Return, 3: Land
     },
     encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    landing_speed=('MPC_LAND_SPEED', 1.0),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0,
@@ -165,7 +174,9 @@ PX4: Final = Profile(
     refused=mavlink.MAV_RESULT_TEMPORARILY_REJECTED, unknown_message=mavlink.MAV_RESULT_FAILED,
     vision={'EKF2_GPS_CTRL': 0},
     frames=(mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD),
-    oldest_vision=0.2,  # EKF2_DELAY_MAX
+    oldest_vision=0.2, position_timeout=0.2, reports_for=math.inf,  # EKF2_DELAY_MAX
+    estimator_flags={'always': 0x65, 'at rest': 0x80, 'position': 0xA, 'aided': 0x100,
+                     'absolute': 0x210},
     drift=np.array([0.1, -0.07, 0.0]),
     tilt_max=math.radians(45.0))  # MPC_TILTMAX_AIR
 
@@ -209,32 +220,29 @@ ARDUCOPTER: Final = Profile(
         'WPNAV_SPEED': (FLOAT, 1000.0),       # cm/s, not applied to acceleration setpoints
     },
     encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
+    landing_speed=('LAND_SPEED', 1e-2),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
            mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.0},
     arming=('permission', 'vision', 'armable'),
     refused=mavlink.MAV_RESULT_FAILED, unknown_message=mavlink.MAV_RESULT_DENIED,
     vision={'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6},
-    frames=(mavlink.MAV_FRAME_LOCAL_FRD,), oldest_vision=math.inf,
+    frames=(mavlink.MAV_FRAME_LOCAL_FRD,),
+    oldest_vision=math.inf, position_timeout=7.1, reports_for=14.5,
+    estimator_flags={'always': 0x25, 'position': 0x31A, 'unreported': 0x82},
     drift=np.array([0.012, -0.01, 0.0]),
     tilt_max=math.radians(30.0))  # ANGLE_MAX
 PROFILES: Final[Mapping[str, Profile]] = {'px4': PX4, 'arducopter': ARDUCOPTER}
-
-
 _LIMITS: Final[Mapping[int, int]] = {INT8: 2**7, INT16: 2**15, INT32: 2**31}
 _UNKNOWN_INDEX: Final[int] = 65535
 
 
-class AutopilotParameters:
-    """The parameters of a profile and their MAVLink protocol."""
+class Parameters(dict[str, float]):
+    """The parameters of an autopilot by name, and their MAVLink protocol."""
 
     def __init__(self, profile: Profile) -> None:
+        super().__init__({name: float(value) for name, (_, value) in profile.parameters.items()})
         self._types = {name: kind for name, (kind, _) in profile.parameters.items()}
-        self._values = {name: float(value) for name, (_, value) in profile.parameters.items()}
         self._bytewise = profile.px4
-
-    def __getitem__(self, name: str) -> float:
-        """Return a value by its name."""
-        return self._values[name]
 
     def set(self, name: str, value: float) -> None:
         """
@@ -242,34 +250,31 @@ class AutopilotParameters:
 
         :raises ValueError: for an unknown name, or a value that its type cannot hold.
         """
-        if name not in self._values:
-            raise ValueError(f'{name}: must be one of {", ".join(self._values)}')
+        if name not in self:
+            raise ValueError(f'{name}: must be one of {", ".join(self)}')
         limit = _LIMITS.get(self._types[name])
-        valid = Range() if limit is None else Range(-limit, limit - 1, whole=True)
-        whole = limit is not None and float(value).is_integer()
-        valid.check(name, int(value) if whole else value)
-        self._values[name] = float(value)
+        if limit is None:
+            Range().check(name, value)
+        else:
+            Range(-limit, limit - 1, whole=True).check(
+                name, int(value) if float(value).is_integer() else value)
+        self[name] = float(value)
 
-    def handle(self, message: Any) -> list[Any]:
+    def answer(self, message: Any) -> list[Any]:
         """Answer PARAM_REQUEST_READ by name and PARAM_SET; unknown names silently."""
         name = str(message.param_id)
-        if name not in self._values:
+        if name not in self:
             return []
+        bytewise = self._bytewise and self._types[name] != FLOAT
         if message.get_type() == 'PARAM_SET':
+            sent = message.param_value
             with contextlib.suppress(ValueError):  # the answer then has the old value
-                self.set(name, self._recode(message.param_value, name, '<f', '<i'))
-        # ArduPilot does not look up the index of a parameter asked for by its name.
-        return [self._message(name)]
-
-    def _message(self, name: str) -> Any:
-        return mavlink.MAVLink_param_value_message(
-            name.encode(), self._recode(self._values[name], name, '<i', '<f'), self._types[name],
-            len(self._values),
-            list(self._values).index(name) if self._bytewise else _UNKNOWN_INDEX)
-
-    def _recode(self, value: float, name: str, old: str, new: str) -> float:
-        """Return the value whose bytes in one layout are those of another in the other."""
-        if not self._bytewise or self._types[name] == FLOAT:
-            return value
-        number = int(value) if old == '<i' else value
-        return float(struct.unpack(new, struct.pack(old, number))[0])
+                self.set(name, struct.unpack('<i', struct.pack('<f', sent))[0] if bytewise
+                         else sent)
+        value = self[name]
+        return [mavlink.MAVLink_param_value_message(
+            name.encode(),
+            struct.unpack('<f', struct.pack('<i', int(value)))[0] if bytewise else value,
+            self._types[name], len(self),
+            # ArduPilot does not look up the index of a parameter asked for by its name.
+            list(self).index(name) if self._bytewise else _UNKNOWN_INDEX)]

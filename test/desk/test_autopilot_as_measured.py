@@ -14,14 +14,12 @@
 
 """What the embedded autopilots learnt from the real ones, see docs/autopilots.md."""
 
-from captured import decoded
 from embedded_flight import BLIND, Flight, seen, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk import autopilot
-from flock_follower.mavlink.status_texts import ArmingChecks
 
 pytestmark = pytest.mark.slow
 ORIGIN = mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488000)
@@ -74,36 +72,6 @@ def test_px4_without_a_position_falls_back_until_something_can_be_flown():
     assert (flight.controller.mode, flight.controller.in_failsafe) == ('OFFBOARD', False)
     flight.command(mavlink.MAV_CMD_NAV_LAND)
     assert flight.controller.mode == 'AUTO.LAND'
-
-
-def events(messages):
-    """Return the checks that fail, as EVENTs tell them: number and arguments."""
-    return [(m.number, bytes(m.arguments)) for m in messages
-            if m.get_type() == 'EVENT' and m.log_levels & 0xF != 8]
-
-
-def test_px4_reports_failed_checks_by_the_events_of_the_real_one():
-    flight = Flight(start='landed', ready_after=60.0)
-    flight.fly(1.0)
-    real = events(m for t, m in decoded('px4_refusals') if 2.0 < t < 3.0)
-    ours = events(flight.messages)
-    # Neither a mission nor a ground station is looked for.
-    assert len(ours) == 4 and [event for event in real if event in ours] == ours
-
-
-def test_px4_reports_on_a_change_and_when_it_is_asked_to():
-    flight = Flight()
-    flight.fly(5.0)
-    checks = ArmingChecks()
-    assert flight.kinds().count('EVENT') == 4
-    flight.fly(0.5, setpoint())
-    assert flight.kinds().count('EVENT') == 7  # there is a stream: one less
-    assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [0]
-    assert flight.kinds().count('EVENT') == 10
-    for message in flight.messages:
-        if message.get_type() == 'EVENT':
-            checks.take(message, 1.0)
-    assert checks.against('OFFBOARD') == []
 
 
 @pytest.mark.parametrize(('armed', 'result', 'said'), [

@@ -84,7 +84,7 @@ class Commanded:
             if controller.mode != 'OFFBOARD':
                 controller.change_mode('OFFBOARD', now)
                 controller.outbox.clear()
-            self.flight.before_step()
+            controller.wind = self.flight.scenario.wind(self.flight.time)
             self.flight.vehicle.autopilot.step(now)
             self.odometry += [(stamp, self.flight.time_ns, state)
                               for stamp, state in self.flight.after_step(engaged)]

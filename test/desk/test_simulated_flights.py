@@ -31,6 +31,7 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop.campaign import fly
+from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.metrics import band_exits, Flights, joined, measure, STATES, summary
 from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
@@ -245,14 +246,16 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
     scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)),
                        # Nobody holds the altitude.
                        response=Response(thrust_error=0.0, odometry_delay=(0.0, 0.0)))
-    world, ages, images = World(scenario, [0, 1], PerceptionNoise()), [], []
+    world, ages, images = World(scenario, [0, 1]), [], []
+    lookout = Lookout(world, PerceptionNoise())
     for k in range(1, 360):
         world.advance(k)
+        lookout.look(k)
         for own in world.odometry(k * STEP):
             if k > 60:
                 assert own is not None
                 ages.append(k * STEP - own.stamp)
-        images += [k * STEP - seen[0].stamp for _, seen in world.lookout.arrived(k * STEP)
+        images += [k * STEP - seen[0].estimate.stamp for _, seen in lookout.arrived(k * STEP)
                    if seen]
     assert min(ages) == pytest.approx(0.06, abs=STEP)
     assert max(ages) == pytest.approx(0.16, abs=STEP)
