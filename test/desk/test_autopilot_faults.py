@@ -65,6 +65,10 @@ def test_a_reboot_in_the_air_brings_it_down():
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['--connect', '0.0.0.0:14540'], 'must be a loopback address'),
+    (['--connect', '8.8.8.8:1'], 'must be a loopback address'),
+    (['--connect', '14540'], 'must be HOST:PORT'),
+    (['--connect', '127.0.0.1:99999'], 'must be HOST:PORT'),
     (['--param', 'GUID_TIMEOUT'], "param = 'GUID_TIMEOUT': must be NAME=NUMBER"),
     (['--param', 'NO=1'], 'NO: must be one of COM_'),
     (['--signing-key-file', '/nowhere'], "signing_key_file = '/nowhere': No such file")])
