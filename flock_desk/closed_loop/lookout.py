@@ -128,7 +128,8 @@ class Lookout:
 
     def _look(self, image: int, now: float) -> None:
         world, m = self._world, len(self._world.others)
-        sensing, vio, offsets = world.scenario.sensing, world.vio, world.offsets.reshape(-1, 3)
+        sensing, vio = world.scenario.sensing, world.vio
+        offsets: Array = world.offsets.reshape(-1, 3)
         eyes = np.repeat(world.vehicle.rotation, m, axis=0)
         self.in_sight = self._in_sight(offsets, eyes)
         found = self._visible[image] & self.in_sight.ravel() & (not world.odometry_lost)

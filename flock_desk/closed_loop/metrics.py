@@ -152,8 +152,8 @@ class FlightsLog:
             'guarded': np.array([d.guarded for d in decisions]),
             'seen': (lookout.seen & edges).any(axis=1),
             'in_sight': (lookout.in_sight & edges).any(axis=1),
-            'obeying': np.array([f.vehicle.obeying_since is not None for f in followers]),
-            'unasked': np.array([f.vehicle.unasked for f in followers]),
+            'obeying': np.array([f.obeying for f in followers]),
+            'unasked': np.array([f.unasked for f in followers]),
             'shown': lookout.seen.sum(axis=1), 'edges': edges.sum(axis=1),
             'cpu': np.array([f.cpu for f in followers]), 'positions': world.positions}
         for name, value in add.items():

@@ -92,8 +92,9 @@ class FlightLog:
 
         :raises OSError: naming the file, if it cannot be written.
         """
-        columns = {name: np.array([row[i] for row in rows]) for kind, rows in self._rows.items()
-                   for i, name in enumerate(_COLUMNS[kind])}
+        columns: dict[str, Any] = {
+            name: np.array([row[i] for row in rows]) for kind, rows in self._rows.items()
+            for i, name in enumerate(_COLUMNS[kind])}
         columns['setpoint_acceleration'] = columns['setpoint_acceleration'].reshape(-1, 3)
         packed = BytesIO()
         np.savez_compressed(packed, **columns, **more)
