@@ -215,7 +215,8 @@ class Simulator(FlockNode):
             while self.context.ok() and not self._finished():
                 self._wait(next_service)
                 now = time.monotonic()
-                while self._end.known(now) >= self._step_due():
+                while (now if self._external is None
+                       else self._external.known(now)) >= self._step_due():
                     self._step()
                     if self._external is None:
                         break  # lost time is flown through, but the bridge is answered between
@@ -286,7 +287,8 @@ class Simulator(FlockNode):
 
     def _wait(self, next_service: float) -> None:
         """Receive from the autopilot until the next step, image or service is due."""
-        wake = min(self._end.wake(self._step_due()), next_service,
+        # An external vehicle is stepped once a pose has come, which ends the wait.
+        wake = min(self._step_due() if self._external is None else math.inf, next_service,
                    self._start + self._outputs.next_image)
         self._end.receive(wake - time.monotonic())
 

@@ -22,7 +22,6 @@ since both truths are latitude, longitude and height.
 from __future__ import annotations
 
 from collections.abc import Callable
-import math
 import time
 from typing import Final
 
@@ -82,10 +81,6 @@ class ExternalVehicles:
     def known(self, now: float) -> float:
         """Return until when, s on the monotonic clock, the follower's motion is known."""
         return self.follower.known(now)
-
-    def wake(self, due: float) -> float:
-        """Return when to look whether a step can be flown that is due: once a pose has come."""
-        return math.inf
 
     def step(self, now: float) -> None:
         """Do nothing: they fly by themselves."""

@@ -116,8 +116,8 @@ def test_the_recommended_parameters_can_be_set_from_their_file(personality, name
     file = 'config/px4.params' if personality == 'px4' else 'config/ardupilot.parm'
     options = autopilot.parser().parse_args([
         '--personality', personality, '--param-file', file, '--param', f'{name}=0.25'])
-    assert autopilot._parameters(options)[name] == 0.25
+    assert autopilot.settings(options)['parameters'][name] == 0.25
     options.param = []
-    parameters = autopilot._parameters(options)
+    parameters = autopilot.settings(options)['parameters']
     assert parameters[name] == value and 'EKF2_GPS_CTRL' not in parameters
     Flight(personality, parameters=parameters)
