@@ -43,7 +43,7 @@ from flock_desk.camera.renderer import (
     T_BODY_MARKER,
     T_BODY_OPTICAL,
 )
-from flock_desk.runs.marker_pages import entry, layout, panel_entry, SIZES
+from flock_desk.marker import entry, layout, panel_entry, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,

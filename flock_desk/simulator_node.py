@@ -60,8 +60,8 @@ from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.sensors.vio import Odometry
 from flock_desk.simulator_outputs import LATCHED, ODOMETRY, SimulatorOutputs, VehicleAhead
 from flock_desk.vehicles.embedded import STEP
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.geometry import Array, quaternion_to_matrix
-from flock_follower.live_line import LiveLine
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN

@@ -38,7 +38,6 @@ import sys
 import textwrap
 from typing import Any
 
-from flock_follower.bags.bag import BagError
 from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import (
@@ -53,9 +52,9 @@ from flock_follower.checks.findings import (
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.checks.topic_names import full_name, parse_remaps
+from flock_follower.files import resource
 from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
-from flock_follower.resources import resource
 
 SECONDS = 6.0
 MOST_SECONDS = 600.0
@@ -99,8 +98,6 @@ def main(args: Sequence[str] | None = None) -> int:
         seen, findings = _observe(options)
         if options.report:
             _report(options, seen, findings)
-    except BagError as error:
-        return _refuse(error)
     except OSError as error:
         return _refuse(f'{error.filename}: {error.strerror}' if error.strerror else error)
     except ValueError as error:
@@ -171,10 +168,9 @@ def table(seen: Observations, findings: Sequence[Finding], colours: bool = False
     for finding in findings:
         lines += _rows(finding, colours)
     levels = [finding.level for finding in findings]
-    if ready(findings):
-        verdict = 'ready to fly' if seen.live else 'usable'
-    else:
-        verdict = 'not ready to fly' if seen.live else 'not usable as it is'
+    verdict = {(True, True): 'ready to fly', (True, False): 'not ready to fly',
+               (False, True): 'usable', (False, False): 'not usable as it is'}[
+                   seen.live, ready(findings)]
     counts = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
         ('error', levels.count(ERROR)), ('warning', levels.count(WARNING))))
     unknown = [finding.what for finding in findings if finding.level == UNMEASURED]

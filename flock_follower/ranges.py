@@ -103,3 +103,8 @@ class Checked:
                     valid.check(name, number)
             elif value not in valid:
                 raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
+
+
+def first_reason(*checks: tuple[object, str]) -> str:
+    """Return the text of the first check that holds, '' if none does."""
+    return next((reason for holds, reason in checks if holds), '')

@@ -22,20 +22,19 @@ from typing import Any
 
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 SAMPLE = resource('bags/sample')
 Change = Callable[[BagMessage], BagMessage | None]
 
 
-def excerpt(path: Path, seconds: float = 1.2, change: Change | None = None) -> Path:
+def excerpt(path: Path, seconds: float = 1.2, change: Change = lambda message: message) -> Path:
     """Write the beginning of the sample bag, each message as ``change`` returns it, if it does."""
     with open_bag(SAMPLE) as bag, BagWriter(path) as writer:
         end = bag.start_ns + round(seconds * 1e9)
-        for message in bag.messages(stop_ns=end):
-            changed = change(message) if change is not None else message
-            if changed is not None:
-                writer.write(changed.topic, changed.msgtype, changed.stamp_ns, changed.data)
+        changed = [change(message) for message in bag.messages(stop_ns=end)]
+        for message in sorted(filter(None, changed), key=lambda message: message.stamp_ns):
+            writer.write(*message)
     return path
 
 

@@ -25,8 +25,7 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
-from flock_follower.messages import Command
+from flock_follower.messages import Command, OdometryState
 
 PERIOD = 5  # steps of a cycle: 20 Hz
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
@@ -116,13 +115,13 @@ class Flight(SteppedAutopilot):
             self.bridge.receive(now)
             velocity = self.vehicle.velocity + self.odom_error
             if self.odometry:
-                self.bridge.on_odometry(velocity,
-                                        self.vehicle.yaw + self.odom_yaw, 0.0, now)
+                self.bridge.gate.update_velocity(
+                    'odom', velocity, 0.0, now, yaw=self.vehicle.yaw + self.odom_yaw)
             if self.forwards and self.steps % 2 == 0:
-                self.bridge.forward(ForwardedOdometry(
-                    now, self.vehicle.position.copy(), self.vehicle.quaternion,
-                    velocity, self.vehicle.angular_velocity,
-                    0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)
+                self.bridge.forward(OdometryState(
+                    0, 'odom', 'base_link', self.vehicle.position.copy(), self.vehicle.quaternion,
+                    velocity, self.vehicle.angular_velocity, 0.01 * np.eye(6), 0.01 * np.eye(6),
+                    np.eye(3)), now, now)
                 self.bridge.send_odometry(now)
             if self.planner is not None and self.steps % 10 == 0:
                 refused = self.bridge.gate.take_command(

@@ -49,9 +49,8 @@ from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
-from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.messages import Command
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
+from flock_follower.messages import Command, OdometryState
 
 FOLDER = Path(__file__).resolve().parent / 'frozen'
 SCENARIOS = ('hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward', 'random_walk',
@@ -122,14 +121,14 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
         transport.arrived.append(bytes(mavlink.MAVLink_extended_sys_state_message(
             0, mavlink.MAV_LANDED_STATE_IN_AIR).pack(codec)))
         bridge.receive(now)
-        bridge.on_odometry(velocity, 0.5, 0.02, now, now * velocity)
+        bridge.gate.update_velocity('odom', velocity, 0.02, now, yaw=0.5, position=now * velocity)
         if k % 5 == 0:
-            bridge.forward(ForwardedOdometry(
-                now, now * velocity, np.array([0.0, 0.0, 0.6, 0.8]), velocity,
-                np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(3), np.eye(3)), now)
+            bridge.forward(OdometryState(
+                0, 'odom', 'base_link', now * velocity, np.array([0.0, 0.0, 0.6, 0.8]), velocity,
+                np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(6), np.eye(3)), now, now)
         match k % 100:
             case 0 | 25 | 50 | 75:
-                bridge.gate.permit(OffboardRequested(now))
+                bridge.gate.permit(bridge.gate.permission.requested(now))
             case 30:
                 bridge.requests.arm(True, now)
             case 60:

@@ -28,6 +28,7 @@ import conftest  # noqa: F401  keeps DDS on this machine; before anything import
 from fuzz_mavlink import fuzz_autopilot, fuzz_bridge, FuzzError
 from fuzz_nodes import fuzz_node, NODES
 import numpy as np
+import rclpy
 
 PERSONALITIES = ('px4', 'arducopter')
 
@@ -43,6 +44,7 @@ def main(args: list[str] | None = None) -> int:
                         help='another one, other input (%(default)s)')
     parser.add_argument('--nodes', nargs='*', choices=NODES, default=NODES, help='only these')
     options = parser.parse_args(args)
+    rclpy.init()
     np.seterr(all='ignore')  # no error where the result is thrown away
     try:
         for personality in PERSONALITIES:

@@ -41,11 +41,11 @@ from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase, TAKEOVER_TIME
 from flock_follower.mavlink.setpoint_rules import COMMAND
-from flock_follower.messages import Command
+from flock_follower.messages import Command, OdometryState
 
 AUTOPILOT = ('127.0.0.1', 14580)
 PEERS = (AUTOPILOT, AUTOPILOT, AUTOPILOT, ('127.0.0.1', 9), 'serial')
@@ -243,12 +243,13 @@ class BridgeUnderFire:
             self.bridge.gate.take_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
         vehicle = self.traffic.autopilot.vehicle
         if r.random() < 0.5:
-            self.bridge.on_odometry(vehicle.velocity + 0.1 * np.array(vector), vehicle.yaw,
-                                    r.choice((0.0, 0.1, -1.0)), now)
-        self.bridge.forward(ForwardedOdometry(
-            now - r.choice((0.0, 0.02, 1.0, -1.0)), r.choice((1.0, 1.0, 1e6)) * _vector(r),
+            self.gate.update_velocity('odom', vehicle.velocity + 0.1 * np.array(vector),
+                                      r.choice((0.0, 0.1, -1.0)), now, yaw=vehicle.yaw)
+        self.bridge.forward(OdometryState(
+            0, 'odom', 'base_link', r.choice((1.0, 1.0, 1e6)) * _vector(r),
             np.array([0.0, 0.0, 0.0, 1.0]), _vector(r), _vector(r),
-            *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
+            *(np.full((6, 6), r.choice(COVARIANCES)) for _ in range(2)), np.eye(3)),
+            now - r.choice((0.0, 0.02, 1.0, -1.0)), now)
         if vehicle.landed and r.random() < 0.2:  # up again
             r.choice((lambda: self.bridge.requests.arm(True, now),
                       lambda: self.bridge.requests.takeoff(3.0, now)))()

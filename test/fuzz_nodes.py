@@ -24,12 +24,12 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import contextmanager
-import math
 import signal
 import time
 
 from builtin_interfaces.msg import Time
 import cv2
+from driven import Driven, overrides
 from fuzz_mavlink import FuzzError, judge_odometry, judge_setpoint, LONGEST, no_hang, place
 from fuzz_messages import MessageFuzzer
 from geometry_msgs.msg import Transform, Twist
@@ -37,11 +37,7 @@ from marker_images import facing, make_camera, render
 from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
-import rclpy
 from rclpy.logging import LoggingSeverity
-from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
-from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header, String
@@ -50,6 +46,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.transport import UdpTransport
+from flock_follower.messages import to_array
 from flock_follower.nodes.flock import SharingNode
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
@@ -58,42 +55,37 @@ from flock_follower.nodes.relative_pose import RelativePose
 PERIOD_NS = 10_000_000  # of time between messages
 A_MAX = 2.5
 RECOVERY = 30  # good messages of each kind after which a node does its work again
-NODES = ('planner', 'mavlink_bridge', 'relative_pose', 'relative_pose compressed', 'sharing')
+NODES = {
+    'planner': (Planner, {}),
+    'mavlink_bridge': (MavlinkBridge, {
+        'stream_rate': 100.0, 'a_max': A_MAX, 'forward_odometry': True,
+        'require_failsafe': False}),  # it is not fused
+    'relative_pose': (RelativePose, {'image_transport': 'raw'}),
+    'relative_pose compressed': (RelativePose, {'image_transport': 'compressed'}),
+    'sharing': (SharingNode, {'vehicle_name': 'f1'})}
 # Small, so that many images are looked at in little time.
 _CAMERA = make_camera().scaled(0, 0, 640, 480, 4, 4)
 _GRAY = render(_CAMERA, {0: facing((0.0, 0.0, 0.8), (0.1, 0.1, 0.0))})
 _FILES = [cv2.imencode(form, _GRAY)[1].tobytes() for form in ('.png', '.jpg')]
 
 
-class NodeUnderFire:
+class NodeUnderFire(Driven):
     """One node without an executor, in a time of its own."""
 
     def __init__(self, kind, seed):
         self.fuzzer = MessageFuzzer(seed)
         self.random = self.fuzzer.random
-        self.now_ns = 1_000_000_000_000
         self.published = Counter()
         self.given = 0
-        overrides = [Parameter('use_sim_time', value=True)]
         self.autopilot = self._line = None
-        if kind == 'planner':
-            self.node = Planner(parameter_overrides=overrides)
-        elif kind == 'mavlink_bridge':
+        make, parameters = NODES[kind]
+        if kind == 'mavlink_bridge':
             self._line = UdpTransport('', bind=('127.0.0.1', 0))
-            host, port = self._line.address
             self.autopilot = EmbeddedAutopilot('px4', now=time.monotonic(), seed=seed)
-            self.node = MavlinkBridge(parameter_overrides=[
-                *overrides, Parameter('connection', value=f'udpout:{host}:{port}'),
-                Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX),
-                Parameter('forward_odometry', value=True),
-                Parameter('require_failsafe', value=False)])  # it is not fused
-        elif kind == 'sharing':
-            self.node = SharingNode(parameter_overrides=[
-                *overrides, Parameter('vehicle_name', value='f1')])
-        else:
-            transport = 'compressed' if 'compressed' in kind else 'raw'
-            self.node = RelativePose(parameter_overrides=[
-                *overrides, Parameter('image_transport', value=transport)])
+            host, port = self._line.address
+            parameters = {**parameters, 'connection': f'udpout:{host}:{port}'}
+        super().__init__(make(parameter_overrides=overrides(use_sim_time=True, **parameters)))
+        self.now = 1_000_000_000_000
         self.node.get_logger().set_level(LoggingSeverity.FATAL)
         self.errors = []
         self.node.diagnostics.internal_error = self._note_error
@@ -107,7 +99,6 @@ class NodeUnderFire:
 
     def _take_over(self):
         """Ask for offboard until the vehicle flies the setpoints: before, no command gets far."""
-        service = next(s for s in self.node.services if s.srv_name.endswith('offboard'))
         asking = answer = None
         deadline = time.monotonic() + 20.0
         while self.node._bridge.gate.permission.phase is not Phase.ACTIVE:
@@ -116,8 +107,8 @@ class NodeUnderFire:
             time.sleep(0.005)
             self._exchange()
             if asking is None:
-                asking = service.callback(
-                    service.srv_type.Request(data=True), service.srv_type.Response())
+                asking = self.call('offboard', data=True)
+            self.turn()
             try:
                 asking.send(None)
             except StopIteration as end:  # refused while nothing is heard yet
@@ -125,24 +116,25 @@ class NodeUnderFire:
 
     def close(self):
         """Release everything."""
-        self.node.destroy_node()
+        super().close()
         if self._line is not None:
             self._line.close()
 
     def fire(self):
         """Send one message to one callback, and now and then let a timer run or a service act."""
         r = self.random
-        self.now_ns += PERIOD_NS
-        subscriptions = [s for s in self.node.subscriptions
-                         if s.topic_name.lstrip('/') not in ('parameter_events',)]
-        subscription = r.choice(subscriptions)
+        self.now += PERIOD_NS
+        subscription = r.choice([s for s in self.node.subscriptions
+                                 if s.topic_name != '/parameter_events'])
         if subscription.msg_type is Clock:
             message = Clock(clock=self._stamp(jitter=r.random() < 0.01))
         else:
-            self._set_clock(subscriptions)
+            self.give('/clock', Clock(clock=self._stamp()))
             message = self._message(subscription.msg_type)
             self._address(subscription, message)
-        self._give(subscription, message)
+        self.given += 1  # how a message came: in order, or untold
+        self.give(subscription.topic_name, message, *r.choice(
+            [(self.given, 0), (self.given, time.time_ns()), (None, None)]))
         if r.random() < self._timer_share:
             for timer in self.node.timers:
                 timer.callback()
@@ -153,8 +145,8 @@ class NodeUnderFire:
 
     def tick(self, change=None):
         """Let every input have a good message, changed by a function, and every timer run."""
-        self.now_ns += PERIOD_NS
-        self._set_clock(self.node.subscriptions)
+        self.now += PERIOD_NS
+        self.give('/clock', Clock(clock=self._stamp()))
         for subscription in self.node.subscriptions:
             if subscription.msg_type in (
                     CameraInfo, Odometry, Image, CompressedImage, Header, String):
@@ -163,7 +155,7 @@ class NodeUnderFire:
                 self._address(subscription, message)
                 if change is not None:
                     change(message)
-                subscription.callback(_as_taken(subscription, message))
+                self.give(subscription.topic_name, message)
         self._engage(True)
         for timer in self.node.timers:
             timer.callback()
@@ -184,27 +176,9 @@ class NodeUnderFire:
             if message.child_frame_id == 'base_link':
                 message.child_frame_id = 'f2'
 
-    def _give(self, subscription, message):
-        """Call a callback; where it wants to know how a message came: in order, or untold."""
-        message = _as_taken(subscription, message)
-        if subscription._callback_type is not Subscription.CallbackType.WithMessageInfo:
-            subscription.callback(message)
-            return
-        self.given += 1
-        number, time_ns = self.random.choice(
-            [(self.given, 0), (self.given, time.time_ns()), (None, None)])
-        subscription.callback(message, {
-            'publication_sequence_number': number, 'received_timestamp': time_ns})
-
-    def _set_clock(self, subscriptions):
-        for subscription in subscriptions:
-            if subscription.msg_type is Clock:
-                subscription.callback(Clock(clock=self._stamp()))
-
     def _engage(self, value):
-        for service in self.node.services:
-            if service.srv_name.endswith('engage'):
-                service.callback(service.srv_type.Request(data=value), service.srv_type.Response())
+        if isinstance(self.node, Planner):
+            self.call('engage', data=value)
 
     def _message(self, kind):
         lot = self.random.random()
@@ -216,7 +190,7 @@ class NodeUnderFire:
         return message if lot < 0.5 else self.fuzzer.spoil(message, self.random.randint(1, 4))
 
     def _stamp(self, jitter=False):
-        now = self.now_ns + (self.random.randint(-10**9, 10**9) if jitter else 0)
+        now = self.now + (self.random.randint(-10**9, 10**9) if jitter else 0)
         return Time(sec=now // 10**9, nanosec=now % 10**9)
 
     def good(self, kind, of_leader=False):
@@ -235,20 +209,15 @@ class NodeUnderFire:
             point.accelerations[0].linear.x = self.random.gauss(0.0, 2.0)
             message.points = [point]
         elif kind is CameraInfo:
-            message.width, message.height = _CAMERA.width, _CAMERA.height
-            message.distortion_model = 'plumb_bob'
-            message.d = [0.0] * 5
-            message.k = _CAMERA.matrix.ravel().tolist()
-            message.r = np.eye(3).ravel().tolist()
-            message.p = np.hstack([_CAMERA.matrix, np.zeros((3, 1))]).ravel().tolist()
+            fill(message, width=_CAMERA.width, height=_CAMERA.height,
+                 distortion_model='plumb_bob', d=[0.0] * 5, k=_CAMERA.matrix.ravel(),
+                 r=np.eye(3).ravel(), p=np.hstack([_CAMERA.matrix, np.zeros((3, 1))]).ravel())
         elif kind is Image:
-            message.encoding = 'mono8'
-            message.height, message.width = _GRAY.shape
-            message.step = message.width
-            message.data = _GRAY.tobytes()
+            height, width = _GRAY.shape
+            fill(message, encoding='mono8', height=height, width=width, step=width,
+                 data=_GRAY.tobytes())
         elif kind is CompressedImage:
-            message.format = 'jpeg'
-            message.data = self.random.choice(_FILES)
+            fill(message, format='jpeg', data=self.random.choice(_FILES))
         return message
 
     def _fill_odometry(self, message, of_leader):
@@ -294,17 +263,21 @@ class NodeUnderFire:
         kind = type(message).__name__
         self.published[kind] += 1
         if isinstance(message, MultiDOFJointTrajectory):
-            linear = message.points[0].accelerations[0].linear
-            size = math.hypot(linear.x, linear.y, linear.z)
+            size = np.linalg.norm(to_array(message.points[0].accelerations[0].linear))
             if not size <= A_MAX * (1.0 + 1e-9):
                 raise FuzzError(f'command of {size} m/s^2')
         elif isinstance(message, Odometry):
-            pose, twist = message.pose.pose, message.twist.twist
-            numbers = [pose.position.x, pose.position.y, pose.position.z, pose.orientation.x,
-                       pose.orientation.y, pose.orientation.z, pose.orientation.w,
-                       twist.linear.x, twist.linear.y, twist.linear.z]
-            if not all(math.isfinite(number) for number in numbers):
+            pose, q = message.pose.pose, message.pose.pose.orientation
+            numbers = [*to_array(pose.position), q.x, q.y, q.z, q.w,
+                       *to_array(message.twist.twist.linear)]
+            if not np.all(np.isfinite(numbers)):
                 raise FuzzError(f'odometry that is not finite: {numbers}')
+
+
+def fill(message, **fields):
+    """Set fields of a message."""
+    for name, value in fields.items():
+        setattr(message, name, value)
 
 
 @contextmanager
@@ -317,31 +290,19 @@ def node_under_fire(kind, seed):
         under_fire.close()
 
 
-def _as_taken(subscription, message):
-    """Return a message as the subscription hands it to its callback."""
-    return serialize_message(message) if subscription.raw else message
-
-
 def fuzz_node(kind, count, seed):
     """Fire ``count`` messages at a node; return what it published and rejected."""
-    started = not rclpy.ok()
-    if started:
-        rclpy.init()
-    try:
-        what = f'{kind}, seed {seed}'
-        with node_under_fire(kind, seed) as under_fire, no_hang(what):
-            for number in range(count):
-                try:
-                    under_fire.fire()
-                except FuzzError as error:
-                    raise FuzzError(f'{what}, message {number}: {error}') from None
-                if under_fire.errors:
-                    raise FuzzError(f'{what}, message {number}: {under_fire.errors[0]}')
-                signal.alarm(LONGEST)
-            if not under_fire.recovers():
-                raise FuzzError(f'{what}: after {count} messages and {RECOVERY} good ones of each '
-                                'kind it publishes nothing')
-            return under_fire
-    finally:
-        if started:
-            rclpy.try_shutdown()
+    what = f'{kind}, seed {seed}'
+    with node_under_fire(kind, seed) as under_fire, no_hang(what):
+        for number in range(count):
+            try:
+                under_fire.fire()
+            except FuzzError as error:
+                raise FuzzError(f'{what}, message {number}: {error}') from None
+            if under_fire.errors:
+                raise FuzzError(f'{what}, message {number}: {under_fire.errors[0]}')
+            signal.alarm(LONGEST)
+        if not under_fire.recovers():
+            raise FuzzError(f'{what}: after {count} messages and {RECOVERY} good ones of each '
+                            'kind it publishes nothing')
+        return under_fire

@@ -15,9 +15,9 @@
 """
 Kill planner, relative_pose or replay at random moments of a flight, and time the braking.
 
-Every time the whole chain runs as real processes, on a bag that makes the planner pull north for
-as long as it lasts, while the autopilot says it flies north: commands and braking have opposite
-signs. The time is from SIGKILL to the first braking setpoint read from the wire.
+Every time the whole chain runs as real processes in a namespace, on a bag that makes the planner
+pull north for as long as it lasts, while the autopilot says it flies north: commands and braking
+have opposite signs. The time is from SIGKILL to the first braking setpoint read from the wire.
 ``python test/kills.py --kills 100``.
 """
 
@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 from odometry_series import states_of
-from wire import permit, V_NORTH, Wire
+from wire import V_NORTH, Wire
 
 from flock_desk.runs.processes import (
     free_udp_port,
@@ -47,8 +47,8 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.bags.bag import deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS
-from flock_follower.resources import resource
 
 VICTIMS = ('planner', 'relative_pose', 'replay')
 LIMIT = 0.3  # s
@@ -105,19 +105,21 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
     wire = Wire(port)
     try:
         with Processes(private_environment(), folder) as processes:
-            ros = ['--ros-args', '-p', 'use_sim_time:=true', '-p']
-            processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
-                *ros, f'connection:=udpin:127.0.0.1:{port}', '-p', 'velocity_source:=autopilot',
-                # The wire has no parameters, and answers no setpoint.
-                '-p', 'v_max:=2.0', '-p', 'require_failsafe:=false',
-                '-p', 'wind_compensation:=never'])
-            processes.start('planner', 'flock_follower.nodes.planner', [
-                *ros, 'v_max:=2.0', '-p', f'd1:={D1}'])
-            permit(processes)
-            processes.start('relative_pose', 'flock_follower.nodes.relative_pose', [
-                *ros, 'image_transport:=compressed'])
+            def start(node: str, *parameters: str) -> None:
+                processes.start(node, f'flock_follower.nodes.{node}', [
+                    '--ros-args', '-r', '__ns:=/one', *(
+                        word for topic in (IMAGE, CAMERA, ODOM)
+                        for word in ('-r', f'{topic[1:]}:={topic}')), *(
+                        word for p in ('use_sim_time:=true', *parameters) for word in ('-p', p))])
+            # The wire has no parameters, and answers no setpoint.
+            start('mavlink_bridge', f'connection:=udpin:127.0.0.1:{port}', 'v_max:=2.0',
+                  'velocity_source:=autopilot', 'require_failsafe:=false',
+                  'wind_compensation:=never')
+            start('planner', 'v_max:=2.0', f'd1:={D1}')
+            processes.ask('/one/mavlink_bridge/offboard')
+            start('relative_pose', 'image_transport:=compressed')
             processes.start('replay', 'flock_follower.nodes.replay', [str(bag)])
-            processes.ask('planner/engage')
+            processes.ask('/one/planner/engage')
             wait_until(lambda: any(m.afx > PULL for _, m in wire.setpoints), 10.0,
                        'a pull to the north')
             moment = time.monotonic() + delay
@@ -132,6 +134,9 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
             received = len(wire.setpoints)
             wait_until(lambda: len(wire.setpoints) > received + 6, 5.0, 'the stream to go on')
             assert all(m.afx < 0.0 for _, m in wire.setpoints[received:]), 'commands came back'
+            assert {(m.type_mask, m.coordinate_frame, m.target_system)
+                    for _, m in wire.setpoints if m.afx > PULL} == {(0x83F, 1, 1)}
+            assert max(abs(m.afx) for _, m in wire.setpoints) <= 2.5
             for child in processes.children.values():
                 child.kill()
             return time_of_braking - killed

@@ -18,13 +18,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bag_excerpts import edited, excerpt
 import numpy as np
 
-from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.bags.writer import BagWriter
+from flock_follower.bags.bag import BagMessage
 from flock_follower.geometry import (
     Array,
     canonical_quaternion,
@@ -34,7 +35,6 @@ from flock_follower.geometry import (
     rotation_vector_to_quaternion,
 )
 from flock_follower.messages import (
-    ODOMETRY,
     set_quaternion,
     set_stamp,
     set_vector,
@@ -111,32 +111,27 @@ def rewrite(source: Source, seed: int = 0) -> Callable[[Any, float], Any]:
     return altered
 
 
-def rewritten_bag(bag: Path, result: Path, source: Source, image_offset: float = 0.0,
+def rewritten_bag(result: Path, source: Source, image_offset: float = 0.0,
                   image_jitter: float = 0.0) -> Path:
-    """Write a bag anew with the odometry of a source, and the images' stamps off by so many s."""
-    rng = np.random.default_rng(1)
-    with open_bag(bag) as read, BagWriter(result) as writer:
-        alter, count = rewrite(source), 0
-        messages: list[tuple[int, str, str, Any]] = []
-        for topic, msgtype, time, data in read.messages():
-            if topic == '/odom':
-                count += 1
-                message = deserialize(data, ODOMETRY)
-                message = alter(message, stamp_to_nanoseconds(message.header.stamp) * 1e-9)
-                if count % source.keep:
-                    continue
-                messages.append((time + round(source.late * 1e9), topic, msgtype, message))
-            elif topic.startswith('/image') and (image_offset or image_jitter):
-                message = deserialize(data, msgtype)
-                off = image_offset + image_jitter * rng.standard_normal()
-                set_stamp(message.header.stamp, stamp_to_nanoseconds(
-                    message.header.stamp) + round(off * 1e9))
-                messages.append((time, topic, msgtype, message))
-            else:
-                messages.append((time, topic, msgtype, bytes(data)))
-        for time, topic, msgtype, message in sorted(messages, key=lambda m: m[0]):
-            writer.write(topic, msgtype, time, message)
-    return result
+    """Write the sample with the odometry of a source, and its images' stamps off by so many s."""
+    rng, alter, count = np.random.default_rng(1), rewrite(source), itertools.count(1)
+
+    def odom(fields: Any) -> None:
+        alter(fields, stamp_to_nanoseconds(fields.header.stamp) * 1e-9)
+
+    def late(fields: Any) -> None:
+        off = image_offset + image_jitter * rng.standard_normal()
+        set_stamp(fields.header.stamp,
+                  stamp_to_nanoseconds(fields.header.stamp) + round(off * 1e9))
+
+    def change(message: BagMessage) -> BagMessage | None:
+        if message.topic == '/odom':
+            altered = edited(message, odom)
+            return None if next(count) % source.keep else altered._replace(
+                stamp_ns=message.stamp_ns + round(source.late * 1e9))
+        moved = message.topic.startswith('/image') and (image_offset or image_jitter)
+        return edited(message, late) if moved else message
+    return excerpt(result, 60.0, change)
 
 
 def sources() -> Iterator[tuple[str, Source]]:

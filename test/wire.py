@@ -22,14 +22,7 @@ from typing import Any
 
 from pymavlink import mavutil
 
-from flock_desk.runs.processes import Processes
-
 V_NORTH = 0.3  # m/s, what it says it flies
-
-
-def permit(processes: Processes) -> None:
-    """Ask a bridge that runs as 'mavlink_bridge' to fly its vehicle, once it hears it."""
-    processes.ask('mavlink_bridge/offboard')
 
 
 class Wire:

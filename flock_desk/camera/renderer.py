@@ -34,9 +34,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flock_desk.camera.lens import Camera
+from flock_follower.files import resource
 from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
 from flock_follower.perception.markers import draw_marker
-from flock_follower.resources import resource
 
 Image = NDArray[np.float32]
 

@@ -51,7 +51,6 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import (
     AccelerationState,
@@ -229,7 +228,7 @@ class SimulatedFollower(Listener):
                 self._mode, self._goal = self._dialect.takeoff_modes[0], above
             case 'offboard':
                 self._asked = True
-                self._follower.permit(time, OffboardRequested(now - 1e-3))
+                self._follower.permit(time, now - 1e-3)
                 # The bridge has to stream first, and to receive the mode by HEARTBEAT.
                 self._mode_asked = now + self._dialect.stream_before_offboard
             case 'engage':

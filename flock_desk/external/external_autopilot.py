@@ -162,7 +162,7 @@ class ExternalAutopilot:
         """End the thread and release the port."""
         self._stopping = True
         self._thread.join(timeout=1.0)
-        self._link.close()
+        self._link.transport.close()
 
     # The thread: the link is its own.
 

@@ -26,7 +26,7 @@ chunks compressed with bz2.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 import struct
@@ -84,7 +84,7 @@ def deserialize(data: bytes, msgtype: str) -> Any:
         return typestore().deserialize_cdr(memoryview(data), msgtype)
 
 
-class Bag:
+class Bag(AbstractContextManager['Bag']):
     """
     An open bag; use :func:`open_bag`, and ``with`` to close it.
 
@@ -162,10 +162,6 @@ class Bag:
     def close(self) -> None:
         """Close the files."""
         self._reader.close()
-
-    def __enter__(self) -> Bag:
-        """Return the bag."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Close the bag."""

@@ -114,7 +114,12 @@ class McapFile:
         if not messages:
             return
         messages = sorted(messages, key=lambda message: message.stamp_ns)
-        content, indices = self._content(messages)
+        content, indices = bytearray(), dict[int, bytearray]()
+        for topic, stamp, data in messages:
+            channel = self._channels.get(topic) or self._introduce(topic, content)
+            indices.setdefault(channel, bytearray()).extend(
+                struct.pack('<QQ', stamp, len(content)))
+            content += _record(_MESSAGE, struct.pack('<HIQQ', channel, 0, stamp, stamp), data)
         stamps = struct.pack('<QQ', messages[0].stamp_ns, messages[-1].stamp_ns)
         size = struct.pack('<Q', len(content))
         chunk = _record(_CHUNK, stamps, size, struct.pack('<I', zlib.crc32(content)), _text(''),
@@ -131,9 +136,9 @@ class McapFile:
             struct.pack('<Q', end - self.size - len(chunk)), _text(''), size, size)
         self._append(b''.join(records))
         self._summary[_CHUNK_INDEX].append(index)
-        first, last = messages[0].stamp_ns, messages[-1].stamp_ns
+        first = messages[0].stamp_ns
         self.start_ns = min(self.start_ns, first) if self.counts else first
-        self.end_ns = max(self.end_ns, last)
+        self.end_ns = max(self.end_ns, messages[-1].stamp_ns)
         self.counts.update(message.topic for message in messages)
 
     def close(self) -> None:
@@ -159,16 +164,6 @@ class McapFile:
             self._file.seek(self.size)
             raise
         self.size += len(data)
-
-    def _content(self, messages: Sequence[TakenMessage]) -> tuple[bytearray, dict[int, bytearray]]:
-        """Return the records of a chunk, and of each channel when and where its messages are."""
-        content, indices = bytearray(), dict[int, bytearray]()
-        for topic, stamp, data in messages:
-            channel = self._channels.get(topic) or self._introduce(topic, content)
-            indices.setdefault(channel, bytearray()).extend(
-                struct.pack('<QQ', stamp, len(content)))
-            content += _record(_MESSAGE, struct.pack('<HIQQ', channel, 0, stamp, stamp), data)
-        return content, indices
 
     def _introduce(self, topic: RecordedTopic, content: bytearray) -> int:
         """Say in a chunk what a topic and its type are; return the channel's number."""

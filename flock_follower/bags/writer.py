@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 import shutil
 from typing import Any
@@ -31,7 +31,7 @@ from flock_follower.bags.message_types import typestore
 CHUNK = 1 << 20
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
 
@@ -132,10 +132,6 @@ class BagWriter:
         if topic.msgtype != msgtype:
             raise BagError(f'{self.path}: {topic.name}: holds {topic.msgtype}, not {msgtype}')
         return topic
-
-    def __enter__(self) -> BagWriter:
-        """Return the writer."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  _: object) -> None:

@@ -20,7 +20,17 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Final
 
-from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
+from flock_follower.checks.findings import (
+    ERROR,
+    error,
+    Finding,
+    first,
+    judged,
+    OK,
+    ok,
+    unmeasured,
+    warning,
+)
 from flock_follower.checks.observations import Observations, OURS
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
@@ -67,51 +77,46 @@ def _nodes(seen: Observations) -> Iterator[Finding]:
     missing = [name for name, number in count.items() if number == 0]
     twice = [name for name, number in count.items() if number > 1]
     elsewhere = [full for full in seen.nodes if _plain(full) in missing]
-    if elsewhere:
-        namespace = elsewhere[0].rsplit('/', 1)[0].strip('/')
-        yield error('nodes', f'{", ".join(missing)} not in /{seen.namespace.strip("/")}, but '
-                    f'{", ".join(elsewhere)}', wanted,
-                    f'check --namespace {namespace}; or start all in one namespace'
-                    if namespace else 'check without --namespace')
-    elif missing:
-        yield error('nodes', f'not running: {", ".join(missing)}', wanted, f'start: {START}')
+    if missing or not twice:
+        namespace = elsewhere[0].rsplit('/', 1)[0].strip('/') if elsewhere else ''
+        yield first(
+            'nodes', wanted,
+            (elsewhere, ERROR, f'{", ".join(missing)} not in /{seen.namespace.strip("/")}, but '
+             f'{", ".join(elsewhere)}', f'check --namespace {namespace}; or start all in one '
+             'namespace' if namespace else 'check without --namespace'),
+            (missing, ERROR, f'not running: {", ".join(missing)}', f'start: {START}'),
+            (True, OK, 'all three are running', ''))
     if twice:
         yield error('nodes', f'twice: {", ".join(twice)}', wanted,
                     'end one of each: both command the vehicle')
-    if not missing and not twice:
-        yield ok('nodes', 'all three are running', wanted)
 
 
 def _needed(seen: Observations, name: str) -> Finding:
     """Check that a topic is published, and that messages arrive."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
-    what, wanted = _images(name), msgtype.replace('/msg/', '/')
     published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
     connect = offer(RAW_IMAGES if name == COMPRESSED_IMAGES else name, published, [
         other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)])
-    if full in seen.unreadable:
-        return error(what, f'{full} cannot be read: {seen.unreadable[full]}', wanted,
-                     'record it anew')
-    if not topic.publishers:
-        far = elsewhere(full, (n for n, t in published.items() if t == msgtype),
-                        seen.names.values())
-        own = seen.names['mavlink/odom']
-        advice = (connect or (f'{far[0]} is published: start all in one namespace' if far else '')
-                  or (f"start its source; or fly by the autopilot's own estimate: -r odom:={own}"
-                      if name == 'odom' and own in published else ''))
-        if seen.live:
-            return error(what, f'nobody publishes {full}', wanted, advice or 'start its driver')
-        return error(what, f'the bag lacks {full}', wanted,
-                     advice or 'record it; evaluate needs it')
-    if msgtype not in topic.types:
-        return error(what, f'{full} holds {", ".join(topic.types)}', wanted,
-                     connect or f'have its source send {msgtype}')
-    if not topic.arrivals:
-        who = ', '.join(sorted({end.node for end in topic.publishers}))
-        return error(what, f'{who} publishes {full}, and sends nothing', wanted,
-                     "see the node's log; is the sensor connected and initialised?"
-                     if msgtype != INFO else 'calibrate the camera; give its driver the file')
-    return ok(what, f'{full}, {len(topic.arrivals)} messages', wanted)
+    far = elsewhere(full, (n for n, t in published.items() if t == msgtype), seen.names.values())
+    own = seen.names['mavlink/odom']
+    advice = (connect or (f'{far[0]} is published: start all in one namespace' if far else '')
+              or (f"start its source; or fly by the autopilot's own estimate: -r odom:={own}"
+                  if name == 'odom' and own in published else ''))
+    who = ', '.join(sorted({end.node for end in topic.publishers}))
+    return first(
+        _images(name), msgtype.replace('/msg/', '/'),
+        (full in seen.unreadable, ERROR, f'{full} cannot be read: {seen.unreadable.get(full)}',
+         'record it anew'),
+        (not topic.publishers and seen.live, ERROR, f'nobody publishes {full}',
+         advice or 'start its driver'),
+        (not topic.publishers, ERROR, f'the bag lacks {full}',
+         advice or 'record it; evaluate needs it'),
+        (msgtype not in topic.types, ERROR, f'{full} holds {", ".join(topic.types)}',
+         connect or f'have its source send {msgtype}'),
+        (not topic.arrivals, ERROR, f'{who} publishes {full}, and sends nothing',
+         "see the node's log; is the sensor connected and initialised?" if msgtype != INFO else
+         'calibrate the camera; give its driver the file'),
+        (True, OK, f'{full}, {len(topic.arrivals)} messages', ''))
 
 
 def _images(name: str) -> str:

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 OK: Final = 'ok'
 WARNING: Final = 'warning'
@@ -89,6 +89,16 @@ def judged(bad: bool, poor: bool, what: str, measured: str, wanted: str,
     if bad or poor:
         return Finding(ERROR if bad else WARNING, what, measured, wanted, advice)
     return ok(what, measured, wanted)
+
+
+def first(what: str, wanted: str, *cases: tuple[Any, str, str, str]) -> Finding:
+    """
+    Return the finding of the first case that holds; one of them must.
+
+    :param cases: whether it holds, the level, the value measured, and the advice, '' if OK.
+    """
+    return next(Finding(level, what, measured, wanted, advice)
+                for holds, level, measured, advice in cases if holds)
 
 
 def without_consequences(findings: Iterable[Finding]) -> list[Finding]:

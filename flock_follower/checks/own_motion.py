@@ -22,7 +22,18 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
+from flock_follower.checks.findings import (
+    ERROR,
+    error,
+    Finding,
+    first,
+    judged,
+    OK,
+    UNMEASURED,
+    unmeasured,
+    WARNING,
+    warning,
+)
 from flock_follower.checks.image_motion import AxesFit, fit_axes, interpolated
 from flock_follower.checks.mounting import SURE
 from flock_follower.checks.observations import Observations, OwnMotion
@@ -129,14 +140,14 @@ def _parameters_alike(seen: Observations) -> Iterator[Finding]:
 
 
 def _frames(seen: Observations) -> Finding:
-    what, wanted = 'odom frames', 'one pair, both named'
     header, child = seen.frames[-1]
-    measured = f'{header or "(none)"} to {child or "(none)"}'
-    if len(seen.frames) > 1:
-        return error(what, f'changed {len(seen.frames) - 1} times, now {measured}', wanted,
-                     'is it published by two sources? Every change starts perception anew')
-    return judged(False, not header, what, measured, wanted,
-                  'let the odometry source fill header.frame_id')
+    changes, measured = len(seen.frames) - 1, f'{header or "(none)"} to {child or "(none)"}'
+    return first(
+        'odom frames', 'one pair, both named',
+        (changes, ERROR, f'changed {changes} times, now {measured}',
+         'is it published by two sources? Every change starts perception anew'),
+        (not header, WARNING, measured, 'let the odometry source fill header.frame_id'),
+        (True, OK, measured, ''))
 
 
 def _positions(twist: TwistFrame, states: list[OdometryState]) -> Iterator[Finding]:
@@ -146,7 +157,6 @@ def _positions(twist: TwistFrame, states: list[OdometryState]) -> Iterator[Findi
     They have others if a rotation, or a reflection, of the velocity explains them, and neither
     reading of the velocity does without it (Kabsch's method).
     """
-    what, wanted = 'odom positions', 'along the axes of the velocity'
     if twist.wanted == NONE or len(twist.windows) < FEW or not np.any(
             np.array(twist.windows)[:, 1]):
         return  # without a velocity there is nothing to compare
@@ -164,40 +174,37 @@ def _positions(twist: TwistFrame, states: list[OdometryState]) -> Iterator[Findi
     # An axis whose reversal would show is known.
     still = ', '.join(axis for axis, gain in zip('xyz', 4.0 * np.sum(moved * same, axis=0))
                       if gain < EVIDENT * variance)
-    if before - after > max(EVIDENT * variance, 3.0 * after):
-        axes = ', '.join(f'{"-" if row[k] < 0.0 else ""}{"xyz"[k]}'
-                         for row in A for k in [int(np.abs(row).argmax())])
-        turn = math.degrees(math.acos(max(-1.0, 0.5 * (float(np.trace(A)) - 1.0))))
-        yield error(
-            what, f'turned by {turn:.0f} deg against the velocity' if axes == 'x, y, z' else
-            f'x, y, z move as {axes} of the velocity', wanted, 'set up its source to send '
-            'position, attitude and velocity in the axes of REP-103 (ENU, FLU)')
-    elif still:
-        measured = f'{still} moved too little: carry it, and lift it'
-        low = float(np.median([state.position[2] for state in states]))
-        yield unmeasured(what, measured, wanted) if 'z' not in still or low > BELOW else warning(
-            what, f'{measured}; z is {low:.1f} m', wanted, 'if it was not started higher up, z '
-            'points down: set up its source to send ENU (REP-103)')
-    else:
-        yield ok(what, 'as the velocity says', wanted)
+    axes = ', '.join(f'{"-" if row[k] < 0.0 else ""}{"xyz"[k]}'
+                     for row in A for k in [int(np.abs(row).argmax())])
+    turn = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(A)) - 1.0)))))
+    low = float(np.median([state.position[2] for state in states]))
+    moved_little = f'{still} moved too little: carry it, and lift it'
+    yield first(
+        'odom positions', 'along the axes of the velocity',
+        (before - after > max(EVIDENT * variance, 3.0 * after), ERROR,
+         f'turned by {turn:.0f} deg against the velocity' if axes == 'x, y, z' else
+         f'x, y, z move as {axes} of the velocity', 'set up its source to send position, attitude '
+         'and velocity in the axes of REP-103 (ENU, FLU)'),
+        ('z' in still and low <= BELOW, WARNING, f'{moved_little}; z is {low:.1f} m',
+         'if it was not started higher up, z points down: set up its source to send ENU '
+         '(REP-103)'),
+        (still, UNMEASURED, moved_little, ''),
+        (True, OK, 'as the velocity says', ''))
 
 
 def _twist(motion: OwnMotion) -> Finding:
     twist = motion.source.twist
-    what, wanted = 'odom velocity', 'as its positions move'
-    if 'velocity' in motion.source.missing:
-        return warning(what, 'none (not finite)', wanted, DERIVED)
-    if twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted):
-        return error(what, f'read in {twist.wanted}, the positions say {twist.found}', wanted,
-                     'set odom_twist_frame:=auto')
-    if twist.found == NONE:
-        return warning(what, f'off by {twist.contradiction:.2f} m/s in either frame', wanted,
-                       f'{DERIVED}; check the velocity of the odometry source')
-    if twist.wanted == NONE:
-        return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
-    if not twist.found:
-        return unmeasured(what, 'moved too little', wanted)
-    return ok(what, f'in the {twist.found} frame', wanted)
+    return first(
+        'odom velocity', 'as its positions move',
+        ('velocity' in motion.source.missing, WARNING, 'none (not finite)', DERIVED),
+        (twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted), ERROR,
+         f'read in {twist.wanted}, the positions say {twist.found}',
+         'set odom_twist_frame:=auto'),
+        (twist.found == NONE, WARNING, f'off by {twist.contradiction:.2f} m/s in either frame',
+         f'{DERIVED}; check the velocity of the odometry source'),
+        (twist.wanted == NONE, OK, 'odom_twist_frame is none: derived from the positions', ''),
+        (not twist.found, UNMEASURED, 'moved too little', ''),
+        (True, OK, f'in the {twist.found} frame', ''))
 
 
 def _lacking(motion: OwnMotion) -> Iterator[Finding]:
@@ -224,46 +231,59 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams, up: Array
     """
     turned = fit is not None and fit.best >= EXPLAINED and (
         1.0 - fit.best < TURNED * (1.0 - fit.configured))
-    what, wanted = 'odom up', "base_link's z up"
+    down = fit is not None and turned and lean < LYING and fit.turn[2, 2] < -0.5
     R = (np.eye(3) if fit is None else fit.turn) @ quaternion_to_matrix(
         quaternion_from_rpy(*params.child_rpy))
     rpy = f'[{",".join(str(round(angle, 4) + 0.0) for angle in rpy_from_matrix(R).tolist())}]'
-    if lean >= LYING:
-        largest = int(np.argmax(np.abs(up)))
-        axis = f'{"-" if up[largest] < 0.0 else "+"}{"xyz"[largest]}'
-        yield error(what, f'{axis} of base_link is up (leans {lean:.0f} deg)', wanted,
-                    f'odom_child_rpy:={rpy} fits the images' if turned else
-                    'its child frame is a camera or its IMU (x right, y down): '
-                    'odom_child_rpy:=[-1.5708,0.0,-1.5708]' if axis == '-y' else
-                    'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its '
-                    'attitude on the body, see docs/sensors.md')
-    elif turned and fit is not None and fit.turn[2, 2] < -0.5:
-        yield error(what, 'images turn the other way round: z of base_link is down', wanted,
-                    'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; '
-                    'or is the camera upside down (camera_rpy)?')
+    largest = int(np.argmax(np.abs(up)))
+    axis = f'{"-" if up[largest] < 0.0 else "+"}{"xyz"[largest]}'
+    yield first(
+        'odom up', "base_link's z up",
+        (lean >= LYING, ERROR, f'{axis} of base_link is up (leans {lean:.0f} deg)',
+         f'odom_child_rpy:={rpy} fits the images' if turned else
+         'its child frame is a camera or its IMU (x right, y down): '
+         'odom_child_rpy:=[-1.5708,0.0,-1.5708]' if axis == '-y' else
+         'its child frame (child_frame_id) is not base_link: set odom_child_rpy to its attitude '
+         'on the body, see docs/sensors.md'),
+        (down, ERROR, 'images turn the other way round: z of base_link is down',
+         'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; or is the '
+         'camera upside down (camera_rpy)?'),
+        (lean >= LEAN, WARNING, f'leans {lean:.0f} deg on average',
+         'hold the vehicle level; else set the pose of the IMU on the body (odom_child_rpy)'),
+        (True, OK, f'leans {lean:.0f} deg on average', ''))
+    if down:
         return
-    else:
-        yield judged(False, lean >= LEAN, what, f'leans {lean:.0f} deg on average', wanted,
-                     'hold the vehicle level; else set the pose of the IMU on the body '
-                     '(odom_child_rpy)')
     if fit is None:
         yield unmeasured('odom ahead', 'turned too little: turn the vehicle by 30 deg', TURN_MOVES)
         yield unmeasured('camera time offset', 'turned too little', IN_TIME)
         return
-    what, share = 'odom ahead', f'turning explains {max(fit.configured, 0.0):.0%} of it'
-    if turned and lean < LYING:
-        yield error(what, f'{share}; with other axes {fit.best:.0%}', TURN_MOVES,
-                    f'check camera_rpy; if that is right, set odom_child_rpy:={rpy}')
-    elif fit.configured >= EXPLAINED:
-        yield ok(what, share, TURN_MOVES)
-    elif not turned:
-        yield unmeasured(what, f'{share}; turn the vehicle by hand', TURN_MOVES)
-    period = motion.source.period
-    if fit.best >= EXPLAINED and period <= SLOW:
-        yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))
-    else:
-        yield unmeasured('camera time offset', share if period <= SLOW else
-                         f'odometry comes only every {period:.2f} s', IN_TIME)
+    share = f'turning explains {max(fit.configured, 0.0):.0%} of it'
+    if not turned or lean < LYING or fit.configured >= EXPLAINED:
+        yield first(
+            'odom ahead', TURN_MOVES,
+            (turned and lean < LYING, ERROR, f'{share}; with other axes {fit.best:.0%}',
+             f'check camera_rpy; if that is right, set odom_child_rpy:={rpy}'),
+            (fit.configured >= EXPLAINED, OK, share, ''),
+            (True, UNMEASURED, f'{share}; turn the vehicle by hand', ''))
+    yield _offset(fit, share, motion.source.period,
+                  float(seen.value('relative_pose', 'time_offset', 0.0)))
+
+
+def _offset(fit: AxesFit, share: str, period: float, known: float) -> Finding:
+    """Check the time offset; ``known``, s, is the parameter ``time_offset``."""
+    off = f'about {1e3 * abs(fit.offset):.0f} ms'
+    side = 'later' if fit.offset > 0.0 else 'earlier'
+    rest = abs(fit.offset + known)
+    return first(
+        'camera time offset', IN_TIME,
+        (period > SLOW, UNMEASURED, f'odometry comes only every {period:.2f} s', ''),
+        (fit.best < EXPLAINED, UNMEASURED, share, ''),
+        (abs(fit.offset) <= OFFSET or 1.0 - fit.explained >= SHIFTED * (1.0 - fit.together), OK,
+         off, ''),
+        (rest > OFFSET, ERROR if rest > BAD_OFFSET else WARNING,
+         f'images are stamped {off} {side} than odometry', 'have the driver stamp the middle of '
+         f'the exposure, by one clock; else set time_offset:={-fit.offset:.3f} of relative_pose'),
+        (True, OK, f'{off} {side}, as time_offset says', ''))
 
 
 def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
@@ -276,19 +296,6 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     return judged(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
         wanted, 'is the calibration of this lens, and for this size of images?')
-
-
-def _offset(fit: AxesFit, known: float) -> Finding:
-    """Check the time offset; ``known``, s, is the parameter ``time_offset``."""
-    off = f'about {1e3 * abs(fit.offset):.0f} ms'
-    side, rest = 'later' if fit.offset > 0.0 else 'earlier', abs(fit.offset + known)
-    if abs(fit.offset) <= OFFSET or 1.0 - fit.explained >= SHIFTED * (1.0 - fit.together):
-        return ok('camera time offset', off, IN_TIME)
-    return judged(rest > BAD_OFFSET, rest > OFFSET, 'camera time offset',
-                  f'images are stamped {off} {side} than odometry' if rest > OFFSET else
-                  f'{off} {side}, as time_offset says', IN_TIME,
-                  'have the driver stamp the middle of the exposure, by one clock; '
-                  f'else set time_offset:={-fit.offset:.3f} of relative_pose')
 
 
 def _fit(seen: Observations, states: list[OdometryState], up: Array | None) -> AxesFit | None:

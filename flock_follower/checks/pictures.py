@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, judged, ok, warning
+from flock_follower.checks.findings import ERROR, error, Finding, first, judged, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
 from flock_follower.perception.camera import CameraModel
 
@@ -76,23 +76,24 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     except ValueError as problem:
         return error(what, str(problem), wanted, calibrate)
     size = f'{camera.width}x{camera.height}'
-    if others := {f'{picture.width}x{picture.height}' for picture in pictures} - {size}:
-        return error(what, f'for {size}, images are {min(others)}', wanted, calibrate)
+    others = sorted({f'{picture.width}x{picture.height}' for picture in pictures} - {size})
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     shares = camera.matrix[:2, 2] / (camera.width, camera.height)
-    if np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width:
-        return error(what, f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the '
-                     'image: K is for another resolution', wanted, calibrate)
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
-    if straight and not rectified and np.any(camera.distortion):
-        return error(what, f'{measured}, distorted, but the topic is marked as rectified',
-                     wanted, 'start relative_pose with rectified:=true')
-    if rectified and not straight and any(seen.calibration.d):
-        return warning(what, f'{measured}; rectified is true, but the topic is not marked as '
-                       'rectified', wanted,
-                       'rectified:=true only for images whose distortion was removed')
-    return ok(what, measured, wanted)
+    return first(
+        what, wanted,
+        (others, ERROR, f'for {size}, images are {"".join(others[:1])}', calibrate),
+        (np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width, ERROR,
+         f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the image: K is for '
+         'another resolution', calibrate),
+        (straight and not rectified and np.any(camera.distortion), ERROR,
+         f'{measured}, distorted, but the topic is marked as rectified',
+         'start relative_pose with rectified:=true'),
+        (rectified and not straight and any(seen.calibration.d), WARNING,
+         f'{measured}; rectified is true, but the topic is not marked as rectified',
+         'rectified:=true only for images whose distortion was removed'),
+        (True, OK, measured, ''))
 
 
 def _exposure(pictures: list[Picture]) -> Finding:
@@ -101,15 +102,14 @@ def _exposure(pictures: list[Picture]) -> Finding:
     contrast = float(np.median([picture.contrast for picture in pictures]))
     measured = (f'{newest.width}x{newest.height} {newest.encoding}, grey level {brightness:.0f} '
                 f'± {contrast:.0f}')
-    wanted = f'grey level {DARK:.0f} to {BRIGHT:.0f}'
-    if brightness < DARK:
-        return error('images', f'{measured}: black', wanted,
-                     'take off the cap; more light, or a longer exposure')
-    if brightness > BRIGHT:
-        return error('images', f'{measured}: white', wanted, 'expose less (automatic exposure on)')
-    if contrast < FLAT:
-        return warning('images', f'{measured}: one grey', wanted, 'is something before the lens?')
-    return ok('images', measured, wanted)
+    return first(
+        'images', f'grey level {DARK:.0f} to {BRIGHT:.0f}',
+        (brightness < DARK, ERROR, f'{measured}: black',
+         'take off the cap; more light, or a longer exposure'),
+        (brightness > BRIGHT, ERROR, f'{measured}: white',
+         'expose less (automatic exposure on)'),
+        (contrast < FLAT, WARNING, f'{measured}: one grey', 'is something before the lens?'),
+        (True, OK, measured, ''))
 
 
 def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
@@ -118,26 +118,28 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     found = [[side for number, side in picture.markers.items() if number in seen.wanted_markers]
              for picture in pictures]
     sides = [side for each in found for side in each]
-    if not sides and seen.strangers:
-        name, numbers = next(iter(seen.strangers.items()))
-        return error(what, f'marker {", ".join(map(str, numbers[:4]))} of {name} in sight, '
-                     f'not {ours}', wanted, 'write dictionary and marker_id of the print into '
-                     'config/neighbors.yaml, or print that one')
     if not sides:
-        return warning(what, f'not in sight in {len(pictures)} images', wanted,
-                       'hold the leader before the camera; is the print flat, its margin white?')
+        name, numbers = next(iter(seen.strangers.items()), ('', []))
+        return first(
+            what, wanted,
+            (name, ERROR, f'marker {", ".join(map(str, numbers[:4]))} of {name} in sight, not '
+             f'{ours}', 'write dictionary and marker_id of the print into config/neighbors.yaml, '
+             'or print that one'),
+            (True, WARNING, f'not in sight in {len(pictures)} images',
+             'hold the leader before the camera; is the print flat, its margin white?'))
     share, side = sum(map(bool, found)) / len(pictures), float(np.median(sides))
-    measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
-    if side < TINY:
-        return error(what, measured, wanted,
-                     'come nearer, print it larger, or use a longer lens or a finer image')
-    if side < SMALL:
-        return warning(what, measured, wanted,
-                       'come nearer, or print the marker larger: a small marker is lost easily')
-    if share < SELDOM:
-        return warning(what, measured, f'{wanted}, most of the time',
-                       'keep the marker in sight; check light, blur and the white margin')
-    return ok(what, measured, wanted)
+    seldom = side >= SMALL and share < SELDOM
+    return first(
+        what, f'{wanted}, most of the time' if seldom else wanted,
+        *((holds, level, f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images', advice)
+          for holds, level, advice in (
+              (side < TINY, ERROR,
+               'come nearer, print it larger, or use a longer lens or a finer image'),
+              (side < SMALL, WARNING,
+               'come nearer, or print the marker larger: a small marker is lost easily'),
+              (seldom, WARNING,
+               'keep the marker in sight; check light, blur and the white margin'),
+              (True, OK, ''))))
 
 
 def _duplicates(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:

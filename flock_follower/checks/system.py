@@ -176,8 +176,8 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         return
     yield ok(what, f'{values.get("autopilot") or "received"}, {values.get("mode") or "no mode"}, '
              f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
-    differing = [key for key in values if key.startswith(PARAMETER)]
     wanted = 'as config/ recommends'
+    differing = [key for key in values if key.startswith(PARAMETER)]
     for key in differing:
         value, _, why = values[key].partition(': ')
         yield warning('autopilot parameter', f'{key.removeprefix(PARAMETER)} {value}', wanted,

@@ -21,7 +21,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, judged, ok, unmeasured, warning
+from flock_follower.checks.findings import (
+    ERROR,
+    error,
+    Finding,
+    first,
+    judged,
+    OK,
+    unmeasured,
+    WARNING,
+    warning,
+)
 from flock_follower.checks.observations import Observations, TopicSeen
 
 #: s: stamps that differ by more from the arrival are of another clock.
@@ -98,28 +108,24 @@ def _stream(name: str, topic: TopicSeen, newest: float, live: bool,
         yield warning(f'{name} stamps', f'{disorder:.0%} repeat the one before, or step back',
                       'each later than the one before',
                       'is the topic published twice, or by two drivers? Repetitions are dropped')
-    yield _latency(f'{name} latency', topic, limits, live)
-
-
-def _latency(what: str, topic: TopicSeen, limits: _Limits, live: bool) -> Finding:
     late = np.array(topic.arrivals) - np.array(topic.stamps)
     middle, most = float(np.median(late)), float(np.percentile(late, 95))
-    wanted = f'below {limits.latency[0]:g} s after its stamp'
-    if abs(middle) > OTHER_CLOCK:
-        return error(
-            what, f'stamped {_span(abs(middle))} {"before" if middle > 0.0 else "after"} it '
-            'came: another clock', wanted,
-            'set use_sim_time alike in all nodes, and the clocks of all computers; have the '
-            'driver stamp by the clock of ROS' if live else 'record it anew with stamps of the '
-            'clock of ROS (a replayed bag: ros2 bag record --use-sim-time)')
-    if middle < -AHEAD[0]:
-        return judged(middle < -AHEAD[1], True, what,
-                      f'stamped {-1e3 * middle:.0f} ms in the future', wanted, 'synchronise the '
-                      'clocks (chrony, PTP); have the driver stamp by the clock of ROS')
-    return judged(middle > limits.latency[1], middle > limits.latency[0]
-                  or most > limits.latency[1], what,
-                  f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms', wanted,
-                  limits.sooner)
+    ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
+    synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
+    measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
+    yield first(
+        f'{name} latency', f'below {limits.latency[0]:g} s after its stamp',
+        (abs(middle) > OTHER_CLOCK, ERROR,
+         f'stamped {_span(abs(middle))} {"before" if middle > 0.0 else "after"} it came: another '
+         'clock', 'set use_sim_time alike in all nodes, and the clocks of all computers; have the '
+         'driver stamp by the clock of ROS' if live else 'record it anew with stamps of the clock '
+         'of ROS (a replayed bag: ros2 bag record --use-sim-time)'),
+        (middle < -AHEAD[1], ERROR, ahead, synchronise),
+        (middle < -AHEAD[0], WARNING, ahead, synchronise),
+        (middle > limits.latency[1], ERROR, measured, limits.sooner),
+        (middle > limits.latency[0] or most > limits.latency[1], WARNING, measured,
+         limits.sooner),
+        (True, OK, measured, ''))
 
 
 def _clock_source(seen: Observations) -> Iterator[Finding]:
@@ -127,32 +133,31 @@ def _clock_source(seen: Observations) -> Iterator[Finding]:
     simulated = {node: bool(own['use_sim_time']) for node, own in seen.parameters.items()
                  if 'use_sim_time' in own}
     wrong = sorted(node for node, value in simulated.items() if value != seen.clock)
-    names, wanted = ', '.join(wrong), 'use_sim_time where /clock is'
-    if wrong and seen.clock:
-        yield error('clock', f'/clock is published, but use_sim_time is false in {names}', wanted,
-                    'start with -p use_sim_time:=true; or end the publisher of /clock')
-    elif wrong:
-        yield error('clock', f'{names}: use_sim_time is true, but nobody publishes /clock',
-                    wanted, 'start without use_sim_time; or replay with /clock')
-    elif simulated:
-        yield ok('clock', '/clock, used by all our nodes' if seen.clock
-                 else 'the system time, used by all our nodes', wanted)
+    names = ', '.join(wrong)
+    if simulated:
+        yield first(
+            'clock', 'use_sim_time where /clock is',
+            (wrong and seen.clock, ERROR,
+             f'/clock is published, but use_sim_time is false in {names}',
+             'start with -p use_sim_time:=true; or end the publisher of /clock'),
+            (wrong, ERROR, f'{names}: use_sim_time is true, but nobody publishes /clock',
+             'start without use_sim_time; or replay with /clock'),
+            (True, OK, '/clock, used by all our nodes' if seen.clock else
+             'the system time, used by all our nodes', ''))
 
 
 def _one_clock(seen: Observations) -> Iterator[Finding]:
     """Check that images and odometry are stamped by one clock."""
     images, odometry = ([stamp for stamp in seen.topic(name).stamps if stamp]
                         for name in (seen.image_name, 'odom'))
-    if not images or not odometry:
-        return
-    apart = max(min(images) - max(odometry), min(odometry) - max(images))
-    wanted = 'one clock for both'
-    if apart > 1.0:
-        yield error('camera and odometry', f'their stamps are {_span(apart)} apart', wanted,
-                    'have both drivers stamp by the clock of ROS, as unite_imu_method and '
-                    'global_time_enabled do for a RealSense')
-    else:
-        yield ok('camera and odometry', 'stamped over the same time', wanted)
+    if images and odometry:
+        apart = max(min(images) - max(odometry), min(odometry) - max(images))
+        yield first(
+            'camera and odometry', 'one clock for both',
+            (apart > 1.0, ERROR, f'their stamps are {_span(apart)} apart',
+             'have both drivers stamp by the clock of ROS, as unite_imu_method and '
+             'global_time_enabled do for a RealSense'),
+            (True, OK, 'stamped over the same time', ''))
 
 
 def _span(seconds: float) -> str:

@@ -107,7 +107,9 @@ def likely(topics: Mapping[str, str], msgtypes: Sequence[str],
     """
     fitting = [name for name, msgtype in topics.items() if msgtype in msgtypes
                and name not in set(taken) and not any(word in name for word in _NEVER)]
-    return sorted(fitting, key=lambda name: (_unlikely(name), not _is_likely(name), len(name)))
+    return sorted(fitting, key=lambda name: (
+        sum(word in name for word in _UNLIKELY), not any(word in name for word in _LIKELY),
+        len(name)))
 
 
 def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> str:
@@ -134,11 +136,3 @@ def elsewhere(full: str, topics: Iterable[str], ours: Iterable[str]) -> list[str
     """Return the topics of the same name in other namespaces."""
     last = full.rsplit('/', 1)[-1]
     return sorted(name for name in set(topics) - set(ours) if name.rsplit('/', 1)[-1] == last)
-
-
-def _unlikely(name: str) -> int:
-    return sum(word in name for word in _UNLIKELY)
-
-
-def _is_likely(name: str) -> bool:
-    return any(word in name for word in _LIKELY)

@@ -33,7 +33,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -63,20 +62,6 @@ DRIFT_STEP = 50_000_000
 _SIZE = 4
 
 
-class FirstFit(NamedTuple):
-    """
-    Initial estimate of the transform between two frames: see ``first_fit``.
-
-    ``yaw``, rad, turns its coordinates to the other's; ``anchor`` (3,), m, in it is at ``place``
-    (3,), m, in the other; ``covariance`` (4, 4) is of yaw and place.
-    """
-
-    yaw: float
-    place: Array
-    anchor: Array
-    covariance: Array
-
-
 def turned(yaw: float) -> Array:
     """Return the rotation (3, 3) about the vertical by a yaw, rad."""
     c, s = math.cos(yaw), math.sin(yaw)
@@ -90,19 +75,24 @@ def sideways(vector: Array) -> Array:
 
 @dataclass
 class Frame:
-    """Estimate of one frame; the covariance has 4 rows of it, in the order of the frames."""
+    """
+    Estimate of one frame; a covariance of it (4, 4) is of yaw and place.
+
+    ``yaw``, rad, turns its coordinates to those of the other frame; ``anchor`` (3,), m, in it is
+    at ``place`` (3,), m, in the other.
+    """
 
     yaw: float
-    """Turns its coordinates to the own ones, rad."""
-    rotation: Array
-    """(3, 3), the same."""
     place: Array
-    """Place of the anchor in the own frame (3,), m."""
     anchor: Array
-    """Anchor in the frame itself (3,), m."""
+
+    @property
+    def rotation(self) -> Array:
+        """Return the rotation (3, 3) of its coordinates to those of the other frame."""
+        return turned(self.yaw)
 
     def lever(self, position: Array) -> Array:
-        """Return the vector (3,), m, in the own frame from the anchor to a position."""
+        """Return the vector (3,), m, in the other frame from the anchor to a position."""
         return self.rotation.dot(position - self.anchor)
 
 
@@ -114,15 +104,14 @@ class FrameAlignment:
     """
 
     def __init__(self, own: str) -> None:
-        self.frames: dict[str, Frame] = {}
-        """The estimates of the other frames."""
-        self._own = own
-        self._covariance: Array = np.zeros((0, 0))
+        self.frames = {own: Frame(0.0, np.zeros(3), np.zeros(3))}
+        """The estimates of all frames in the own one, which is the first."""
+        self._covariance: Array = np.zeros((_SIZE, _SIZE))
         self._stamp: int | None = None
 
     def __contains__(self, name: str) -> bool:
         """Return whether a frame is known."""
-        return name == self._own or name in self.frames
+        return name in self.frames
 
     def covariance(self, name: str) -> Array:
         """Return the covariance (4, 4) of the yaw and place of a frame."""
@@ -131,7 +120,7 @@ class FrameAlignment:
 
     def stds(self, name: str) -> tuple[float, float]:
         """Return the standard deviations of a frame's place, sqrt(trace), m, and yaw, rad."""
-        if name not in self.frames:
+        if name not in self:
             return math.inf, math.inf
         variances = self.covariance(name).diagonal()
         return math.sqrt(max(variances[1:].sum(), 0.0)), math.sqrt(max(variances[0], 0.0))
@@ -145,39 +134,36 @@ class FrameAlignment:
 
     def drop(self, name: str) -> None:
         """Forget a frame."""
-        if name in self.frames:
+        if name in self:
             kept = np.delete(np.arange(len(self._covariance)), self._part(name))
             self._covariance = self._covariance[np.ix_(kept, kept)]
             del self.frames[name]
 
-    def start(self, name: str, fit: FirstFit, reference: str) -> None:
+    def start(self, name: str, found: Frame, covariance: Array, reference: str) -> None:
         """
         Begin the estimate of a frame.
 
-        :param reference: the known frame that ``fit`` relates it to.
+        :param found: its estimate in the known frame ``reference``, and the covariance (4, 4).
         """
         size = len(self._covariance)
+        known, part = self.frames[reference], self._part(reference)
+        lever = known.lever(found.place)
+        # yaw = yaw_r + yaw', place = place_r + R_r (place' - anchor_r), and their errors.
+        A, B = np.eye(_SIZE), np.eye(_SIZE)
+        A[1:, 0], B[1:, 1:] = sideways(lever), known.rotation
+        across = A.dot(self._covariance[part])
         grown = np.zeros((size + _SIZE, size + _SIZE))
         grown[:size, :size] = self._covariance
-        yaw, place, covariance = fit.yaw, fit.place, fit.covariance
-        if reference != self._own:
-            # yaw = yaw_r + yaw', place = place_r + R_r (place' - anchor_r), and their errors.
-            known, part = self.frames[reference], self._part(reference)
-            lever = known.lever(fit.place)
-            yaw, place = known.yaw + fit.yaw, known.place + lever
-            A, B = np.eye(_SIZE), np.eye(_SIZE)
-            A[1:, 0], B[1:, 1:] = sideways(lever), known.rotation
-            across = A.dot(self._covariance[part])
-            grown[size:, :size], grown[:size, size:] = across, across.T
-            covariance = A.dot(self._covariance[part, part]).dot(A.T) + (
-                B.dot(fit.covariance).dot(B.T))
-        grown[size:, size:] = covariance
+        grown[size:, :size], grown[:size, size:] = across, across.T
+        grown[size:, size:] = A.dot(self._covariance[part, part]).dot(A.T) + (
+            B.dot(covariance).dot(B.T))
         self._covariance = grown
-        self.frames[name] = Frame(wrap_angle(yaw), turned(yaw), place, fit.anchor)
+        self.frames[name] = Frame(
+            wrap_angle(known.yaw + found.yaw), known.place + lever, found.anchor)
 
     def set_anchor(self, name: str, position: Array) -> None:
         """Move the anchor of a frame to the position (3,) of its vehicle, if it is known."""
-        if name not in self.frames:
+        if name not in self:
             return
         frame, row = self.frames[name], self._part(name).start
         lever = frame.lever(position)
@@ -188,7 +174,7 @@ class FrameAlignment:
 
     def drift(self, stamp: int, own_position: Array) -> None:
         """Let the frames drift until a stamp, ns; the own frame turns about a position (3,)."""
-        if self._stamp is None or not self.frames:
+        if self._stamp is None or len(self.frames) == 1:
             self._stamp = stamp
         if stamp - self._stamp < DRIFT_STEP:
             return
@@ -196,13 +182,14 @@ class FrameAlignment:
         self._stamp = stamp
         position = POSITION_DRIFT ** 2 * elapsed
         yaw = YAW_DRIFT ** 2 * elapsed
-        count = len(self.frames)
+        others = list(self.frames.values())[1:]
         turning = np.concatenate([np.concatenate([[1.0], sideways(frame.place - own_position)])
-                                  for frame in self.frames.values()])
+                                  for frame in others])
         own = yaw * np.outer(turning, turning) + position * np.kron(
-            np.ones((count, count)), np.diag([0.0, 1.0, 1.0, 1.0]))
-        theirs = np.tile([yaw, position, position, position], count)
-        self._covariance = self._covariance + own + np.diag(theirs)
+            np.ones((len(others), len(others))), np.diag([0.0, 1.0, 1.0, 1.0]))
+        theirs = np.tile([yaw, position, position, position], len(others))
+        known = self._covariance[_SIZE:, _SIZE:]
+        known[:] = known + own + np.diag(theirs)
 
     def relate(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> float:
         """
@@ -218,16 +205,14 @@ class FrameAlignment:
         noise: Array = np.zeros((3, 3))
         yaw_gap, yaw_noise = 0.0, 0.0
         for sign, (name, there) in ((1.0, first), (-1.0, second)):
-            place, covariance, yaw = there.position, there.covariance, there.yaw
-            if name != self._own:
-                frame, part = self.frames[name], self._part(name)
-                lever = frame.lever(place)
-                place, yaw = frame.place + lever, yaw + frame.yaw
-                covariance = frame.rotation.dot(covariance).dot(frame.rotation.T)
-                columns += range(part.start, part.stop)
-                parts.append(sign * np.vstack([_lever_matrix(lever), [1.0, 0.0, 0.0, 0.0]]))
-            gap, noise = gap + sign * place, noise + covariance
-            yaw_gap, yaw_noise = yaw_gap + sign * yaw, yaw_noise + there.yaw_variance
+            frame, part = self.frames[name], self._part(name)
+            lever, rotation = frame.lever(there.position), frame.rotation
+            columns += range(part.start, part.stop)
+            parts.append(sign * np.vstack([_lever_matrix(lever), [1.0, 0.0, 0.0, 0.0]]))
+            gap = gap + sign * (frame.place + lever)
+            noise = noise + rotation.dot(there.covariance).dot(rotation.T)
+            yaw_gap = yaw_gap + sign * (there.yaw + frame.yaw)
+            yaw_noise = yaw_noise + there.yaw_variance
         H = np.hstack(parts)
         known = self._covariance[np.ix_(columns, columns)]
         spread = H.dot(known).dot(H.T)
@@ -250,7 +235,6 @@ class FrameAlignment:
         for frame, (yaw, *place) in zip(self.frames.values(),
                                         -innovation.dot(gain).reshape(-1, _SIZE)):
             frame.yaw = wrap_angle(frame.yaw + float(yaw))
-            frame.rotation = turned(frame.yaw)
             frame.place = frame.place + place
         P = self._covariance - across.dot(gain)
         self._covariance = 0.5 * (P + P.T)
@@ -297,16 +281,16 @@ class PairedFrames:
             self._pairs.popleft()
         self._pairs.append((one, other))
 
-    def first_fit(self, swapped: bool = False) -> FirstFit | None:
+    def first_fit(self, swapped: bool = False) -> tuple[Frame, Array] | None:
         """
-        Return the second frame in the first, or None while that is unknown.
+        Return the second frame in the first, with its covariance; None while that is unknown.
 
         :param swapped: the first in the second.
         """
         if len(self._pairs) < FEWEST:
             return None
         pairs = [(other, one) if swapped else (one, other) for one, other in self._pairs]
-        found = _fit(pairs)
+        found, covariance = _fit(pairs)
         agreeing = [pair for pair, chi2 in zip(pairs, _misfit(pairs, found)) if chi2 < OUTLIER]
         if len(agreeing) < max(FEWEST, AGREEING * len(pairs)):
             if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
@@ -314,9 +298,9 @@ class PairedFrames:
                     self._pairs.popleft()
             return None
         if len(agreeing) < len(pairs):
-            found = _fit(agreeing)
-        self.yaw_std = math.sqrt(min(found.covariance[0, 0], math.pi ** 2))
-        return found if self.yaw_std <= START_YAW else None
+            found, covariance = _fit(agreeing)
+        self.yaw_std = math.sqrt(min(covariance[0, 0], math.pi ** 2))
+        return (found, covariance) if self.yaw_std <= START_YAW else None
 
 
 def _variances(pairs: list[Pair]) -> Array:
@@ -332,7 +316,7 @@ def _positions(pairs: list[Pair]) -> tuple[Array, Array]:
         other.position for _, other in pairs])
 
 
-def _fit(pairs: list[Pair]) -> FirstFit:
+def _fit(pairs: list[Pair]) -> tuple[Frame, Array]:
     weights = 1.0 / _variances(pairs)
     total = float(weights.sum())
     one, other = _positions(pairs)
@@ -353,13 +337,13 @@ def _fit(pairs: list[Pair]) -> FirstFit:
         known += share * sure
     covariance = np.diag([WARINESS / max(known, 1e-6),
                           *[WARINESS / total + SIGHTING_NOISE ** 2] * 3])
-    return FirstFit(math.atan2(across, along), place, anchor, covariance)
+    return Frame(math.atan2(across, along), place, anchor), covariance
 
 
-def _misfit(pairs: list[Pair], fit: FirstFit) -> Array:
+def _misfit(pairs: list[Pair], fit: Frame) -> Array:
     """Return chi^2 (n,) of the distance and attitudes of each pair from a fit."""
     one, other = _positions(pairs)
-    gap = one - fit.place - (other - fit.anchor) @ turned(fit.yaw).T
+    gap = one - fit.place - (other - fit.anchor) @ fit.rotation.T
     turns = np.array([wrap_angle(a.yaw - b.yaw - fit.yaw) ** 2 / (a.yaw_variance + b.yaw_variance)
                       for a, b in pairs])
     return np.maximum((gap * gap).sum(axis=1) / _variances(pairs), turns)

@@ -276,7 +276,7 @@ class Sharing:
         fit = pairs.first_fit(swapped=reference == two)
         if fit is None:
             return
-        self.frames.start(fresh, fit, reference)
+        self.frames.start(fresh, *fit, reference)
         state = self.senders[fresh].states.get(fresh)
         if state is not None:
             self.frames.set_anchor(fresh, state.position)
@@ -298,15 +298,15 @@ class Sharing:
 
     def _align_all_anew(self, forget_senders: bool) -> None:
         """Reset after a change of the own frame; ``forget_senders``: after a jump of time, too."""
+        self.frames = FrameAlignment(self.name)
         self._seen.clear()
-        self._forget_frame(self.name)
         self._pairs.clear()
         self._related.clear()
-        for name, sender in self.senders.items():
-            self.frames.drop(name)
+        self._tracks = {key: each for key, each in self._tracks.items()
+                        if key[0] != self.name and not forget_senders}
+        for sender in self.senders.values():
             sender.refused = 0
         if forget_senders:
-            self._tracks.clear()
             self.senders.clear()
 
     # Out.

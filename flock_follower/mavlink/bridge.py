@@ -20,35 +20,32 @@ One thread owns it, see ``setpoint_thread``; other threads may only read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import commands, estimator_health
-from flock_follower.mavlink.commands import NOT_RECEIVED, Request
+from flock_follower.mavlink.commands import Goal, NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
-from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
+from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD, LAND
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
-from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
+from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import (
-    EndRequested,
-    FELL_SILENT,
-    NO_AUTOPILOT,
-    Restarted,
-)
+from flock_follower.mavlink.permission import FELL_SILENT, NO_AUTOPILOT
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
-from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
+from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import OdometryState
+from flock_follower.ranges import first_reason
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
 REST_SPEED: Final[float] = 0.1
@@ -59,6 +56,7 @@ BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
 #: Whether setpoints offset the wind; 'auto': if the autopilot does not.
 WIND_COMPENSATIONS: Final[tuple[str, ...]] = ('auto', 'always', 'never')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
+_GOALS: Final[dict[str, Goal]] = {HOLD: commands.HOLD, LAND: commands.LAND}
 
 
 class Cycle(NamedTuple):
@@ -81,7 +79,7 @@ class Bridge:
     :param recommendations: these three are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: when the bridge itself ends a flight.
-    :param ground_station: the reports to the pilot's ground station; None: nothing is reported.
+    :param report_to_gcs: whether the pilot's ground station receives reports.
     """
 
     def __init__(self, link: Link, gate: Gate, *, now: float,
@@ -91,7 +89,7 @@ class Bridge:
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None,
                  wind_compensation: str = 'auto', end: EndParams | None = None,
-                 ground_station: GroundStationReport | None = None) -> None:
+                 report_to_gcs: bool = False) -> None:
         self.link = link
         self.telemetry = link.telemetry
         self.gate = gate
@@ -108,7 +106,8 @@ class Bridge:
         """While it flies without odometry, the motion by the attitude at a time, s."""
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
-        self.ground_station = ground_station
+        self.ground_station = GroundStationReport()
+        self._reports = report_to_gcs
         gate.fused = forwarder is not None
         self._wind_compensation = wind_compensation
         self._start = self._streaming_since = now
@@ -116,12 +115,16 @@ class Bridge:
         self._blind_action = blind_action
         self._last_command: AcceptedCommand | None = None
         self._armed: bool | None = None
-        self._stopping_since: float | None = None
-        self._reboots = self._peer_changes = 0
+        self._stopping_since = math.inf
+        self._vehicle = 0, 0  # reboots, and changes of the vehicle
+        self._takers: dict[str, Callable[[Any, float], object]] = {
+            'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
+            'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
+            'PARAM_VALUE': self.housekeeping.take_parameter}
 
     def status(self, now: float) -> VehicleStatus | None:
         """Return the vehicle's status, None while the link is not alive."""
-        return self.telemetry.status if self.alive(now) else None
+        return self.telemetry.current(now, self.gate.limits.link_timeout)
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is connected."""
@@ -129,38 +132,27 @@ class Bridge:
 
     def state(self, now: float) -> str:
         """Return the text of ``mavlink_bridge/state`` at ``now``, s: the state and its reason."""
-        if self.telemetry.dialect is None:
-            return f'{NO_AUTOPILOT}: no HEARTBEAT yet'
-        if not self.alive(now):
-            return f'{NO_AUTOPILOT}: lost, {self.gate.permission.announced()} before'
-        return self.gate.permission.announced()
+        announced = self.gate.permission.announced()
+        return first_reason(
+            (self.telemetry.dialect is None, f'{NO_AUTOPILOT}: no HEARTBEAT yet'),
+            (not self.alive(now), f'{NO_AUTOPILOT}: lost, {announced} before'), (True, announced))
 
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
         return NOT_RECEIVED if self.telemetry.dialect is None else self.gate.withheld
 
-    def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float,
-                    position: ArrayLike | None = None, std: float = 0.0) -> str:
-        """Take velocity (3,), m/s, yaw, rad, and position (3,) +- ``std``, m, of odometry, ENU."""
-        refused = self.gate.update_velocity(ODOM, velocity, age, now)
-        if not refused:
-            self.gate.update_yaw(ODOM, yaw, now - age)
-            if position is not None:
-                self.gate.update_position(ODOM, position, now - age, std)
-        return refused
-
-    def forward(self, sample: ForwardedOdometry, now: float) -> str:
+    def forward(self, state: OdometryState, time: float, now: float) -> str:
         """
-        Take odometry to send on; return '' or why it is refused.
+        Take odometry stamped at a time, s, to send on; return '' or why it is refused.
 
         Its vertical velocity is corrected by the barometer: the autopilot's height follows it,
         in the hold mode too.
         """
         if self.forwarder is None:
             return ''
-        east, north, up = sample.velocity.tolist()
+        east, north, up = state.velocity.tolist()
         velocity = np.array([east, north, self.gate.corrected_climb_rate(up, now)])
-        return self.forwarder.take(sample._replace(velocity=velocity), now)
+        return self.forwarder.take(state._replace(velocity=velocity), time, now)
 
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is invalid, or ''."""
@@ -170,8 +162,7 @@ class Bridge:
 
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
-        obstacle = self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
-        return '' if obstacle is None else obstacle.reason
+        return self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))[0]
 
     def unready(self, now: float) -> str | None:
         """Return the reasons against the service ``arm``, '' without any; None: unknown."""
@@ -192,18 +183,14 @@ class Bridge:
             self._take(message, now)
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         if position is not None and position.time == now:
-            refused = self.distrusted(now) or self.gate.update_velocity(
-                AUTOPILOT, position.velocity, self._age(position, now), now)
-            if refused:
+            gps = self.telemetry.gps
+            if refused := self.distrusted(now) or self.gate.update_velocity(
+                    AUTOPILOT, position.velocity, self._age(position, now), now,
+                    position=position.position, std=0.0 if gps is None else gps.accuracy):
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
-            elif not self.distrusted(now):
-                gps = self.telemetry.gps
-                self.gate.update_position(
-                    AUTOPILOT, position.position, now - self._age(position, now),
-                    0.0 if gps is None else gps.accuracy)
         if attitude is not None and attitude.time == now:
             time = now - self._age(attitude, now)
-            self.gate.update_yaw(AUTOPILOT, attitude.yaw, time)
+            self.gate.update_yaw(AUTOPILOT, yaw_from_quaternion(attitude.quaternion), time)
             motion = self.gate.update_attitude(
                 attitude.quaternion, attitude.angular_velocity, time, now)
             self.motion = None if motion is None else (motion, time)
@@ -219,18 +206,11 @@ class Bridge:
         return self.housekeeping.timesync.age(estimate.time_boot_ms, round(now * 1e9))
 
     def _take(self, message: Any, now: float) -> None:
-        kind = message.get_type()
         if (status := self.telemetry.shown(message)) is not None:
             # Each one: the pilot may have switched away and back between two that came at once.
             self._look(status, now)
-        elif kind == 'STATUSTEXT':
-            self.texts.add(message, now)
-        elif kind == 'EVENT':
-            self.texts.add_event(message, now)
-        elif kind == 'COMMAND_ACK':
-            self.requests.acknowledge(message, now)
-        else:
-            self.housekeeping.take(message, now)
+        elif message.get_type() in self._takers:
+            self._takers[message.get_type()](message, now)
 
     def cycle(self, now: float) -> Cycle:
         """Send the messages due at ``now``: a setpoint, HEARTBEAT, commands and requests."""
@@ -242,8 +222,8 @@ class Bridge:
             self._look(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
-        self.gate.distrust(self.distrusted(now), now)
-        setpoint, accepted = self.gate.decide(now, self.telemetry.silence(now), self.withheld())
+        setpoint, accepted = self.gate.decide(
+            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
         if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
@@ -257,14 +237,17 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
-        self._report_to_ground_station(now)
+        # On a line too slow for all, setpoints go first.
+        if self._reports and self.alive(now) and not self.link.transport.congested():
+            for message in self.ground_station.due(self._boot_time(now), now):
+                self.link.send(message)
         first = accepted if sent and accepted is not self._last_command else None
         self._last_command = first or self._last_command
         return Cycle(setpoint, sent, first)
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
-                               self.link.target_system, self.link.target_component)
+                               self.link.target_system, AUTOPILOT_COMPONENT)
 
     def _boot_time(self, now: float) -> int:
         """Return the ``time_boot_ms`` of messages sent at ``now``, s: ms since the start."""
@@ -280,8 +263,7 @@ class Bridge:
         reason = self.gate.permission.reason
         if not reason.startswith(FELL_SILENT):
             return
-        if self.ground_station is not None:
-            self.ground_station.take_handover(reason)
+        self.ground_station.take_handover(reason)
         if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.LAND, now))
@@ -299,33 +281,21 @@ class Bridge:
 
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""
-        flies, pending = self.gate.flies, self.requests.pending
-        dialect = self.telemetry.dialect
-        status = self.status(now)
-        if status is None:
+        flies, pending, status = self.gate.flies, self.requests.pending, self.status(now)
+        dialect, handover = self.telemetry.dialect, self.handover
+        if status is None or dialect is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
             self.gate.active_since, self.gate.command_time,
             self.gate.handover(now) if flies else '', now)
         held = ''
-        if self.handover is not None and dialect is not None and (
-                self.handover.outcome is not None and self.handover.outcome.success):
-            modes = self.handover.current.modes
-            held = modes(dialect)[0] if modes is not None else ''
+        if handover is not None and handover.outcome is not None and handover.outcome.success:
+            held, *_ = handover.current.modes(dialect)
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask and not self.requests.stopping:
-            goal = commands.HOLD if ask == HOLD else commands.LAND
-            self.handover = self.requests.begin(goal, now, why=self.end.why)
-            if self.ground_station is not None:
-                self.ground_station.take_handover(self.end.why)
-
-    def _report_to_ground_station(self, now: float) -> None:
-        # On a line too slow for all, setpoints go first.
-        if self.ground_station is None or not self.alive(now) or self.link.transport.congested():
-            return
-        for message in self.ground_station.due(self._boot_time(now), now):
-            self.link.send(message)
+            self.handover = self.requests.begin(_GOALS[ask], now, why=self.end.why)
+            self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -340,13 +310,12 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.gate.permit(EndRequested('the bridge is stopping'))
+        self.gate.permit(self.gate.permission.ended('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
-        speed, since = self.gate.speed(now), self._stopping_since
-        return (not self.gate.flies or speed is None or speed < REST_SPEED
-                or (since is not None and now - since >= STOP_TIMEOUT))
+        return not self.gate.flies or (self.gate.speed(now) or 0.0) < REST_SPEED or (
+            now - self._stopping_since >= STOP_TIMEOUT)
 
     def finish(self, now: float) -> None:
         """
@@ -362,18 +331,17 @@ class Bridge:
             self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
         if self.withheld():
             return
-        setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
+        setpoint, _ = self.gate.decide(
+            now, self.telemetry.silence(now), distrusted=self.distrusted(now))
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 
     def _look(self, status: VehicleStatus, now: float) -> None:
         """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
-        known = self.telemetry.reboots, self.link.peer_changes
-        if known != (self._reboots, self._peer_changes):
-            rebooted = known[0] != self._reboots
-            if known[1] != self._peer_changes and self.requests.pending is not None:
+        before, self._vehicle = self._vehicle, (self.telemetry.reboots, self.link.peer_changes)
+        if before != self._vehicle:
+            if before[1] != self._vehicle[1] and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
-            self._reboots, self._peer_changes = known
-            self.gate.permit(Restarted('the autopilot rebooted' if rebooted
-                                          else _OTHER_VEHICLE))
+            self.gate.permit(self.gate.permission.restarted(
+                'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
         self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

@@ -32,8 +32,9 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, enum_name, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
+from flock_follower.ranges import first_reason
 
 #: How long to wait for HEARTBEAT (1 Hz) to show the result, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
@@ -80,8 +81,8 @@ class Goal:
     command: int
     params: Callable[[Dialect], tuple[float, ...]]
     reached: Callable[[Vehicle], bool]
-    modes: Callable[[Dialect], tuple[str, ...]] | None = None
-    """The modes that it leads through; None: any. In any other mode the pilot has taken over."""
+    modes: Callable[[Dialect], tuple[str, ...]] = lambda dialect: ()
+    """The modes that it leads through; (): any. In any other mode the pilot has taken over."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
     insists: bool = False
@@ -163,11 +164,10 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
             replace(OFFBOARD) if vehicle.dialect.setpoints_end_takeoff else None))
 
 
-def result_text(result: int) -> str:
+def result_text(result: int | None) -> str:
     """Return a MAV_RESULT in words: 'temporarily rejected'."""
-    entry = mavlink.enums['MAV_RESULT'].get(result)
-    return entry.name.removeprefix('MAV_RESULT_').lower().replace('_', ' ') if entry else (
-        f'result {result}')
+    name = enum_name('MAV_RESULT', result) or f'result {result}'
+    return 'no result' if result is None else name.lower().replace('_', ' ')
 
 
 class Request:
@@ -292,25 +292,20 @@ class Request:
         status, dialect = vehicle.status, vehicle.dialect
         if self.current.command == TAKEOFF and not status.armed:
             return 'disarmed meanwhile'
-        if self.current.modes is None:
-            return ''
-        expected = {self._mode, *self.current.modes(dialect)}
-        if self._superseded is not None and self._superseded.modes is not None:
-            expected.update(self._superseded.modes(dialect))
-        if self._mode in dialect.takeoff_modes:  # one leads on to the next
-            expected.update(dialect.takeoff_modes)
-        return '' if status.mode in expected else (
+        goals = [goal for goal in (self.current, self._superseded) if goal is not None]
+        expected = {self._mode, *(mode for goal in goals for mode in goal.modes(dialect)),
+                    # One leads on to the next.
+                    *(dialect.takeoff_modes if self._mode in dialect.takeoff_modes else ())}
+        return '' if status.mode in expected or not self.current.modes(dialect) else (
             f'the mode was changed to {status.mode} meanwhile')
 
     def _first(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
         """Send the command for the first time if its conditions are met; else wait, or end."""
-        missing = ''
-        if vehicle is None and not self.current.ends_flight:
-            missing = NOT_RECEIVED
-        elif vehicle is not None and self.current is OFFBOARD and (
-                streaming_for < vehicle.dialect.stream_before_offboard):
-            missing = ('no setpoint stream has been running for '
-                       f'{vehicle.dialect.stream_before_offboard} s')
+        stream = vehicle.dialect.stream_before_offboard if vehicle is not None else 0.0
+        missing = first_reason(
+            (vehicle is None and not self.current.ends_flight, NOT_RECEIVED),
+            (self.current is OFFBOARD and streaming_for < stream,
+             f'no setpoint stream has been running for {stream} s'))
         if not missing:
             self._since = now
             return self._send(now)
@@ -326,20 +321,18 @@ class Request:
     def _refusal(self, texts: StatusTexts) -> str:
         goal, vehicle, mode = self.current, self._known, ''
         if vehicle is not None and not (goal.ends_flight and goal.command == _ARM):
-            mode = goal.modes(vehicle.dialect)[0] if goal.modes else vehicle.status.mode
+            mode, *_ = *goal.modes(vehicle.dialect), vehicle.status.mode
         reasons = texts.why(self._since, mode)
         self._advice = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
-        result = 'no result' if self._result is None else result_text(self._result)
-        return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
+        return f'{goal.name} refused: ' + ': '.join(
+            filter(None, (result_text(self._result), '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
-        name = self.current.name
+        problem = f'{self.current.name} not reached within {self.current.timeout:.1f} s: ' + (
+            'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
         if self._result is None:
-            problem = f'{name}: no answer to {self._attempts} commands' + (
+            problem = f'{self.current.name}: no answer to {self._attempts} commands' + (
                 ', and no HEARTBEAT' if vehicle is None else '')
-        else:
-            problem = f'{name} not reached within {self.current.timeout:.1f} s: ' + (
-                'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
         return ': '.join(filter(None, (problem, '; '.join(texts.since(self._since)))))
 
     def _finish(self, success: bool, message: str) -> None:

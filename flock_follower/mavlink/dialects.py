@@ -35,6 +35,12 @@ _MULTIROTORS: Final[frozenset[int]] = frozenset({
     mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR})
 
 
+def enum_name(enum: str, value: int | None) -> str:
+    """Return the name of a value of an enum of MAVLink, without the name of the enum, or ''."""
+    entry = mavlink.enums[enum].get(value)
+    return entry.name.removeprefix(f'{enum}_') if entry else ''
+
+
 class VehicleStatus(NamedTuple):
     """The vehicle's state by HEARTBEAT, or by a CURRENT_MODE after it."""
 
@@ -145,11 +151,10 @@ class Dialect:
 
     def status(self, heartbeat: Any) -> VehicleStatus:
         """Return the status in a HEARTBEAT."""
-        state = mavlink.enums['MAV_STATE'].get(heartbeat.system_status)
         mode = self.mode_name(heartbeat.custom_mode)
         return VehicleStatus(
             bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
-            state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown',
+            (enum_name('MAV_STATE', heartbeat.system_status) or 'unknown').lower(),
             mode == self.offboard)
 
 
@@ -221,11 +226,9 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
 
 def describe(heartbeat: Any) -> str:
     """Return the firmware and vehicle type in a HEARTBEAT: 'ARDUPILOTMEGA FIXED_WING'."""
-    parts = []
-    for enum, value in (('MAV_AUTOPILOT', heartbeat.autopilot), ('MAV_TYPE', heartbeat.type)):
-        entry = mavlink.enums[enum].get(value)
-        parts.append(entry.name.removeprefix(f'{enum}_') if entry else f'{enum} {value}')
-    return ' '.join(parts)
+    return ' '.join(
+        enum_name(enum, value) or f'{enum} {value}' for enum, value in (
+            ('MAV_AUTOPILOT', heartbeat.autopilot), ('MAV_TYPE', heartbeat.type)))
 
 
 def is_autopilot(heartbeat: Any) -> bool:

@@ -35,7 +35,7 @@ from typing import Final, NamedTuple
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import product, Side
-from flock_follower.ranges import Checked, parameter, Range
+from flock_follower.ranges import Checked, first_reason, parameter, Range
 
 #: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
 #: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
@@ -131,9 +131,6 @@ class Location(NamedTuple):
     """(2,), m, horizontally from where it became ACTIVE; None before."""
 
 
-NOWHERE: Final[Location] = Location()
-
-
 def approach_speed(distance: float, deceleration: float) -> float:
     """
     Return the largest speed, m/s, towards a bound from which the vehicle still stops before it.
@@ -189,17 +186,16 @@ def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float)
 
 def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
     """Return which bound the vehicle is beyond by more than a tolerance, m, in words, or ''."""
-    if place.height is not None:
-        if place.height < limits.height_min - tolerance:
-            return f'height {place.height:.2f} m: below height_min = {limits.height_min:g} m'
-        if place.height > limits.height_max + tolerance:
-            return f'height {place.height:.2f} m: above height_max = {limits.height_max:g} m'
-    if place.offset is not None:
-        distance = math.hypot(*place.offset.tolist())
-        if distance > limits.radius_max + tolerance:
-            return (f'{distance:.2f} m from where it became ACTIVE: beyond radius_max = '
-                    f'{limits.radius_max:g} m')
-    return ''
+    height = limits.height_min if place.height is None else place.height
+    distance = 0.0 if place.offset is None else math.hypot(*place.offset.tolist())
+    return first_reason(
+        (height < limits.height_min - tolerance,
+         f'height {height:.2f} m: below height_min = {limits.height_min:g} m'),
+        (height > limits.height_max + tolerance,
+         f'height {height:.2f} m: above height_max = {limits.height_max:g} m'),
+        (distance > limits.radius_max + tolerance,
+         f'{distance:.2f} m from where it became ACTIVE: beyond radius_max = '
+         f'{limits.radius_max:g} m'))
 
 
 def outside(limits: GateLimits, height: float | None) -> str:
@@ -258,13 +254,13 @@ class HeightEstimator:
 
         :param climb_rate: of the vehicle, m/s, by another source; None if none is known.
         """
-        if not abs(altitude) <= SANE:  # written so that NaN fails
-            return 'not finite'
+        elapsed = now - self._time
+        # Written so that NaN fails.
+        if refused := first_reason((not abs(altitude) <= SANE, 'not finite'),
+                                   (not elapsed > 0.0, 'not newer')):
+            return refused
         if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:
             climb_rate = None
-        elapsed = now - self._time
-        if not elapsed > 0.0:
-            return 'not newer'
         if elapsed > TIMEOUT:
             # A sensor that returns is used again, with the same reference.
             self._altitude, self._velocity_error = altitude, 0.0
@@ -342,7 +338,5 @@ class HeightEstimator:
 
     def lost(self, now: float) -> str:
         """Return why a height that was known cannot be used at ``now``, or ''."""
-        if self.missing(now):
-            return 'height stale'
         jumped = self._reference is not None and now - self._stepped < STEP_PAUSE
-        return 'height jumped' if jumped else ''
+        return first_reason((self.missing(now), 'height stale'), (jumped, 'height jumped'))

@@ -22,22 +22,29 @@ vision: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
+from functools import partial
+from itertools import pairwise
 import math
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.ranges import first_reason
+
 #: The estimate uses forwarded odometry for this long after the last ODOMETRY, s: PX4's limit.
 FORWARDED_TIMEOUT: Final[float] = 0.2
 #: What the estimator said of itself longer ago than this, s, is the past.
 STATUS_TIMEOUT: Final[float] = 3.0
-#: PX4's second flag is whether any source of horizontal motion is in use: cleared 0.6 s after
-#: vision is gone, the first only after 5 s.
-_PX4: Final[int] = mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-_ARDUPILOT: Final[int] = mavlink.EKF_VELOCITY_HORIZ
+#: The flags that are set and that are not if the estimator has a velocity, by the message. PX4's
+#: second one is whether any source of horizontal motion is in use: cleared 0.6 s after vision is
+#: gone, the first only after 5 s. ArduPilot's integrates nothing at a position taken for constant.
+_VELOCITY: Final[dict[str, tuple[int, int]]] = {
+    'ESTIMATOR_STATUS': (
+        mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, 0),
+    'EKF_STATUS_REPORT': (mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE)}
 #: The flags that a flight needs, by number; EKF_STATUS_REPORT numbers and names them likewise.
 #: Without PRED_POS_HORIZ_REL nothing carries the position, without POS_HORIZ_ABS it has no origin.
 _NEEDED: Final[dict[int, str]] = {
@@ -55,8 +62,6 @@ WITHOUT_COMPASS: Final[str] = ', and set EKF2_MAG_TYPE to 5 if it flies without 
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
 GPS_SILENCE: Final[float] = 10.0
-#: GPS_RAW_INT.fix_type from which on a receiver knows where it is.
-_FIX: Final[int] = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 class GpsFix(NamedTuple):
@@ -83,12 +88,9 @@ class EstimatorStatus(NamedTuple):
 def estimator_status(message: Any, now: float) -> EstimatorStatus:
     """Return what an ESTIMATOR_STATUS or EKF_STATUS_REPORT says."""
     flags = message.flags
-    missing = tuple(name for flag, name in _NEEDED.items() if not flags & flag)
-    if message.get_type() == 'ESTIMATOR_STATUS':
-        return EstimatorStatus(now, flags & _PX4 == _PX4, missing)
-    # It integrates nothing at all if it takes its position for constant.
-    return EstimatorStatus(now, flags & _ARDUPILOT == _ARDUPILOT
-                           and not flags & mavlink.EKF_CONST_POS_MODE, missing)
+    needed, forbidden = _VELOCITY[message.get_type()]
+    return EstimatorStatus(now, flags & (needed | forbidden) == needed, tuple(
+        name for flag, name in _NEEDED.items() if not flags & flag))
 
 
 def explained(refusal: str, status: EstimatorStatus | None, now: float,
@@ -102,22 +104,20 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float,
 
     :param parameters: the values of the autopilot's parameters that are known.
     """
-    if status is None or now - status.time > STATUS_TIMEOUT:
-        return refusal
-    if status.missing:
-        return f'{refusal}; its estimator lacks {", ".join(status.missing)}'
-    if NO_GLOBAL_POSITION not in refusal:
-        return refusal
-    advice = '' if parameters.get('EKF2_MAG_TYPE') == 5.0 else WITHOUT_COMPASS
-    return f'{refusal}; {UNALIGNED}{advice}'
+    known = status is not None and now - status.time <= STATUS_TIMEOUT
+    missing = status.missing if status is not None else ()
+    compass = '' if parameters.get('EKF2_MAG_TYPE') == 5.0 else WITHOUT_COMPASS
+    return refusal + first_reason(
+        (not known, ''),
+        (missing, f'; its estimator lacks {", ".join(missing)}'),
+        (NO_GLOBAL_POSITION in refusal, f'; {UNALIGNED}{compass}'))
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
     """Return the state of the GPS fix after a GPS_RAW_INT."""
-    fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
+    fixed = mavlink.GPS_FIX_TYPE_3D_FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
     accuracy = message.h_acc * 1e-3 if fixed else 0.0
-    if before is None:
-        return GpsFix(fixed, -math.inf, accuracy)
+    before = before or GpsFix(False, -math.inf)
     return GpsFix(fixed, now if before.fixed and not fixed else before.lost, accuracy)
 
 
@@ -130,14 +130,12 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
     :param gps: the newest, None if it sends none.
     :param forwarded: how long ago ODOMETRY was last sent, s; infinite if never.
     """
-    if FORWARDED_TIMEOUT < forwarded < math.inf:
-        return 'rests on odometry that is lost'
-    if math.isinf(forwarded) and gps is not None and not gps.fixed and (
-            now - gps.lost <= GPS_SILENCE):
-        return 'rests on GPS, whose fix is lost'
-    if status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity:
-        return 'is none, says its estimator'
-    return ''
+    return first_reason(
+        (FORWARDED_TIMEOUT < forwarded < math.inf, 'rests on odometry that is lost'),
+        (math.isinf(forwarded) and gps is not None and not gps.fixed
+         and now - gps.lost <= GPS_SILENCE, 'rests on GPS, whose fix is lost'),
+        (status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity,
+         'is none, says its estimator'))
 
 
 #: Rates and pauses are reported over this time, s.
@@ -145,8 +143,10 @@ RECENT: Final[float] = 5.0
 #: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
 WINDOW: Final[float] = 1.0
 FEWEST: Final[int] = 5
-#: So many of a kind are remembered: RECENT at 400 Hz.
-MOST: Final[int] = 2000
+#: So many are remembered: RECENT at 1 kHz.
+MOST: Final[int] = 5000
+#: Stands for all messages in the place of an id.
+ANY: Final[int] = -1
 #: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
 #: Time between two requests, s; the longest where asking does no good.
@@ -158,49 +158,38 @@ class Arrivals:
     """Times of reception, s, of the messages of one autopilot, by message id."""
 
     def __init__(self) -> None:
-        self._times: dict[int, deque[float]] = {}
-        self._newest = -math.inf
-        # Times and lengths of pauses, each longer than all that came after it.
-        self._pauses: deque[tuple[float, float]] = deque()
+        self._times: defaultdict[int, deque[float]] = defaultdict(partial(deque, maxlen=MOST))
 
     def take(self, message_id: int, now: float) -> None:
         """Take a message that came at ``now``."""
-        times = self._times.setdefault(message_id, deque(maxlen=MOST))
-        times.append(now)
-        while now - times[0] > RECENT:
-            times.popleft()
-        pause, self._newest = now - self._newest, now
-        if math.isinf(pause):
-            return
-        while self._pauses and self._pauses[-1][1] <= pause:
-            self._pauses.pop()
-        self._pauses.append((now, pause))
-        while now - self._pauses[0][0] > RECENT:
-            self._pauses.popleft()
+        for times in (self._times[message_id], self._times[ANY]):
+            times.append(now)
+            while now - times[0] > RECENT and now - times[1] > RECENT:
+                times.popleft()
 
-    def count(self, message_id: int, now: float, window: float) -> int:
-        """Return how often a message came within ``window``, s, at most ``RECENT``."""
-        times = self._times.get(message_id, deque()).copy()  # other threads read too
-        return sum(now - window < time for time in times)
+    def recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
+        """Return when a message came within ``window``, s, at most ``RECENT``."""
+        # A copy: other threads read too.
+        return [time for time in self._times[message_id].copy() if now - time < window]
 
     def rate(self, message_id: int, now: float) -> float:
         """Return how often a message comes, Hz; 0 if the last is half of RECENT ago."""
-        times = [time for time in self._times.get(message_id, deque()).copy()
-                 if now - time < RECENT]
+        times = self.recent(message_id, now)
         if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
             return 0.0
         return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
 
     def longest_pause(self, now: float) -> float:
         """Return the longest pause in all messages within the last RECENT, s."""
-        ended = [pause for time, pause in self._pauses.copy() if now - time <= RECENT]
-        return max([*ended, now - self._newest] if math.isfinite(self._newest) else [0.0])
+        times = [*self._times[ANY].copy(), now]
+        return max((later - time for time, later in pairwise(times) if now - later <= RECENT),
+                   default=0.0)
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
         """Return whether the rate of a message is well below the requested one, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
-        return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window
+        return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
 
 
 class AskAgain:
@@ -214,13 +203,21 @@ class AskAgain:
     def __init__(self) -> None:
         self._asked = self._low = -math.inf
         self._vain = 0
+        self._absent = False
 
     def asked(self, now: float) -> None:
         """Begin afresh: everything was asked for at ``now``, s."""
         self._asked, self._vain = now, 0
 
-    def due(self, low: bool, now: float) -> bool:
-        """Return whether to ask at ``now``, s, where messages come too seldom (``low``) or not."""
+    def due(self, low: bool, now: float, comes: bool = True) -> bool:
+        """
+        Return whether to ask at ``now``, s.
+
+        :param low: whether messages come too seldom; ``comes``: whether any comes.
+        """
+        if comes and self._absent:
+            self.asked(now)  # in vain before, since there was no estimate to send
+        self._absent = not comes
         if not low:
             if now - max(self._low, self._asked) >= SHORTEST_WAIT:
                 self._vain = 0

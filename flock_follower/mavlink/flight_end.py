@@ -117,10 +117,9 @@ class FlightEnd:
 
     def battery_low(self, now: float) -> str:
         """Return that the battery has been low for long enough, or ''."""
-        if now - self._low_since < BATTERY_TIME:
-            return ''
-        return (f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
-                f'{100.0 * self.params.battery_low:.0f} %')
+        return '' if now - self._low_since < BATTERY_TIME else (
+            f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
+            f'{100.0 * self.params.battery_low:.0f} %')
 
     def battery_unknown(self, now: float) -> bool:
         """Return whether ``battery_low`` cannot act, because the battery is not known."""
@@ -141,19 +140,17 @@ class FlightEnd:
         :param command_time: when a command was accepted last, s.
         :param handover: why the gate wants to, or ''.
         """
-        if handover:
-            return handover, HOLD
-        if low := self.battery_low(now):
-            return low, self.params.battery_action
-        if math.isinf(active_since):
-            return '', HOLD
-        if command_time < active_since:
-            waited, most = now - active_since, self.params.engage_timeout
-            reason = f'no command within engage_timeout = {most:g} s'
-        else:
-            waited, most = now - command_time, COMMAND_TIMEOUT
-            reason = f'no command for {COMMAND_TIMEOUT:g} s'
-        return (reason, self.params.leader_lost_action) if waited > most else ('', HOLD)
+        most = self.params.engage_timeout
+        late = command_time >= active_since and now - command_time > COMMAND_TIMEOUT
+        causes = (
+            (handover, HOLD),
+            (self.battery_low(now), self.params.battery_action),
+            (f'no command for {COMMAND_TIMEOUT:g} s' if late else '',
+             self.params.leader_lost_action),
+            (f'no command within engage_timeout = {most:g} s' if (
+                command_time < active_since and now - active_since > most) else '',
+             self.params.leader_lost_action))
+        return next((cause for cause in causes if cause[0]), ('', HOLD))
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
              status: VehicleStatus, now: float) -> str:

@@ -31,15 +31,7 @@ from flock_follower.geometry import Array
 from flock_follower.mavlink import envelope, setpoint_rules, velocity_check
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
-from flock_follower.mavlink.permission import (
-    Blinded,
-    Event,
-    Landed,
-    next_permission,
-    Permission,
-    Phase,
-    Seen,
-)
+from flock_follower.mavlink.permission import Permission, Phase
 from flock_follower.mavlink.relative_flight import RelativeFlight
 from flock_follower.mavlink.setpoint_rules import (
     AcceptedCommand,
@@ -61,6 +53,7 @@ from flock_follower.mavlink.velocity_check import (
     VelocityComparison,
 )
 from flock_follower.messages import Command, OdometryState, SANE
+from flock_follower.ranges import first_reason
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -123,10 +116,9 @@ class Gate:
         self._commanded = False  # whether the last setpoint was a command
         self._last_yaw: float | None = None
 
-    def permit(self, event: Event) -> None:
-        """Update the permission by a request, or by its result."""
-        before, self.permission = self.permission, next_permission(self.permission, event)
-        phase = self.permission.phase
+    def permit(self, after: Permission) -> None:
+        """Take the permission after an event, such as ``permission.requested(now)``."""
+        before, self.permission, phase = self.permission, after, after.phase
         self._was_active = phase is Phase.ACTIVE or (
             self._was_active and phase is Phase.GIVING_BACK)
         if (before.phase is Phase.ACTIVE) != (phase is Phase.ACTIVE):
@@ -139,7 +131,7 @@ class Gate:
         :param airborne: whether the autopilot reports that it flies; None if it does not report.
         """
         self._status, self._airborne = status, airborne
-        self.permit(Seen(status, received, airborne))
+        self.permit(self.permission.seen(status, received, airborne))
 
     @property
     def flies(self) -> bool:
@@ -159,36 +151,42 @@ class Gate:
 
         ``source_age`` is the age of the image the command rests on, for latency statistics.
         """
-        if self.permission.phase is not Phase.ACTIVE:
-            return f'while {self.permission.phase.name}'
-        a = finite_vector(command.acceleration)
-        if a is None or not math.isfinite(command.yaw):
-            return 'not finite'
-        if refused := refusal(age, self.limits.planner_timeout):
-            return refused
+        a, phase = finite_vector(command.acceleration), self.permission.phase
         source = age if source_age is None else source_age
-        if not source <= OLDEST_SOURCE:
-            return 'resting on an old image'
-        if command.relative and math.isnan(self.relative.lasts(now)):
-            return 'relative: not permitted'
+        late = refusal(age, self.limits.planner_timeout)
+        refused = first_reason(
+            (phase is not Phase.ACTIVE, f'while {phase.name}'),
+            (a is None or not math.isfinite(command.yaw), 'not finite'),
+            (late, late),
+            (not source <= OLDEST_SOURCE, 'resting on an old image'),
+            (command.relative and math.isnan(self.relative.lasts(now)),
+             'relative: not permitted'))
+        if refused or a is None:
+            return refused
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
             command._replace(acceleration=a), now - max(age, 0.0), now - source)
         return ''
 
-    def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
-        """Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused."""
-        v = finite_vector(velocity)
-        if v is None:
-            return 'not finite'
-        if refused := refusal(age, self.limits.odom_timeout):
-            return refused
-        known = self._sources[source]
-        known.velocity, known.velocity_time = v, now - max(age, 0.0)
-        return ''
+    def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float, *,
+                        yaw: float = math.nan, position: ArrayLike | None = None,
+                        std: float = 0.0) -> str:
+        """
+        Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused.
 
-    def update_position(self, source: str, position: ArrayLike, time: float,
+        :param yaw: of the same message, rad; NaN without one.
+        :param position: of the same message (3,), m, and its standard deviation ``std``, m.
+        """
+        v, known = finite_vector(velocity), self._sources[source]
+        refused = 'not finite' if v is None else refusal(age, self.limits.odom_timeout)
+        if v is not None and not refused:
+            known.velocity, known.velocity_time = v, now - max(age, 0.0)
+            known.take_yaw(yaw, known.velocity_time)
+            self.update_position(source, position, known.velocity_time, std)
+        return refused
+
+    def update_position(self, source: str, position: ArrayLike | None, time: float,
                         std: float = 0.0) -> None:
         """Take a position (3,), m, of 'odom' or 'autopilot' at a time, s; ``std`` in m."""
         known, p = self._sources[source], finite_vector(position)
@@ -214,10 +212,6 @@ class Gate:
         """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
         return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
-    def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity of the autopilot is invalid, or ''."""
-        self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
-
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
         self._sources[source].take_yaw(yaw, time)
@@ -237,19 +231,17 @@ class Gate:
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
         what = self._known(now).contradiction(self.limits)
-        if what != VELOCITIES_DISAGREE:
-            return what or self._displaced  # compared in each cycle
-        return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
+        more = (f' by {self.velocity_difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
+        # Displacements are compared in each cycle.
+        return f'{what}{more}' if what == VELOCITIES_DISAGREE else what or self._displaced
 
     def misaligned(self, now: float) -> str:
         """Return that the frames do not fit together, and what that would do, or ''."""
-        known = self._known(now)
-        difference = known.yaw_difference(self.limits)
-        if difference is None or not known.yaws_disagree(self.limits):
-            return ''
-        return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
-                'their frames are not aligned, commands would go the wrong way')
+        difference = self.yaw_difference(now) or 0.0
+        return '' if abs(difference) <= self.limits.yaw_disagreement else (
+            f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
+            'their frames are not aligned, commands would go the wrong way')
 
     @property
     def velocity_difference(self) -> float:
@@ -268,11 +260,10 @@ class Gate:
 
     def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
-        if now - self._disturbance.excess_since <= longer:
-            return ''
-        return (f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
-                f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
-                'battery, MPC_THR_HOVER or MOT_THST_HOVER')
+        return '' if now - self._disturbance.excess_since <= longer else (
+            f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
+            f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
+            'battery, MPC_THR_HOVER or MOT_THST_HOVER')
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
@@ -291,15 +282,15 @@ class Gate:
 
     def handover(self, now: float) -> str:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        if now - self._displaced_since > velocity_check.HANDOVER_TIME and math.isnan(
-                self.relative.lasts(now)):
-            return self._displaced
-        if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
-            return 'no height from the autopilot'
-        return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
+        displaced_for = now - self._displaced_since
+        return first_reason(
+            (displaced_for > velocity_check.HANDOVER_TIME and math.isnan(self.relative.lasts(now)),
+             self._displaced),
+            (now - self._heightless_since > HEIGHT_HANDOVER_TIME, 'no height from the autopilot'),
+        ) or envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, setpoint_rules.HANDOVER_TIME)
 
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, s, and the command it comes from, if any.
@@ -309,9 +300,11 @@ class Gate:
 
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
+        :param distrusted: why the velocity of the autopilot is invalid, or ''.
         """
         self.new_command = False
         self._notice_landing(now)
+        self._distrusted_since = min(self._distrusted_since, now) if distrusted else math.inf
         active = self.permission.phase is Phase.ACTIVE
         self.active_since = min(self.active_since, now) if active else math.inf
         status, withheld = self._status, withheld or self.withheld
@@ -346,7 +339,7 @@ class Gate:
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
         self._commanded = setpoint.kind == setpoint_rules.COMMAND
         if not sends and not withheld and known.blind(self.limits):
-            self.permit(Blinded(setpoint.reason))
+            self.permit(self.permission.blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:
             return setpoint, None
         self._held, self._last_yaw = None, setpoint.yaw
@@ -357,7 +350,7 @@ class Gate:
         down = self._airborne is False and (height is None or height < LANDED_HEIGHT)
         self._landed_since = min(self._landed_since, now) if down else math.inf
         if now - self._landed_since >= LANDED_TIME:
-            self.permit(Landed())
+            self.permit(self.permission.landed())
 
     def _source(self) -> str:
         if self.velocity_source != 'auto':
@@ -405,13 +398,11 @@ class Gate:
             height = min(max(place.height + HEIGHT_LEAD * place.climb_rate,
                              self.limits.height_min), self.limits.height_max)
         if self._held is not None and engaged:
-            if self._held.height is None:
-                self._held = self._held._replace(height=height)
+            held_height = height if self._held.height is None else self._held.height
+            self._held = self._held._replace(height=held_height)
             return
         # The autopilot's own yaw first: it is the one that will obey.
-        for source in (AUTOPILOT, ODOM):
-            yaw, time = self._sources[source].newest_yaw
-            if now - time <= self.limits.odom_timeout:
-                self._last_yaw = yaw
-                break
+        yaws = [self._sources[source].newest_yaw for source in (AUTOPILOT, ODOM)]
+        fresh = [yaw for yaw, time in yaws if now - time <= self.limits.odom_timeout]
+        self._last_yaw = fresh[0] if fresh else self._last_yaw
         self._held = Held(self._last_yaw, height)

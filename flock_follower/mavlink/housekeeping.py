@@ -35,10 +35,11 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.mavlink.dialects import Dialect
 from flock_follower.mavlink.estimator_health import AskAgain, RECENT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
-from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, wanted_rates
+from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 
 #: Time between two questions, s.
 PERIOD: Final[float] = 1.0
@@ -69,13 +70,10 @@ class TimeSync:
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
         self._asked: deque[int] = deque(maxlen=WINDOW)
-        self._unanswered_since: int | None = None
 
     def question(self, now: int) -> Any:
         """Return the message that asks for the autopilot's time."""
         self._asked.append(now)
-        if self._unanswered_since is None:
-            self._unanswered_since = now
         return mavlink.MAVLink_timesync_message(0, now)
 
     def take(self, message: Any, now: int) -> Any | None:
@@ -83,7 +81,6 @@ class TimeSync:
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
         if message.ts1 in self._asked:  # else another system has sent the request
-            self._unanswered_since = None
             self._samples.append(Sample(
                 message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))
         return None
@@ -113,18 +110,15 @@ class TimeSync:
 
     def unanswered(self, now: int) -> float:
         """Return for how long, s, no question has been answered; 0 where none waits."""
-        return 0.0 if self._unanswered_since is None else (now - self._unanswered_since) * 1e-9
+        # Copies: diagnostics read them from another thread.
+        answered = max((sample.time for sample in self._samples.copy()), default=0)
+        waiting = (now - time for time in self._asked.copy() if time > answered)
+        return max(waiting, default=0) * 1e-9
 
     @property
     def best(self) -> Sample | None:
         """Return the best of the recent answers, None without one."""
         return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
-
-    def forget(self) -> None:
-        """Drop all samples: the autopilot's clock has restarted."""
-        self._samples.clear()
-        self._asked.clear()
-        self._unanswered_since = None
 
 
 #: Telemetry is requested again after this, s, until the vehicle reports whether it flies.
@@ -133,6 +127,14 @@ STREAM_REQUEST_PERIOD: Final[float] = 2.0
 ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
+#: The rates of the other messages wanted from any autopilot, Hz.
+RATES: Final[Mapping[int, float]] = MappingProxyType({
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 20.0,
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 20.0,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5})
 #: Rates below this share of the requested one are reported, except a rate of zero: its cause is
 #: not the link.
 FEW: Final[float] = 0.5
@@ -155,6 +157,13 @@ WHY_PERIOD: Final[float] = 30.0
 WHY_WAIT: Final[float] = 3.0
 
 
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
+    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
+    return {dialect.mode_message: dialect.mode_rate, dialect.estimator_status: 5.0,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+            **dict.fromkeys(ESTIMATE.values(), estimate_rate), **RATES}
+
+
 class Housekeeping:
     """
     Sends HEARTBEAT, requests and origins, and takes the answers.
@@ -170,7 +179,7 @@ class Housekeeping:
                  estimate_rate: float, origin: tuple[float, float, float] | None,
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
-        self.parameters = ParameterCheck((), bytewise=False)
+        self.parameters = ParameterCheck(())
         self.alive_since = math.inf
         """When the first message of the autopilot was received, s."""
         self._link = link
@@ -183,18 +192,16 @@ class Housekeeping:
         self._reboots = 0
         self._was_alive = False
         self._request_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
-        self._absent: set[int] = set()
         self._watched_since = math.inf
 
-    def take(self, message: Any, now: float) -> None:
-        """Take a message of the autopilot, received at ``now``, s."""
-        kind = message.get_type()
-        if kind == 'PARAM_VALUE':
-            self.parameters.take(message)
-        elif kind == 'TIMESYNC':
-            answer = self.timesync.take(message, round(now * 1e9))
-            if answer is not None:
-                self._link.send(answer)
+    def take_timesync(self, message: Any, now: float) -> None:
+        """Take a TIMESYNC, and answer it if it is a question."""
+        if (answer := self.timesync.take(message, round(now * 1e9))) is not None:
+            self._link.send(answer)
+
+    def take_parameter(self, message: Any, now: float) -> None:
+        """Take a PARAM_VALUE."""
+        self.parameters.take(message)
 
     def step(self, now: float, alive: bool) -> None:
         """Send HEARTBEAT and due requests; ``alive``: whether the autopilot is connected."""
@@ -203,7 +210,7 @@ class Housekeeping:
         reboots = self._link.telemetry.reboots
         if reboots != self._reboots or (alive and not self._was_alive):
             self._reboots = reboots
-            self.timesync.forget()
+            self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._streams_requested, self.parameters = -math.inf, self._new_check()
             self._watched_since = now
             self.alive_since = min(self.alive_since, now)
@@ -235,17 +242,16 @@ class Housekeeping:
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
         if dialect is None:
-            return ParameterCheck((), bytewise=False)
-        needed = [rule.name for rule in rules(dialect, self.without_gps)]
+            return ParameterCheck(())
         switch = dialect.gps_switch if self.without_gps else ''
         return ParameterCheck(
             self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
-            needed=[*needed, *filter(None, (dialect.minimum_takeoff, switch))])
+            needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
+                    *filter(None, (dialect.minimum_takeoff, switch))])
 
     def rates(self, now: float) -> dict[str, tuple[float, float]]:
         """Return how often the estimate comes and was asked for, Hz, by the message's name."""
-        arrivals, wanted = self._link.telemetry.arrivals, self._estimate_rate
-        return {name: (arrivals.rate(message_id, now), wanted)
+        return {name: (self._link.telemetry.arrivals.rate(message_id, now), self._estimate_rate)
                 for name, message_id in ESTIMATE.items()}
 
     def too_slow(self, now: float) -> str:
@@ -262,22 +268,21 @@ class Housekeeping:
 
     def unreceived(self, now: float) -> str:
         """Return why the autopilot does not receive our messages, or ''."""
-        if self._link.signs or not self._link.autopilot_signs or (  # USB needs no signature
+        if self._link.signing or not self._link.autopilot_signs or (  # USB needs no signature
                 self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
             return ''
         return ('the autopilot signs its messages and answers none of ours: '
                 'set signing_key_file')
 
     def _request_streams(self, now: float) -> None:
-        telemetry = self._link.telemetry
-        dialect = telemetry.dialect
+        telemetry, dialect = self._link.telemetry, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
         # These must not come less often, Hz: what braking and the pilot's switch rest on.
-        watched = {message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status)} | {
-                dialect.mode_message: dialect.least_mode_rate}
+        watched = {**{message_id: wanted[message_id] for message_id in (
+            *ESTIMATE.values(), dialect.estimator_status)},
+            dialect.mode_message: dialect.least_mode_rate}
         unreported = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
@@ -287,22 +292,19 @@ class Housekeeping:
             for message_id in watched:
                 self._request_again[message_id].asked(now)
             return
-        arrivals, due = telemetry.arrivals, {}
-        for message_id, least in watched.items():
-            again = self._request_again[message_id]
-            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
-            if comes and message_id in self._absent:
-                again.asked(now)  # in vain before, since there was no estimate to send
-            (self._absent.discard if comes else self._absent.add)(message_id)
-            if again.due(arrivals.too_seldom(message_id, least, now), now):
-                due[message_id] = wanted[message_id]
-        self._link.request_streams(due)
+        arrivals = telemetry.arrivals
+        self._link.request_streams({
+            message_id: wanted[message_id] for message_id, least in watched.items()
+            if self._request_again[message_id].due(
+                arrivals.too_seldom(message_id, least, now), now,
+                bool(arrivals.recent(message_id, now, STREAM_REQUEST_PERIOD)))})
 
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin
         dialect = telemetry.dialect
         # An autopilot that has one, from GPS or from before, keeps it.
-        if dialect is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
+        if dialect is None or 'GPS_GLOBAL_ORIGIN' in telemetry.newest or (
+                now - self._origin_sent < ORIGIN_PERIOD):
             return
         if origin is None and self.without_gps and (
                 self.parameters.values.get(dialect.gps_switch) == 0):

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -40,7 +40,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
+from flock_follower.messages import FUTURE_TOLERANCE, OdometryState, POSITION_JUMP, SANE
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is counted, s.
 LONGEST_GAP: Final[float] = 0.1
@@ -58,27 +58,6 @@ _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
 
 
-class ForwardedOdometry(NamedTuple):
-    """One odometry in ENU and FLU."""
-
-    time: float
-    """Time of the stamp, s on our monotonic clock."""
-    position: Array
-    """(3,), m, ENU."""
-    quaternion: Array
-    """(x, y, z, w), FLU to ENU."""
-    velocity: Array
-    """(3,), m/s, ENU."""
-    angular_velocity: Array
-    """(3,), rad/s, FLU."""
-    pose_covariance: Array
-    """(6, 6), position and rotation, ENU."""
-    velocity_covariance: Array
-    """(3, 3), ENU."""
-    rate_covariance: Array
-    """(3, 3), FLU."""
-
-
 class OdometryForwarder:
     """
     Takes odometry as it comes, and hands it on as messages no faster than the line carries.
@@ -91,37 +70,37 @@ class OdometryForwarder:
         """Jumps, gaps and losses, by name."""
         self.reset_counter = 0
         self._spacing = 1.0 / rate
-        self._queue: deque[tuple[ForwardedOdometry, int]] = deque(maxlen=10)  # with reset counters
-        self._last: ForwardedOdometry | None = None
+        # States, the times of their stamps, and reset counters.
+        self._queue: deque[tuple[OdometryState, float, int]] = deque(maxlen=10)
+        self._last: tuple[OdometryState, float] | None = None
         self._due = -math.inf
         self._sent = -math.inf
 
-    def take(self, sample: ForwardedOdometry, now: float) -> str:
-        """Take a sample; return '' or why it is refused."""
-        if now - sample.time > OLDEST:
+    def take(self, state: OdometryState, time: float, now: float) -> str:
+        """Take odometry stamped at ``time``, s on our clock; return '' or why it is refused."""
+        if now - time > OLDEST:
             return 'too old to forward'
-        if sample.time - now > FUTURE_TOLERANCE:
+        if time - now > FUTURE_TOLERANCE:
             return 'from the future, not forwarded'
-        last, self._last = self._last, sample
-        if last is not None and jumped(last, sample):
+        last, self._last = self._last, (state, time)
+        if last is not None and jumped(*last, state, time):
             self.reset_counter = (self.reset_counter + 1) % 256
             self.counters['jumps'] += 1
-        if last is not None and sample.time < last.time:
-            self._due = sample.time
-        # The slack keeps a source of just the wanted rate from losing every second sample.
-        if sample.time >= self._due - 0.25 * self._spacing:
-            self._due = max(self._due + self._spacing, sample.time)
-            self._queue.append((sample, self.reset_counter))
+        if last is not None and time < last[1]:
+            self._due = time
+        # The slack keeps a source of just the wanted rate from losing every second state.
+        if time >= self._due - 0.25 * self._spacing:
+            self._due = max(self._due + self._spacing, time)
+            self._queue.append((state, time, self.reset_counter))
         return ''
 
     def messages(self, dialect: Dialect, now: float) -> list[Any]:
         """Return the messages to send now, oldest first; what waited for too long is lost."""
-        queued = list(self._queue)
+        fresh = [entry for entry in self._queue if now - entry[1] <= OLDEST]
+        if lost := len(self._queue) - len(fresh):
+            self.counters['too old to send'] += lost
         self._queue.clear()
-        fresh = [(sample, count) for sample, count in queued if now - sample.time <= OLDEST]
-        if len(fresh) < len(queued):
-            self.counters['too old to send'] += len(queued) - len(fresh)
-        return [encode_odometry(sample, dialect, count) for sample, count in fresh]
+        return [encode_odometry(state, time, dialect, count) for state, time, count in fresh]
 
     def sent(self, success: bool, now: float) -> None:
         """Note that a message went out, or that the link had no room for it."""
@@ -138,43 +117,43 @@ class OdometryForwarder:
         return now - self._sent
 
 
-def jumped(before: ForwardedOdometry, after: ForwardedOdometry) -> bool:
-    """Return whether the pose is not where the motion of the sample before leads, or time fell."""
-    dt = after.time - before.time
-    if dt < 0.0:
-        return True
+def jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
+    """Return whether a pose is not where the motion at time ``then``, s, leads, or time fell."""
+    dt = now - then
     mean_velocity = 0.5 * (before.velocity + after.velocity)
     moved = after.position - before.position - mean_velocity * dt
     turned = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
     turned = turned - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
-    return bool(np.linalg.norm(moved) > POSITION_JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
+    return bool(dt < 0.0 or np.linalg.norm(moved) > POSITION_JUMP
+                or np.linalg.norm(turned) > ATTITUDE_JUMP)
 
 
-def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: int) -> Any:
+def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_counter: int
+                    ) -> Any:
     """
-    Return the ODOMETRY message of a sample in the frames of the autopilot.
+    Return the ODOMETRY message of a state, at a time, s, in the frames of the autopilot.
 
     Covariances are the row-major upper triangles of (6, 6). One that is missing (zeros), not
     finite, absurdly large or without positive variances is replaced by a diagonal of the
     deviations above.
     """
-    R_enu_flu = quaternion_to_matrix(sample.quaternion)
-    x, y, z, w = quaternion_enu_flu_to_ned_frd(sample.quaternion).tolist()
+    R_enu_flu = quaternion_to_matrix(state.quaternion)
+    x, y, z, w = quaternion_enu_flu_to_ned_frd(state.quaternion).tolist()
     # The covariance of R x is R C R^T.
     pose_covariance = _transformed(
-        _valid(sample.pose_covariance, [POSITION_STD] * 3 + [ATTITUDE_STD] * 3),
+        _valid(state.pose_covariance, [POSITION_STD] * 3 + [ATTITUDE_STD] * 3),
         _R_NED_ENU)
     twist_covariance: Array = np.zeros((6, 6))
     twist_covariance[:3, :3] = (
-        R_enu_flu.T @ _valid(sample.velocity_covariance, [VELOCITY_STD] * 3) @ R_enu_flu)
-    twist_covariance[3:, 3:] = _valid(sample.rate_covariance, [RATE_STD] * 3)
+        R_enu_flu.T @ _valid(state.velocity_covariance, [VELOCITY_STD] * 3) @ R_enu_flu)
+    twist_covariance[3:, 3:] = _valid(state.twist_covariance[3:, 3:], [RATE_STD] * 3)
     twist_covariance = _transformed(twist_covariance, _R_FRD_FLU)
     return mavlink.MAVLink_odometry_message(
-        max(0, round(sample.time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,
-        *enu_to_ned(sample.position).tolist(), [w, x, y, z],
-        *flu_to_frd(R_enu_flu.T @ sample.velocity).tolist(),
-        *flu_to_frd(sample.angular_velocity).tolist(),
+        max(0, round(time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,
+        *enu_to_ned(state.position).tolist(), [w, x, y, z],
+        *flu_to_frd(R_enu_flu.T @ state.velocity).tolist(),
+        *flu_to_frd(state.angular_velocity).tolist(),
         pose_covariance[_UPPER].tolist(), twist_covariance[_UPPER].tolist(),
         reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO)
 

@@ -125,54 +125,45 @@ class ParameterCheck:
     :param needed: names to read that are not compared with anything.
     """
 
-    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool,
+    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool = False,
                  needed: Sequence[str] = ()) -> None:
         self.values: dict[str, float] = {}
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
-        self._waiting = list(dict.fromkeys([*needed, *self._recommended]))
-        self._names = frozenset(self._waiting)
-        self._asked: dict[str, tuple[float, int]] = {}
-        self._unanswered: list[str] = []
+        # When each was asked for last, s, and how often.
+        self._asked = dict.fromkeys((*needed, *self._recommended), (-math.inf, 0))
+        self._finished = False
 
     def step(self, now: float) -> list[str]:
         """Return the names to ask for at ``now``, s."""
-        ask = []
-        for name, (time, attempts) in list(self._asked.items()):
-            if now - time < RETRY_PERIOD:
-                continue
-            if attempts >= ATTEMPTS:
-                del self._asked[name]
-                self._unanswered.append(name)
-            else:
-                self._asked[name] = now, attempts + 1
-                ask.append(name)
-        while self._waiting and len(self._asked) < AT_ONCE:
-            name = self._waiting.pop(0)
-            self._asked[name] = now, 1
-            ask.append(name)
+        unanswered = {name: asked for name, asked in self._asked.items()
+                      if name not in self.values}
+        waiting = [name for name, (time, _) in unanswered.items() if now - time < RETRY_PERIOD]
+        due = [name for name, (_, count) in unanswered.items()
+               if name not in waiting and count < ATTEMPTS]
+        ask = due[:max(AT_ONCE - len(waiting), 0)]
+        self._asked.update({name: (now, unanswered[name][1] + 1) for name in ask})
+        self._finished = not waiting and not due
         return ask
 
     def again(self, name: str) -> None:
         """Ask once more for one that was given up."""
-        if name in self._unanswered:
-            self._unanswered.remove(name)
-            self._waiting.append(name)
+        time, count = self._asked.get(name, (0.0, 0))
+        if count >= ATTEMPTS:
+            self._asked[name] = time, 0
 
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""
         name = message.param_id
         name = (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
-        if name in self._names:
+        if name in self._asked:
             self.values[name] = parameter_value(message, bytewise=self._bytewise)
-            self._asked.pop(name, None)
-            self._waiting = [other for other in self._waiting if other != name]
-            self._unanswered = [other for other in self._unanswered if other != name]
 
     def result(self) -> CheckResult | None:
         """Return the differences, None until every parameter was answered or given up."""
-        values, unanswered = self.values.copy(), self._unanswered.copy()
-        if self._waiting or self._asked or not self._names:
+        values = self.values.copy()
+        unanswered = [name for name in self._asked if name not in values]
+        if not self._asked or (unanswered and not self._finished):
             return None
         lines = [f'{name} = {values[name]:g}, recommended {entry.value:g}: {entry.why}'
                  for name, entry in self._recommended.items()
@@ -209,11 +200,6 @@ _TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if 
 _NOT_FUSED: Final[str] = ': it does not fuse the odometry that is forwarded to it; '
 
 
-def _source(name: str) -> Rule:
-    return Rule(name, lambda value: value != _EXTERNAL_NAVIGATION,
-                f'{_NOT_FUSED}set it to {_EXTERNAL_NAVIGATION} (ExternalNav)', forwarding=True)
-
-
 #: By the name of the dialect; the values are those of PX4 1.14 to 1.16, ArduCopter 4.6 and 4.7.
 RULES: Final[Mapping[str, tuple[Rule, ...]]] = MappingProxyType({
     'px4': (
@@ -229,7 +215,9 @@ RULES: Final[Mapping[str, tuple[Rule, ...]]] = MappingProxyType({
         Rule('GUID_TIMEOUT', lambda value: value > LONGEST, _TOO_LONG),
         Rule('VISO_TYPE', lambda value: value == 0, f'{_NOT_FUSED}set it to 1 (MAVLink)',
              forwarding=True),
-        _source('EK3_SRC1_POSXY'), _source('EK3_SRC1_VELXY'))})
+        *(Rule(f'EK3_SRC1_{source}', lambda value: value != _EXTERNAL_NAVIGATION,
+               f'{_NOT_FUSED}set it to {_EXTERNAL_NAVIGATION} (ExternalNav)', forwarding=True)
+          for source in ('POSXY', 'VELXY')))})
 
 
 def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:

@@ -22,7 +22,7 @@ the permission to send setpoints follows the request and its outcome.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -37,30 +37,23 @@ from flock_follower.mavlink.commands import (
     STREAM_TIMEOUT,
     Vehicle,
 )
-from flock_follower.mavlink.dialects import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.estimator_health import explained
 from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.permission import (
-    EndRequested,
-    OffboardFailed,
-    OffboardRequested,
-    Phase,
-)
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
+from flock_follower.ranges import first_reason
 
+#: What speaks against offboard, by whether the vehicle reports to be in the air.
+IN_AIR: Final[dict[bool | None, str]] = {
+    True: '', False: 'on the ground: arm, call takeoff, and request offboard in the air',
+    None: 'the autopilot does not report whether it flies (EXTENDED_SYS_STATE), which counts as '
+          'on the ground'}
 #: PX4 accepts a take-off this much below its minimum height, m.
 TOLERANCE: Final[float] = 0.1
-
-
-class Obstacle(NamedTuple):
-    """Why offboard may not be requested."""
-
-    reason: str
-    waits: bool = False
-    """Whether the next seconds may clear it: something has not been received yet."""
 
 
 class Requests:
@@ -95,10 +88,9 @@ class Requests:
         self._end.begin()
         if not value:
             return self.begin(HOLD, now)
-        obstacle = self.offboard_obstacle(now)
-        if obstacle is None or obstacle.waits or self._gate.permission.phase is Phase.ACTIVE:
-            return self.begin(OFFBOARD, now)
-        return self.begin(OFFBOARD, now, obstacle.reason)
+        reason, waits = self.offboard_obstacle(now)
+        flies = self._gate.permission.phase is Phase.ACTIVE
+        return self.begin(OFFBOARD, now, '' if waits or flies else reason)
 
     def land(self, now: float) -> Request:
         """Land here."""
@@ -151,81 +143,69 @@ class Requests:
                     self._housekeeping.parameters.values))
         if request.goal is OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
-            self._gate.permit(OffboardFailed(request.outcome.message))
+            self._gate.permit(self._gate.permission.failed(request.outcome.message))
 
     def _status(self, now: float) -> VehicleStatus | None:
-        telemetry = self._link.telemetry
-        alive = telemetry.alive(now, self._gate.limits.link_timeout)
-        return telemetry.status if alive else None
+        return self._link.telemetry.current(now, self._gate.limits.link_timeout)
 
-    def offboard_obstacle(self, now: float, in_air: bool = True) -> Obstacle | None:
+    def offboard_obstacle(self, now: float, in_air: bool = True) -> tuple[str, bool]:
         """
-        Return why the vehicle may not fly our setpoints now, as far as it is received.
+        Return why the vehicle may not fly our setpoints now, as far as it is received, or ''.
+
+        And whether the next seconds may clear it, because something has not been received yet.
 
         :param in_air: whether it has to be in the air, and in the envelope, by now.
         """
-        return next(filter(lambda obstacle: obstacle.reason,
-                           self._offboard_obstacles(now, in_air)), None)
+        return next(filter(lambda found: found[0], self._offboard_checks(now, in_air)),
+                    ('', False))
 
-    def _offboard_obstacles(self, now: float, in_air: bool) -> Iterator[Obstacle]:
-        """Yield each check of offboard, the first one first; its reason is '' if it passes."""
+    def _offboard_checks(self, now: float, in_air: bool) -> Iterator[tuple[str, bool]]:
+        """Yield the result of each check of offboard, the first one first; '' if it passes."""
         telemetry, gate = self._link.telemetry, self._gate
         dialect, parameters = telemetry.dialect, self._housekeeping.parameters
         forwarding = self._housekeeping.without_gps
         # The autopilot may not have had the time to send everything.
         waits = now - self._housekeeping.alive_since < STREAM_TIMEOUT
-        yield Obstacle(gate.permission.taken_over(now))
-        yield Obstacle(gate.misaligned(now) or gate.contradiction(now))
+        yield gate.permission.taken_over(now), False
+        yield gate.misaligned(now) or gate.contradiction(now), False
         if self._require_failsafe and dialect is not None:
-            yield Obstacle(parameter_check.obstacle(dialect, parameters, forwarding))
+            yield parameter_check.obstacle(dialect, parameters, forwarding), False
         if dialect is None or self._status(now) is None:
             return
         if gate.speed(now) is None:
-            yield Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED', waits)
+            yield 'no velocity known: neither odom nor LOCAL_POSITION_NED', waits
+        flying, height = telemetry.flying(now), gate.heights.height(now)
         if in_air:
-            flying, height = telemetry.flying(now), gate.heights.height(now)
-            if flying is None:
-                yield Obstacle('the autopilot does not report whether it flies '
-                               '(EXTENDED_SYS_STATE), which counts as on the ground', waits)
-            elif not flying:
-                yield Obstacle('on the ground: arm, call takeoff, and request offboard in the air')
-            yield Obstacle(envelope.outside(gate.limits, height), height is None and waits)
-        yield Obstacle(self._end.battery_low(now))
+            yield IN_AIR[flying], flying is None and waits
+            yield envelope.outside(gate.limits, height), height is None and waits
+        yield self._end.battery_low(now), False
         if self._require_failsafe:
-            yield Obstacle(parameter_check.unread(dialect, parameters, forwarding), waits=True)
+            yield parameter_check.unread(dialect, parameters, forwarding), True
 
     def _takeoff_obstacle(self, height: float, now: float) -> str:
         """Return why the vehicle may not climb by ``height``, m, or ''."""
         telemetry, status, limits = self._link.telemetry, self._status(now), self._gate.limits
-        if status is None or telemetry.dialect is None:
+        dialect, values = telemetry.dialect, self._housekeeping.parameters.values
+        if status is None or dialect is None:
             return NOT_RECEIVED
-        if not status.armed:
-            return 'disarmed: arm first'
-        # A second climb would begin at the height that the first has reached by now.
-        if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
-            return 'already in the air'
-        if telemetry.altitude(now) is None:
-            return 'no LOCAL_POSITION_NED: the height reached would be unknown'
-        if reason := self._minimum_takeoff(telemetry.dialect, height):
-            return reason
-        reached = height + (self._gate.heights.height(now) or 0.0)
-        beyond = ('height_min' if reached < limits.height_min else
-                  'height_max' if reached > limits.height_max else '')
-        return beyond and (f'it would end {reached:.1f} m above the place of arming: beyond '
-                           f'{beyond} = {getattr(limits, beyond):g} m')
-
-    def _minimum_takeoff(self, dialect: Dialect, height: float) -> str:
-        """Return that the autopilot would climb higher than it is asked to, or ''."""
-        name, parameters = dialect.minimum_takeoff, self._housekeeping.parameters
-        if not name:
-            return ''
-        least = parameters.values.get(name)
-        if least is None:
-            parameters.again(name)
-            return f'{name} is not known yet: {dialect.title} would climb that high at least'
-        return '' if height >= least - TOLERANCE else (
-            f'{dialect.title} would climb to {name} = {least:g} m, '
-            f'above takeoff_height = {height:g} m')
+        name, reached = dialect.minimum_takeoff, height + (self._gate.heights.height(now) or 0.0)
+        if name not in values:
+            self._housekeeping.parameters.again(name)
+        climbs, least = f'{dialect.title} would climb', values.get(name, 0.0)
+        above = f'it would end {reached:.1f} m above the place of arming: beyond '
+        return first_reason(
+            (not status.armed, 'disarmed: arm first'),
+            # A second climb would begin at the height that the first has reached by now.
+            (telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF,
+             'already in the air'),
+            (telemetry.altitude(now) is None,
+             'no LOCAL_POSITION_NED: the height reached would be unknown'),
+            (name and name not in values,
+             f'{name} is not known yet: {climbs} that high at least'),
+            (not height >= least - TOLERANCE,
+             f'{climbs} to {name} = {least:g} m, above takeoff_height = {height:g} m'),
+            (reached < limits.height_min, f'{above}height_min = {limits.height_min:g} m'),
+            (reached > limits.height_max, f'{above}height_max = {limits.height_max:g} m'))
 
     def begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
         """
@@ -234,24 +214,24 @@ class Requests:
         :param obstacle: why it is refused at once, or ''.
         :param why: why the bridge itself requests it; '' for a request by a person.
         """
-        if self.stopping and not goal.ends_flight:
-            obstacle = 'the bridge is stopping'
-        permit, pending, superseded = self._gate.permit, self.pending, None
-        if goal.ends_flight and self._link.telemetry.dialect is None:
-            obstacle = NOT_RECEIVED  # nor is it known how to ask
+        gate, pending, superseded = self._gate, self.pending, None
+        obstacle = first_reason(
+            # Nor is it known how to ask.
+            (goal.ends_flight and self._link.telemetry.dialect is None, NOT_RECEIVED),
+            (self.stopping and not goal.ends_flight, 'the bridge is stopping'),
+            (obstacle, obstacle),
+            (pending is not None and not goal.ends_flight,
+             f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
             # From here on only braking goes out, even if the autopilot refuses.
-            permit(EndRequested(why or f'{goal.name} requested'))
-        elif pending is not None:
-            obstacle = obstacle or f'still waiting for {pending.goal.name}'
-        if pending is not None and goal.ends_flight:
-            pending.refuse(f'superseded by {goal.name}')
-            superseded = pending.goal
+            gate.permit(gate.permission.ended(why or f'{goal.name} requested'))
+            if pending is not None:
+                superseded = pending.refuse(f'superseded by {goal.name}').goal
         if obstacle:
             return Request(goal, now).refuse(obstacle)
         self.newest = request = Request(goal, now, superseded, own=bool(why))
         if goal is OFFBOARD:
-            permit(OffboardRequested(now))
+            gate.permit(gate.permission.requested(now))
         return request
 
     def _ended_here(self, request: Request, now: float) -> bool:
@@ -263,14 +243,12 @@ class Requests:
             request.refuse(permission.reason)  # a reboot or the pilot was quicker
             return True
         # Requested before the autopilot was received: only now there is something to compare.
-        obstacle = None if request.sent else self.offboard_obstacle(now)
-        if obstacle is None:
-            return False
-        if not obstacle.waits or now - request.begun >= STREAM_TIMEOUT:
-            request.refuse(obstacle.reason)
+        reason, waits = ('', False) if request.sent else self.offboard_obstacle(now)
+        if reason and not (waits and now - request.begun < STREAM_TIMEOUT):
+            request.refuse(reason)
             if permission.since >= request.begun:  # else it was flying before
-                self._gate.permit(OffboardFailed(obstacle.reason, asked=False))
-        return True
+                self._gate.permit(permission.failed(reason, asked=False))
+        return bool(reason)
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:
         telemetry, status, vehicle = self._link.telemetry, self._status(now), None

@@ -47,8 +47,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
-from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
-from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
+from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
@@ -60,6 +60,7 @@ from flock_follower.planner.limits import (
     SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
+from flock_follower.ranges import first_reason
 
 #: Acceleration only, 0xC3F: for as long as no yaw is known.
 ACCELERATION: Final[int] = (
@@ -214,14 +215,10 @@ class Held(NamedTuple):
     """m."""
 
 
-NOT_HELD: Final[Held] = Held()
-
-
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, armed: bool, airborne: bool = True,
-           withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
-           held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
-           wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
+           command_age: float, link_age: float, armed: bool, airborne: bool, withheld: str,
+           place: Location, unplaced: str, held: Held, relative: Relative, wind: ArrayLike,
+           offset: float) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
@@ -251,12 +248,12 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced,
-                              _refusal(limits, command, relative, place, airborne))
-    if admitted is not None:
-        command, velocity = admitted
-        if velocity is None:
-            return _relative(full, command, against, place, offset)
+    reason = _refusal(limits, known, command, command_age, link_age, unplaced, relative, place,
+                      airborne)
+    if not reason and command is not None and command.relative:
+        return _relative(full, command, against, place, offset)
+    velocity = known.source_first[0].fresh_velocity(limits)
+    if not reason and command is not None and velocity is not None:
         bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
         axis = _direction(command.separation_axis)
         safe = _limited(limits if axis is None else full,
@@ -279,52 +276,30 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
 
 
-def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-           link_age: float, unplaced: str, without_odometry: str | None,
-           ) -> tuple[tuple[Command, Velocity | None] | None, str]:
-    """
-    Return the command and the velocity to judge it with, or None and why it may not pass.
-
-    :param without_odometry: of a command that rests on the marker alone, which has no velocity,
-        why it may not pass, or ''; of others None.
-    """
-    if not link_age <= limits.link_timeout:  # written so that NaN fails
-        return None, 'link lost'
-    velocity = None
-    if without_odometry is None:
-        judge, _ = known.source_first
-        velocity = judge.fresh_velocity(limits)
-        if velocity is None:
-            never = math.isinf(judge.velocity_age)
-            source = f'velocity from {known.source}'
-            return None, f'no {source}' if never else f'{source} stale'
-        if disagreement := known.contradiction(limits):
-            return None, disagreement
-    elif without_odometry:
-        return None, without_odometry
-    if unplaced:
-        return None, unplaced
-    if command is None:
-        return None, 'no command'
-    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
-        return None, 'command not finite'
-    if not fresh(command_age, limits.planner_timeout):
-        return None, 'command stale'
-    return (command, velocity), ''
-
-
-def _refusal(limits: GateLimits, command: Command | None, relative: Relative, place: Location,
-             airborne: bool) -> str | None:
-    """Return why a command that rests on the marker alone may not pass, or ''; of others None."""
-    if command is None or not command.relative:
-        return None
-    if not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout):
-        return 'relative command not permitted'
-    if not fresh(relative.marker_age, OLDEST_MARKER):
-        return 'marker lost'
-    if place.height is None or not math.isfinite(place.height + place.climb_rate):
-        return 'no height'
-    return '' if airborne else 'on the ground'
+def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
+             link_age: float, unplaced: str, relative: Relative, place: Location,
+             airborne: bool) -> str:
+    """Return why a command may not pass, or ''."""
+    judge, _ = known.source_first
+    source, contradiction = f'velocity from {known.source}', known.contradiction(limits)
+    by_odometry = (
+        (judge.fresh_velocity(limits) is None,
+         f'no {source}' if math.isinf(judge.velocity_age) else f'{source} stale'),
+        (contradiction, contradiction))
+    by_marker = (
+        (not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout),
+         'relative command not permitted'),
+        (not fresh(relative.marker_age, OLDEST_MARKER), 'marker lost'),
+        (place.height is None or not math.isfinite(place.height + place.climb_rate), 'no height'),
+        (not airborne, 'on the ground'))
+    return first_reason(
+        (not link_age <= limits.link_timeout, 'link lost'),  # written so that NaN fails
+        *(by_marker if command is not None and command.relative else by_odometry),
+        (unplaced, unplaced),
+        (command is None, 'no command'),
+        (command is not None and (finite_vector(command.acceleration) is None
+                                  or not math.isfinite(command.yaw)), 'command not finite'),
+        (not fresh(command_age, limits.planner_timeout), 'command stale'))
 
 
 def _relative(full: GateLimits, command: Command, against: Array, place: Location,
@@ -379,7 +354,7 @@ def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Veloc
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
     bounds = [] if inward is None else [inward]
-    kept = all(product(normal, flat) >= bound for normal, bound in bounds)
+    kept = inward is None or product(inward[0], flat) >= inward[1]
     if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST_OWN or not (
             math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
         return safe

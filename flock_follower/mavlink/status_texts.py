@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-import math
 import struct
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
@@ -167,50 +166,39 @@ class ArmingChecks:
     """The newest report of the arming checks of PX4."""
 
     def __init__(self) -> None:
-        self.time = -math.inf
-        """Time of completion, s."""
         self._failures: tuple[Failure, ...] = ()
         self._coming: list[Failure] | None = None
 
-    def take(self, message: Any, now: float) -> str:
-        """Take an EVENT received at ``now``, s; return its text if it has one by itself, or ''."""
+    def take(self, message: Any) -> str:
+        """Take an EVENT; return its text if it has one by itself, or ''."""
         name = _BY_NUMBER.get(message.number % 2**24, '')
         level, arguments = message.log_levels & 0xF, bytes(message.arguments)
         if name == _BEGIN:
             self._coming = []
         elif name == _END:
             if self._coming is not None:
-                self._failures, self.time = tuple(self._coming), now
+                self._failures = tuple(self._coming)
             self._coming = None
         elif name in _ENTERS:
-            action = arguments[4]
-            return 'failsafe: ' + (_FAILSAFES[action] if action < len(_FAILSAFES)
-                                   else f'action {action}')
+            action = dict(enumerate(_FAILSAFES)).get(arguments[4], f'action {arguments[4]}')
+            return f'failsafe: {action}'
         elif name.startswith('commander_'):
             return _MEANINGS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
             modes, part = struct.unpack_from('<IB', arguments)
-            self._coming.append(Failure(_meaning(name, message.number, part), modes, level))
+            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ') or (
+                f'{_PARTS.get(part, f"part {part}")}: event {message.number % 2**24}')
+            self._coming.append(Failure(text, modes, level))
         return ''
 
     def against(self, mode: str) -> list[str]:
         """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
-        if mode not in _MODES:
-            return []
         return [failure.text for failure in self._failures
-                if failure.modes >> _MODES[mode] & 1
+                if mode in _MODES and failure.modes >> _MODES[mode] & 1
                 # For every mode come remarks, too, that keep it from nothing,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which keeps it from the pilot's.
                      or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
-
-
-def _meaning(name: str, number: int, part: int) -> str:
-    if name in _MEANINGS:
-        return _MEANINGS[name]
-    if name:
-        return name.removeprefix('check_').replace('_', ' ')
-    return f'{_PARTS.get(part, f"part {part}")}: event {number % 2**24}'
 
 
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
@@ -268,23 +256,20 @@ class StatusTexts:
         if not number:
             self._finish(severity, text, now)
             return
-        known = self._unfinished.get(number)
-        if known is not None and message.chunk_seq < known.next_chunk:
+        if number in self._unfinished and message.chunk_seq < self._unfinished[number].next_chunk:
             self._give_up(number, now)  # its end was lost, another text begins
-            known = None
-        known = known or _Unfinished(now, severity, '', 0)
-        lost = GAP if message.chunk_seq != known.next_chunk else ''
-        known = known._replace(time=now, text=f'{known.text}{lost}{text}',
-                               next_chunk=message.chunk_seq + 1)
-        self._unfinished[number] = known
-        if len(text) < CHUNK or known.next_chunk >= MOST_CHUNKS:
-            self._finish(known.severity, self._unfinished.pop(number).text, now)
-        elif len(self._unfinished) > MOST_UNFINISHED:
+        _, severity, before, due = self._unfinished.pop(number, (now, severity, '', 0))
+        whole = before + (GAP if message.chunk_seq != due else '') + text
+        if len(text) < CHUNK or message.chunk_seq + 1 >= MOST_CHUNKS:
+            self._finish(severity, whole, now)
+            return
+        self._unfinished[number] = _Unfinished(now, severity, whole, message.chunk_seq + 1)
+        if len(self._unfinished) > MOST_UNFINISHED:
             self._give_up(next(iter(self._unfinished)), now)
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its text is used only if no STATUSTEXTs come."""
-        text = self.checks.take(message, now)
+        text = self.checks.take(message)
         if text and not self._has_texts:
             self._finish(message.log_levels & 0xF, text, now)
 

@@ -35,7 +35,6 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
-    yaw_from_quaternion,
 )
 from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
 from flock_follower.mavlink.envelope import pressure_altitude
@@ -46,6 +45,7 @@ from flock_follower.mavlink.estimator_health import (
     gps_fix,
     GpsFix,
 )
+from flock_follower.messages import OdometryState
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -55,10 +55,11 @@ ESTIMATE_TIMEOUT: Final[float] = 1.0
 LANDED_OLDEST: Final[float] = 3.0
 #: An altitude above sea level older than this, s, is not used.
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
-#: How often barometer and rangefinder are asked for, Hz.
-HEIGHT_RATE: Final[float] = 20.0
 #: The autopilot has rebooted if stamps of two consecutive messages go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
+_FLYING: Final[dict[int, bool]] = {
+    mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
+    mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
 _UNKNOWN_CELL = 65535  # mV
 _UNKNOWN_TEMPERATURE = 32767  # 0.01 degC
 # What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
@@ -94,11 +95,6 @@ class Attitude(NamedTuple):
     angular_velocity: Array
     time_boot_ms: int
 
-    @property
-    def yaw(self) -> float:
-        """Return the yaw, rad, anticlockwise from east."""
-        return yaw_from_quaternion(self.quaternion)
-
 
 class Battery(NamedTuple):
     """BATTERY_STATUS or SYS_STATUS; NaN if unknown."""
@@ -126,15 +122,9 @@ class Telemetry:
     def __init__(self, autopilot: str = AUTO) -> None:
         self.dialect: Dialect | None = None
         self.status: VehicleStatus | None = None
-        self.landed: int | None = None
-        """MAV_LANDED_STATE, None if the autopilot does not report it."""
-        self.landed_time = -math.inf
-        self._sea_level = -math.inf, math.nan  # time, s, and altitude, m
+        self.newest: dict[str, tuple[float, Any]] = {}
+        """The newest message of each kind, and when it came, s."""
         self.sensor_altitude: SensorAltitude | None = None
-        self.home_altitude: float | None = None
-        """HOME_POSITION: height of the place of arming above mean sea level, m."""
-        self.has_origin = False
-        """Whether its estimator knows where on Earth the origin of the local frame is."""
         self.reboots = 0
         self.heartbeat_time = -math.inf
         self.mode_time = -math.inf
@@ -149,14 +139,13 @@ class Telemetry:
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
         self._fallen: set[str] = set()
-        self._battery_status_seen = False
-        self._streaming = False
 
     def update(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
         self.message_time = now
         self.arrivals.take(message.get_msgId(), now)
         kind = message.get_type()
+        self.newest[kind] = now, message
         self._notice_reboot(message)
         if kind == 'HEARTBEAT':
             self.dialect = dialect_of(message, self._autopilot) or self.dialect
@@ -168,12 +157,6 @@ class Telemetry:
             self._local_position(message, now)
         elif kind == 'ATTITUDE_QUATERNION':
             self._attitude(message, now)
-        elif kind == 'EXTENDED_SYS_STATE':
-            self.landed, self.landed_time = message.landed_state, now
-        elif kind == 'GLOBAL_POSITION_INT':
-            self._sea_level = now, message.alt * 1e-3
-        elif kind == 'HOME_POSITION':
-            self.home_altitude = message.altitude * 1e-3
         elif kind == 'SCALED_PRESSURE':
             self.sensor_altitude = SensorAltitude(
                 now, pressure_altitude(message.press_abs), kind)
@@ -183,13 +166,15 @@ class Telemetry:
             self.estimator = estimator_status(message, now)
         elif kind == 'GPS_RAW_INT':
             self.gps = gps_fix(message, self.gps, now)
-        elif kind == 'GPS_GLOBAL_ORIGIN':
-            self.has_origin = True
-        elif kind == 'BATTERY_STATUS' and message.id == 0:
-            self._battery_status_seen = True
+        # SYS_STATUS has no cells: it counts only until a BATTERY_STATUS has come.
+        elif (kind == 'BATTERY_STATUS' and message.id == 0) or (
+                kind == 'SYS_STATUS' and 'BATTERY_STATUS' not in self.newest):
             self.battery = _battery(message, now)
-        elif kind == 'SYS_STATUS' and not self._battery_status_seen:
-            self.battery = _battery(message, now)
+
+    def recent(self, kind: str, oldest: float, now: float) -> Any | None:
+        """Return the newest message of a kind, None if it is older than ``oldest``, s."""
+        time, message = self.newest.get(kind, (-math.inf, None))
+        return message if now - time <= oldest else None
 
     def shown(self, message: Any) -> VehicleStatus | None:
         """
@@ -220,36 +205,42 @@ class Telemetry:
         1 Hz, so it is missing from one second after the last on.
         """
         overdue = now - self.heartbeat_time - HEARTBEAT_PERIOD
-        quiet = now - self.message_time if self._streaming else 0.0
-        return max(0.0, overdue, quiet)
+        streams = {'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION'} & self.newest.keys()
+        return max(0.0, overdue, now - self.message_time if streams else 0.0)
 
     def alive(self, now: float, link_timeout: float) -> bool:
         """Return whether the autopilot has not been missing for longer than ``link_timeout``."""
         return self.silence(now) <= link_timeout
 
+    def current(self, now: float, link_timeout: float) -> VehicleStatus | None:
+        """Return the vehicle's status, None while the link is not alive."""
+        return self.status if self.alive(now, link_timeout) else None
+
     def flying(self, now: float) -> bool | None:
         """Return whether the vehicle reports that it is in the air; None if it reports neither."""
-        if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
-                now - self.landed_time > LANDED_OLDEST):
-            return None
-        return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
+        message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
+        return None if message is None else _FLYING.get(message.landed_state)
+
+    @property
+    def landed(self) -> int | None:
+        """Return the newest MAV_LANDED_STATE, None if the autopilot does not report it."""
+        message = self.recent('EXTENDED_SYS_STATE', math.inf, 0.0)
+        return None if message is None else message.landed_state
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None if not fresh."""
-        known = self.local_position
-        return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
-            known.position[2])
+        message = self.recent('LOCAL_POSITION_NED', ESTIMATE_TIMEOUT, now)
+        return None if message is None or not math.isfinite(message.z) else -float(message.z)
 
     def sea_level_altitude(self, now: float) -> float | None:
         """Return the height above mean sea level, m; None if not fresh (no GPS)."""
-        time, altitude = self._sea_level
-        return altitude if now - time <= SEA_LEVEL_TIMEOUT else None
+        message = self.recent('GLOBAL_POSITION_INT', SEA_LEVEL_TIMEOUT, now)
+        return None if message is None else message.alt * 1e-3
 
     def height_above_home(self, now: float) -> float | None:
         """Return the height above the place of arming by the estimate, m; None if not known."""
-        above_sea = self.sea_level_altitude(now)
-        known = self.home_altitude is not None and above_sea is not None
-        return above_sea - self.home_altitude if known else None  # type: ignore[operator]
+        above_sea, home = self.sea_level_altitude(now), self.recent('HOME_POSITION', math.inf, now)
+        return None if home is None or above_sea is None else above_sea - home.altitude * 1e-3
 
     def _distance(self, message: Any, now: float) -> None:
         """Take a rangefinder that looks down, as long as no barometer is reported."""
@@ -275,7 +266,7 @@ class Telemetry:
         self._fallen.discard(kind)
         if fallen:
             self.reboots += 1
-            self.has_origin = False
+            self.newest.pop('GPS_GLOBAL_ORIGIN', None)
             self._boot_times_ms.clear()  # the other kinds fall back for the same reason
             self._fallen.clear()
         self._boot_times_ms[kind] = stamp
@@ -283,7 +274,6 @@ class Telemetry:
     def _local_position(self, message: Any, now: float) -> None:
         position = ned_to_enu([message.x, message.y, message.z])
         velocity = ned_to_enu([message.vx, message.vy, message.vz])
-        self._streaming = True
         if np.all(np.isfinite(position)) and np.all(np.isfinite(velocity)):
             self.local_position = LocalPosition(now, position, velocity, message.time_boot_ms)
 
@@ -291,7 +281,6 @@ class Telemetry:
         # MAVLink's quaternions are (w, x, y, z).
         wxyz = [message.q1, message.q2, message.q3, message.q4]
         rates = frd_to_flu([message.rollspeed, message.pitchspeed, message.yawspeed])
-        self._streaming = True
         try:
             quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
         except ValueError:
@@ -316,45 +305,16 @@ def _battery(message: Any, now: float) -> Battery:
         tuple(cells) if len(cells) > 1 else ())
 
 
-def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
-    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
-    return {
-        dialect.mode_message: dialect.mode_rate,
-        dialect.estimator_status: 5.0,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
-        mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
-        mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
-        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: HEIGHT_RATE,
-        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: HEIGHT_RATE,
-        mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-    }
-
-
 #: An attitude further than this, s, from a position is no part of the same estimate.
 ATTITUDE_TIMEOUT: Final[float] = 0.1
 
 
-class AutopilotEstimate(NamedTuple):
-    """Odometry: position and attitude in ENU, twist in FLU."""
-
-    time: float
-    """Time of validity, s on our monotonic clock."""
-    position: Array
-    """(3,), m, ENU."""
-    quaternion: Array
-    """(x, y, z, w), FLU to ENU."""
-    velocity: Array
-    """(3,), m/s, FLU."""
-    angular_velocity: Array
-    """(3,), rad/s, FLU."""
-
-
-def estimate(position: LocalPosition, attitude: Attitude, age: float) -> AutopilotEstimate | None:
+def estimate(position: LocalPosition, attitude: Attitude, age: float
+             ) -> tuple[OdometryState, float] | None:
     """
-    Return the odometry at the time of a position, None if no attitude belongs to it.
+    Return the odometry, and the time of a position, s, at which it was valid.
+
+    None if no attitude belongs to the position. The stamp of the odometry is 0.
 
     The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
     turned on by its rates to the time of the position, where the autopilot has stamped both.
@@ -370,6 +330,8 @@ def estimate(position: LocalPosition, attitude: Attitude, age: float) -> Autopil
             between = 0.0
     quaternion = quaternion_multiply(
         attitude.quaternion, rotation_vector_to_quaternion(attitude.angular_velocity * between))
-    return AutopilotEstimate(position.time - max(age, 0.0), position.position, quaternion,
-                             quaternion_to_matrix(quaternion).T @ position.velocity,
-                             attitude.angular_velocity)
+    state = OdometryState(
+        0, 'odom', 'base_link', position.position, quaternion, position.velocity,
+        attitude.angular_velocity, np.zeros((6, 6)), np.zeros((6, 6)),
+        quaternion_to_matrix(quaternion))
+    return state, position.time - max(age, 0.0)

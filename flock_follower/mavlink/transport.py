@@ -23,7 +23,7 @@ there yet.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import errno
 import fcntl
@@ -35,10 +35,11 @@ import socket
 import struct
 import termios
 import tty
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flock_follower.ranges import Range
 
+T = TypeVar('T')
 #: Time between two attempts to reopen a lost port, s.
 RETRY_PERIOD: Final[float] = 0.5
 #: A line is congested if what waits to be sent takes longer than this, s.
@@ -47,7 +48,7 @@ LONGEST_BACKLOG: Final[float] = 0.02
 LONGEST_TCP_DELAY: Final[int] = 1000
 TCP_BUFFER: Final[int] = 16384
 #: It is congested if more than this is not acknowledged, bytes.
-TCP_BACKLOG: Final[int] = 1000
+TCP_BACKLOG: Final[float] = 1000.0
 #: Bytes read at once.
 MOST_READ: Final[int] = 2048
 #: Bits on a serial line for each byte, with its start and stop bit.
@@ -55,9 +56,8 @@ BITS_PER_BYTE: Final[int] = 10
 #: The termios constant of each baud rate.
 BAUD_RATES: Final[Mapping[int, int]] = {
     int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r'B\d+', name)}
-#: Errors that pass by themselves.
-NOT_NOW: Final[tuple[int, ...]] = (
-    errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED, errno.EINTR)
+#: Fault of a TCP connection that is being made.
+CONNECTING: Final[str] = 'connecting'
 #: Errors of a serial port that another process uses: it is exclusive, or locked.
 IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
@@ -68,6 +68,7 @@ class _Line:
     peer: Any = 'line'
     capacity = 0.0
     delivers_late = False
+    _backlog = 0.0  # bytes that may wait in the kernel
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -80,54 +81,63 @@ class _Line:
         """Return the descriptor to select on, -1 while there is none."""
         return self._fd
 
+    def _open(self) -> int:
+        """Return a new descriptor."""
+        raise NotImplementedError
+
+    def _call(self, call: Callable[[], T]) -> T | None:
+        """Return the result of a system call; None if it has to wait, or the line is lost."""
+        try:
+            return call()
+        except (BlockingIOError, InterruptedError):
+            return None
+        except OSError as error:
+            self._lose(reason_of(error))
+            return None
+
+    def _lose(self, fault: str) -> None:
+        self.close()
+        self.fault = fault
+
+    def reopen(self, now: float) -> None:
+        """Try to reopen a lost port, at most every RETRY_PERIOD."""
+        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
+            return
+        self._tried = now
+        try:
+            self._fd, self.fault = self._open(), ''
+        except (OSError, termios.error) as error:
+            self.fault = reason_of(error)
+
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the bytes that have arrived."""
         if self._fd < 0:
             return
-        try:
-            # No more than is taken in one call; what follows waits in the kernel.
-            data = os.read(self._fd, MOST_READ)
-        except OSError as error:
-            if error.errno not in NOT_NOW:
-                self._lose(reason_of(error))
-            return
+        # No more than is taken in one call; what follows waits in the kernel.
+        data = self._call(lambda: os.read(self._fd, MOST_READ))
         if data:
             yield data, self.peer
-        else:
+        elif data is not None:
             self._lose('closed by the other end')
 
     def write(self, data: bytes) -> bool:
         """Send; return whether it goes out whole. What begins to go out always does."""
-        if self._fd < 0 or not self._flush():
+        if self._fd < 0 or self._waits():
             return False
-        try:
-            taken = os.write(self._fd, data)
-        except OSError as error:
-            if error.errno not in NOT_NOW:
-                self._lose(reason_of(error))
-            return False
+        taken = self._call(lambda: os.write(self._fd, data))
         self._waiting = data[taken:] if taken else b''
-        return taken > 0
+        return bool(taken)
+
+    def _waits(self) -> bool:
+        """Send the rest of the last message; return whether some of it still waits."""
+        if self._waiting and self._fd >= 0:
+            taken = self._call(lambda: os.write(self._fd, self._waiting))
+            self._waiting = self._waiting[taken or 0:]
+        return bool(self._waiting)
 
     def congested(self) -> bool:
-        """Return whether bytes are waiting for the line."""
-        return not self._flush()
-
-    def close(self) -> None:
-        """Release the port."""
-        if self._fd >= 0:
-            os.close(self._fd)
-        self._fd, self._waiting = -1, b''
-
-    def _flush(self) -> bool:
-        """Send the rest of the last message; return whether all of it is sent."""
-        if self._waiting and self._fd >= 0:
-            try:
-                self._waiting = self._waiting[os.write(self._fd, self._waiting):]
-            except OSError as error:
-                if error.errno not in NOT_NOW:
-                    self._lose(reason_of(error))
-        return not self._waiting
+        """Return whether what waits would delay a setpoint."""
+        return self._waits() or self._queued() > self._backlog
 
     def _queued(self) -> int:
         """Return how many bytes the kernel keeps: not sent yet, or over TCP not acknowledged."""
@@ -136,9 +146,11 @@ class _Line:
         except (OSError, ValueError):
             return 0
 
-    def _lose(self, fault: str) -> None:
-        self.close()
-        self.fault = fault
+    def close(self) -> None:
+        """Release the port."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd, self._waiting = -1, b''
 
 
 class SerialTransport(_Line):
@@ -153,18 +165,9 @@ class SerialTransport(_Line):
         self._device = device
         self._baud = baud
         self.capacity = baud / BITS_PER_BYTE
+        self._backlog = LONGEST_BACKLOG * self.capacity
         # Not there yet is no error: at power-on the autopilot may take longer than this computer.
         self.reopen(-math.inf)
-
-    def reopen(self, now: float) -> None:
-        """Try to reopen a lost port, at most every RETRY_PERIOD."""
-        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
-            return
-        self._tried = now
-        try:
-            self._fd, self.fault = self._open(), ''
-        except (OSError, termios.error) as error:
-            self.fault = reason_of(error)
 
     def _open(self) -> int:
         fd = -1
@@ -200,61 +203,47 @@ class SerialTransport(_Line):
                 fcntl.ioctl(self._fd, termios.TIOCNXCL)
         super().close()
 
-    def congested(self) -> bool:
-        """Return whether what the driver has not sent yet takes longer than LONGEST_BACKLOG."""
-        return super().congested() or self._queued() > LONGEST_BACKLOG * self.capacity
-
 
 class TcpTransport(_Line):
     """
     A TCP connection to a listening autopilot or simulator, made again when it is closed.
 
-    Opening only begins the connection, without a wait for an answer that may take a minute.
+    Opening only begins the connection, without a wait for an answer that may take a minute. Until
+    it is made, the kernel takes and gives no bytes, as on a line that is busy.
     """
 
     delivers_late = True
+    _backlog = TCP_BACKLOG  # what room is left is for setpoints
 
     def __init__(self, url: str, address: tuple[str, int]) -> None:
         super().__init__(url)
         self._address = address
-        self._connection: socket.socket | None = None
-        """The connection that is being made."""
         self.fault = 'not connected yet'
 
     def reopen(self, now: float) -> None:
-        """Begin to connect, at most every RETRY_PERIOD, and see how far it has come."""
-        if self._fd >= 0 or (self._connection is None and now - self._tried < RETRY_PERIOD):
-            return
-        if self._connection is None:
-            self._tried, self.fault = now, 'connecting'
-            self._connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            self._connection.setblocking(False)
-            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        """Begin to connect, at most every RETRY_PERIOD, and see whether it is connected."""
+        if self._fd < 0:
+            super().reopen(now)
+            self.fault = self.fault or CONNECTING
+        if self.fault == CONNECTING and select.select([], [self._fd], [], 0.0)[1]:
+            connection = socket.socket(fileno=self._fd)
+            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            connection.detach()
+            self.fault = ''
+            if code:
+                self._lose(os.strerror(code))
+
+    def _open(self) -> int:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             # Drop data that is not delivered by then: a late setpoint is worse than none.
-            self._connection.setsockopt(
+            connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
-            self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
-            code = self._connection.connect_ex(self._address)
-        elif select.select([], [self._connection], [], 0.0)[1]:
-            code = self._connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-            if not code:
-                self._fd, self.fault = self._connection.detach(), ''
-                self._connection = None
-        else:
-            return
-        if code not in (0, errno.EINPROGRESS):
-            self._lose(os.strerror(code))
-
-    def congested(self) -> bool:
-        """Return whether more than TCP_BACKLOG waits: what room is left is for setpoints."""
-        return super().congested() or self._queued() > TCP_BACKLOG
-
-    def close(self) -> None:
-        """End the connection, or the attempt."""
-        if self._connection is not None:
-            self._connection.close()
-        self._connection = None
-        super().close()
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
+            with contextlib.suppress(BlockingIOError):  # under way
+                connection.connect(self._address)
+            return connection.detach()
 
 
 def reason_of(error: BaseException) -> str:
@@ -266,29 +255,28 @@ DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'
 
 
-class UdpTransport:
+class UdpTransport(_Line):
     """
-    A UDP socket.
+    A UDP socket, which is never lost.
 
     A listening one answers only the ``peer`` its owner sets, not everyone who ever sent to it:
     a setpoint must not reach a second vehicle by accident.
     """
 
-    fault = ''
-    capacity = 0.0
-    delivers_late = False
+    _backlog = math.inf  # datagrams do not wait for one another here
 
     def __init__(self, url: str, *, bind: tuple[str, int] | None = None,
                  peer: tuple[str, int] | None = None) -> None:
-        self.url = url
-        self.peer: Any = peer
+        super().__init__(url)
+        self.peer = peer
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._fd = self._socket.fileno()
         try:
             if bind is not None:
                 self._socket.bind(bind)
         except OSError as error:
-            self._socket.close()
+            self.close()
             raise OSError(f'connection = {url!r}: cannot listen there: {error.strerror}') from None
 
     @property
@@ -297,23 +285,14 @@ class UdpTransport:
         host, port = self._socket.getsockname()
         return str(host), int(port)
 
-    def fileno(self) -> int:
-        """Return the descriptor to select on."""
-        return self._socket.fileno()
-
-    def reopen(self, now: float) -> None:
-        """Do nothing: a UDP socket is never lost."""
-
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the datagrams that have arrived, with their senders."""
         # Bounded, so that a flood cannot keep the caller from its other work.
         for _ in range(256):
             try:
                 yield self._socket.recvfrom(65535)
-            except OSError as error:
-                if error.errno in NOT_NOW:
-                    return
-                raise
+            except (BlockingIOError, InterruptedError, ConnectionRefusedError):
+                return
 
     def write(self, data: bytes) -> bool:
         """Send one datagram to the peer; return whether it went out."""
@@ -326,13 +305,10 @@ class UdpTransport:
             return False
         return True
 
-    def congested(self) -> bool:
-        """Return False: datagrams do not wait for one another here."""
-        return False
-
     def close(self) -> None:
         """Release the port."""
         self._socket.close()
+        self._fd = -1
 
 
 #: A non-blocking pipe. ``peer`` is the receiver of ``write``, None while unknown. ``fault`` says

@@ -41,6 +41,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
 from flock_follower.planner.limits import limit_norm
+from flock_follower.ranges import first_reason
 
 #: The stream stops this long, s, after a velocity that still arrives became invalid. If none
 #: arrives at all, the whole computer may have stalled: then ``blind_timeout`` applies.
@@ -108,9 +109,8 @@ class KnownMotion:
     @property
     def source_first(self) -> tuple[Motion, Motion]:
         """Return the motion by the source, then the one by the other."""
-        if self.source == ODOM:
-            return self.odom, self.autopilot
-        return self.autopilot, self.odom
+        both = self.odom, self.autopilot
+        return both if self.source == ODOM else both[::-1]
 
     def braking_velocity(self, limits: GateLimits) -> Velocity | None:
         """Return the velocity to brake with; None if none is fresh, or if two disagree."""
@@ -120,8 +120,7 @@ class KnownMotion:
             first, second = self.autopilot, self.odom
         elif self.disagreeing_for >= 0.0:
             return None  # one of them is wrong: braking on that one would speed the vehicle up
-        velocity = first.fresh_velocity(limits)
-        return second.fresh_velocity(limits) if velocity is None else velocity
+        return first.fresh_velocity(limits) or second.fresh_velocity(limits)
 
     def blind(self, limits: GateLimits) -> bool:
         """Return whether no valid velocity has come for too long, after one had come."""
@@ -136,9 +135,9 @@ class KnownMotion:
 
     def contradiction(self, limits: GateLimits) -> str:
         """Return what odom and the autopilot disagree about, or ''."""
-        if self.yaws_disagree(limits):
-            return 'yaws of odom and of the autopilot disagree'
-        return VELOCITIES_DISAGREE if self.disagreeing_for >= 0.0 else ''
+        return first_reason(
+            (self.yaws_disagree(limits), 'yaws of odom and of the autopilot disagree'),
+            (self.disagreeing_for >= 0.0, VELOCITIES_DISAGREE))
 
     def yaws_disagree(self, limits: GateLimits) -> bool:
         """Return whether the frames are turned against one another: braking would accelerate."""
@@ -155,8 +154,8 @@ class KnownMotion:
         mine, own = self.odom.fresh_velocity(limits), self.autopilot.fresh_velocity(limits)
         if self.source != ODOM or mine is None or own is None:
             return None
-        with np.errstate(over='ignore'):
-            return mine.vector - own.vector
+        # Of finite velocities even the difference may be beyond every number.
+        return np.clip(mine.vector, -SANE, SANE) - np.clip(own.vector, -SANE, SANE)
 
 
 def fresh(age: float, timeout: float) -> bool:
@@ -166,14 +165,11 @@ def fresh(age: float, timeout: float) -> bool:
 
 def refusal(age: float, timeout: float) -> str:
     """Return why an input of an age, s, is refused, or ''."""
-    if not math.isfinite(age):
-        return 'not finite'
-    if age > timeout:
-        return 'too old'
-    return 'from the future' if age < -FUTURE_TOLERANCE else ''
+    return first_reason((not math.isfinite(age), 'not finite'), (age > timeout, 'too old'),
+                        (age < -FUTURE_TOLERANCE, 'from the future'))
 
 
-def finite_vector(value: ArrayLike) -> Array | None:
+def finite_vector(value: ArrayLike | None) -> Array | None:
     """Return a copy as an array (3,), None if it is not three finite numbers."""
     try:
         vector = np.array(value, dtype=float)
@@ -214,8 +210,7 @@ class VelocityComparison:
             first = math.isinf(self._time)
             step = 0.0 if first else min(now - self._time, LONGEST_STEP)
             share = 1.0 - math.exp(-step / AVERAGING_TIME)
-            # Of finite velocities even the difference may be beyond every number.
-            difference = limit_norm(np.clip(difference, -SANE, SANE), LARGEST * tolerance)
+            difference = limit_norm(difference, LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
             self._time = now
             if self.difference > tolerance:
@@ -292,10 +287,9 @@ class Path:
 
     def between(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
-        times = [time for time, _ in self._kept]
-        places = np.array([place for _, place in self._kept])
-        return np.array([np.interp(end, times, column) - np.interp(start, times, column)
-                         for column in places.T])
+        times, places = zip(*self._kept)
+        return np.array([np.diff(np.interp((start, end), times, column))[0]
+                         for column in zip(*places)])
 
 
 def difference(one: Path, other: Path, turn: float, now: float) -> Array | None:
@@ -357,15 +351,13 @@ def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
+    compared = [(height, BAROMETER_STD, 0.0, slice(2, 3), 'barometer')]
     if autopilot is not None:
-        off = difference(odom.path, autopilot.path, -turn, now)
-        most = max(TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
-        if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
-            return (f'displacements of odom and of the autopilot differ by {distance:.1f} m in '
+        compared.insert(0, (autopilot.path, autopilot.std, -turn, slice(0, 2), 'autopilot'))
+    for path, std, turned, axes, other in compared:
+        off = difference(odom.path, path, turned, now)
+        far = 0.0 if off is None else float(np.linalg.norm(off[axes]))
+        if far > max(TOLERANCE, 3.0 * math.hypot(odom.std, std)):
+            return (f'displacements of odom and of the {other} differ by {far:.1f} m in '
                     f'{WINDOW:g} s')
-    off = difference(odom.path, height, 0.0, now)
-    most = max(TOLERANCE, 3.0 * math.hypot(BAROMETER_STD, odom.std))
-    if off is not None and abs(climb := float(off[2])) > most:
-        return (f'displacements of odom and of the barometer differ by {climb:.1f} m in '
-                f'{WINDOW:g} s')
     return ''

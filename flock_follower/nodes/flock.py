@@ -28,14 +28,14 @@ import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import checked_name
 from flock_follower.messages import from_odometry, from_state
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
-from flock_follower.nodes.support.own_odometry import OwnOdometry
+from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
@@ -44,10 +44,7 @@ from flock_follower.parameters.spec import Spec, specs_of
 SHARED_TOPIC = '/neighbors/shared'
 RECEIVED_TOPIC = 'neighbors/heard'
 # A lost message is replaced in 0.1 s: over radio nothing is repeated.
-SHARED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-RECEIVED_QOS = QoSProfile(depth=10)
+SHARED_QOS = best_effort(50)
 PERIOD = 0.1  # s
 
 SPECS = [
@@ -69,9 +66,9 @@ class SharingNode(FlockNode):
         self._sharing = Sharing(parameters.current)
         self._own = OwnOdometry(self, parameters.values)
         self._sent = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
-        self._received = self.create_publisher(Odometry, RECEIVED_TOPIC, RECEIVED_QOS)
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
-        self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
+        self._received = self.create_publisher(Odometry, RECEIVED_TOPIC, QoSProfile(depth=10))
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, best_effort())
+        self.subscribe(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False)
         self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
         self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
         self.diagnostics.values['vehicle_name'] = parameters.current
@@ -112,14 +109,12 @@ class SharingNode(FlockNode):
 
     def _sender_problem(self, now: float) -> Problem | None:
         """Show the frame of every sender; return which clocks are implausible."""
-        values, odd = self.diagnostics.values, []
-        for key in [key for key in values if key.startswith('frame of ')]:
-            del values[key]
-        for status in self._sharing.status(self._now()):
-            values[f'frame of {status.name}'] = status.why or (
-                f'known to {status.position_std:.3f} m, {status.yaw_std:.3f} rad')
-            if status.slow:
-                odd.append(f'{status.name}: {status.slow}')
+        senders = self._sharing.status(self._now())
+        self.diagnostics.parts['senders'] = {
+            f'frame of {sender.name}': sender.why or (
+                f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
+            for sender in senders}
+        odd = [f'{sender.name}: {sender.slow}' for sender in senders if sender.slow]
         return (WARN, '; '.join(odd)) if odd else None
 
     def _rivals(self, now: float) -> Problem | None:

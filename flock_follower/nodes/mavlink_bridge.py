@@ -36,6 +36,7 @@ bridge is to do. The publisher thread publishes and logs what
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 import math
 import os
@@ -46,8 +47,6 @@ from typing import Any
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import Range
 from std_msgs.msg import String
@@ -60,12 +59,13 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD, GroundStationReport
+from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
-from flock_follower.mavlink.permission import Phase, SecondCommander
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
+from flock_follower.mavlink.velocity_check import ODOM
 from flock_follower.messages import (
     from_trajectory,
     OdometryState,
@@ -73,30 +73,55 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
-from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
-from flock_follower.nodes.support.diagnostics import internal_error, listed, publishers
+from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.diagnostics import (
+    internal_error,
+    listed,
+    publishers,
+    STEADY,
+)
+from flock_follower.nodes.support.inputs import (
+    best_effort,
+    EvenClock,
+    LATCHED_QOS,
+    OwnOdometry,
+)
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
-from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.publisher_thread import PublisherThread
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
 from flock_follower.parameters.spec import filled
-from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 
-# Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
-# newest: a second commanding node would otherwise stay undetected.
-COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
+# Not only the newest: a second commanding node would otherwise stay undetected.
+COMMANDS_QOS = best_effort(10)
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
 UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
               '/diagnostics, but does not brake')
 TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
+ENDED = Outcome(False, 'refused: the setpoint thread has ended or takes no more')
+
+
+@dataclass
+class _Call:
+    """A call of a service; the setpoint thread begins its request."""
+
+    answer: Future
+    request: Request | None = None
+    outcome: Outcome | None = None
+
+    def begin(self, ask: Callable[[float], Request]) -> None:
+        """Make the request, in the setpoint thread."""
+        try:
+            self.request = ask(time.monotonic())
+        except Exception as error:
+            self.outcome = Outcome(False, internal_error(error))
+            raise
+
+    def result(self) -> Outcome | None:
+        """Return the outcome, None before."""
+        return self.request.outcome if self.request is not None else self.outcome
 
 
 class MavlinkBridge(FlockNode):
@@ -121,13 +146,11 @@ class MavlinkBridge(FlockNode):
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
-            ground_station=GroundStationReport() if values['report_to_gcs'] else None)
-        self._watch = ClockWatch()
-        self._simulated = bool(self.get_parameter('use_sim_time').value)
+            report_to_gcs=values['report_to_gcs'])
+        self._even_clock = EvenClock(self)
         self._odom_frame = 'odom'
         self._new_odom: list[tuple[OdometryState, float, float]] = []
-        self._pending: list[tuple[Request, Future]] = []
-        self._answered: list[tuple[Future, Outcome]] = []
+        self._calls: list[_Call] = []
         self._stream = SetpointThread(
             self._bridge, 1.0 / values['stream_rate'],
             lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
@@ -151,37 +174,36 @@ class MavlinkBridge(FlockNode):
 
     def _connect(self, values: Mapping[str, Any]) -> None:
         """Create the subscriptions, timers and services."""
-        self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
-        self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._sources = CommandSources()
         self._numbered = True
-        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command, COMMANDS,
-                       required=False, informed=True)
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS, required=(
+        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command,
+                       COMMANDS_QOS, required=False, informed=True)
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, best_effort(200), required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
         self.create_timer(1.0 / rate, self._hand_over_odom,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+                          clock=STEADY)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        if (ground_station := self._bridge.ground_station) is not None:
+        if values['report_to_gcs']:
+            ground_station = self._bridge.ground_station
+
             def take(action: Callable[..., None], *value: Any) -> None:
                 self._stream.submit(partial(action, *value, time.monotonic()))
             self.subscribe(String, 'planner/state', lambda message: take(
-                ground_station.take_state, message.data), STATE_QOS, required=False)
+                ground_station.take_state, message.data), LATCHED_QOS, required=False)
             self.create_timer(DISTANCE_PERIOD, self.poll(
                 Range, 'planner/distance', lambda message, _: take(
                     ground_station.take_distance, message.header.frame_id, message.range),
-                NEWEST_QOS, required=False))
+                best_effort(), required=False))
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
         self._stream.stop()
-        self._answer([*self._answered, *((answer, request.outcome or STOPPING)
-                                         for request, answer in self._pending)])
+        self._answer_calls(otherwise=STOPPING)
         self._publisher.stop()
         self._bridge.link.transport.close()
         super().destroy_node()
@@ -193,7 +215,8 @@ class MavlinkBridge(FlockNode):
         now = time.monotonic()
         self._watch_commanders(info, now)
         command = from_trajectory(message, self._odom_frame)
-        if not self._fresh('command/trajectory', command.stamp):
+        self._even_clock.now()
+        if not self._even_clock.fresh('command/trajectory', command.stamp):
             return
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
@@ -216,31 +239,20 @@ class MavlinkBridge(FlockNode):
         if self._sources.another(number, now - waited) and self._flying():
             topic = self.resolve_topic_name('command/trajectory')
             who = f'{listed(publishers(self, topic))} on {topic}'
-            self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
+            gate = self._bridge.gate
+            self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
         return self._bridge.gate.permission.phase is Phase.ACTIVE
 
-    def _fresh(self, topic: str, stamp: int) -> bool:
-        """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
-        if self._simulated:
-            return True
-        if step := self._watch.take(*self.read_clocks()):
-            self.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
-        before = self._watch.before_step(stamp)
-        if before:
-            self.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
-        return not before
-
-    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
-        if arrival is None:
-            arrival = self.get_clock().now().nanoseconds
-        if not self._fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
+    def _take_odom(self, message: Odometry, arrival: int) -> None:
+        self._even_clock.now()
+        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
             return
         waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
         now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
-        shift = self._watch.shift
+        shift = self._even_clock.shift
         state = self._own.take(message, arrival - shift, shift)
         if state is None:
             return
@@ -252,7 +264,8 @@ class MavlinkBridge(FlockNode):
         self._new_odom.append((state, age, now))
 
     def _hand_over_odom(self) -> None:
-        """Take the odometry that waits, and hand it over."""
+        """Take the odometry that waits, and hand it over; answer the services."""
+        self._answer_calls()
         self._poll_odom()
         taken, self._new_odom = self._new_odom, []
         if taken and not self._stream.submit(lambda: self._use_odom(taken)):
@@ -266,13 +279,12 @@ class MavlinkBridge(FlockNode):
             'offboard': lambda now: requests.offboard(request.data, now),
             'takeoff': lambda now: requests.takeoff(self._settings.values['takeoff_height'], now),
             'land': requests.land}
-        answer = Future()
-        if self._stream.submit(lambda: self._begin(ask[name], answer),
-                               lambda: self._answer([(answer, STOPPING)])):
-            response.success, response.message = await answer
-        else:
-            response.success = False
-            response.message = 'refused: the setpoint thread has ended or takes no more'
+        call = _Call(Future())
+        self._calls.append(call)
+        if not self._stream.submit(lambda: call.begin(ask[name])):
+            call.outcome = ENDED
+        self._answer_calls()
+        response.success, response.message = await call.answer
         log = self.get_logger()
         if response.success:
             log.info(response.message)
@@ -280,56 +292,31 @@ class MavlinkBridge(FlockNode):
             log.warning(response.message)
         return response
 
+    def _answer_calls(self, otherwise: Outcome | None = None) -> None:
+        """Answer the calls that have an outcome; with ``otherwise`` those that have none, too."""
+        for call in self._calls:
+            if (outcome := call.result() or otherwise) is not None:
+                call.answer.set_result(outcome)
+        self._calls = [call for call in self._calls if not call.answer.done()]
+
     # The setpoint thread: it publishes and logs by the publisher thread; no lock of rclpy.
 
     def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
         """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
         for state, age, now in taken:
-            refusals = [self._bridge.on_odometry(
-                state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
-                math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
+            refusals = [self._bridge.gate.update_velocity(
+                ODOM, state.velocity, age, now, yaw=yaw_from_quaternion(state.quaternion),
+                position=state.position,
+                std=math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
             if self._settings.values['forward_odometry']:
-                refusals.append(self._bridge.forward(ForwardedOdometry(
-                    now - age, state.position, state.quaternion, state.velocity,
-                    state.angular_velocity, state.pose_covariance, state.velocity_covariance,
-                    state.twist_covariance[3:, 3:]), now))
+                refusals.append(self._bridge.forward(state, now - age, now))
             for refused in filter(None, refusals):
                 self._report.refused(f'odom {refused}', f'stamp {age:.3f} s old')
-
-    def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
-        """Make a request; ``answer`` is given once it has an outcome."""
-        try:
-            self._pending.append((ask(time.monotonic()), answer))
-        except Exception as error:
-            self._answered.append((answer, Outcome(False, internal_error(error))))
-            raise
-        finally:
-            self._give_answers()
 
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
         self._bridge.gate.limits = self._settings.current
-        self._give_answers()
         self._outputs.on_cycle(now)
-
-    def _give_answers(self) -> None:
-        """Send the results of finished requests; repeated each cycle until all are sent."""
-        self._answered += [(answer, request.outcome) for request, answer in self._pending
-                           if request.outcome is not None]
-        self._pending = [entry for entry in self._pending if entry[0].outcome is None]
-        self._answered = [entry for entry in self._answered if not entry[0].done()]
-        if self._answered:
-            answered = tuple(self._answered)
-            self._publisher.submit(lambda: self._answer(answered))
-
-    # The publisher thread, or any other once the setpoint thread has ended.
-
-    def _answer(self, answered: Sequence[tuple[Future, Outcome]]) -> None:
-        for answer, outcome in answered:
-            if not answer.done():
-                answer.set_result(outcome)
-        if self.executor is not None:
-            self.executor.wake()
 
 
 def _open_link(values: Mapping[str, Any]) -> Link:

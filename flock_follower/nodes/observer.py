@@ -20,18 +20,20 @@ The observer publishes nothing and sets nothing; it requests the parameters of o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 import os
 from pathlib import Path
 import signal
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
@@ -48,30 +50,24 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.files_in_use import (
-    environments_of_processes,
-    files_of_processes,
-    misses,
-)
+from flock_follower.nodes.support.diagnostics import STEADY
+from flock_follower.nodes.support.inputs import best_effort, StaticChild
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
-from flock_follower.nodes.support.transforms import StaticChild
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
-from flock_follower.parameters.files import given, shared
+from flock_follower.parameters.files import files_in, given, shared, unheeded
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
-from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
 PROCESSORS = Path('/proc/stat')
 ANSWER = 2.0  # s for the nodes to send their parameters at the end
-# Best effort and volatile takes what any publisher sends.
-OBSERVED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom', 'mavlink/odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory')
@@ -102,16 +98,18 @@ class Observer(Node):
         self._remote: dict[str, RemoteParameters] = {}
         self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
+        self.create_timer(POLL_PERIOD, self._ask_nodes, clock=STEADY)
+        self.create_timer(POLL_PERIOD, self._subscribe, clock=STEADY)
 
     def observe(self) -> Observations:
         """Listen, and return the observations."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         try:
-            self._until(executor, DISCOVERY)
+            self._until(executor, time.monotonic() + DISCOVERY)
             before, self._listening = PROCESSORS.read_text(), True
             began = time.monotonic()
-            self._until(executor, self._seconds)
+            self._until(executor, began + self._seconds)
             self.seen.duration = time.monotonic() - began
             self._listening = False
             idle = idle_share(before, PROCESSORS.read_text())
@@ -134,15 +132,9 @@ class Observer(Node):
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
 
-    def _until(self, executor: SingleThreadedExecutor, seconds: float) -> None:
-        """Spin for some seconds, and search for new topics from time to time."""
-        end, look = time.monotonic() + seconds, 0.0
+    def _until(self, executor: SingleThreadedExecutor, end: float) -> None:
         while rclpy.ok() and (now := time.monotonic()) < end:
-            if now >= look:
-                look = now + POLL_PERIOD
-                self._ask_nodes()
-                self._subscribe()
-            executor.spin_once(timeout_sec=min(POLL_PERIOD, end - now))
+            executor.spin_once(timeout_sec=end - now)
 
     def _ask_nodes(self) -> None:
         """Ask our nodes for their parameters, and relative_pose for its topics."""
@@ -166,22 +158,18 @@ class Observer(Node):
                 self.seen.names[ours] = topic
 
     def _take_values(self, node: str, values: dict[str, Any]) -> None:
+        """Keep the parameters of a node; of several cameras those of the one to observe."""
         if NAMES in values:
-            values = self._of_camera(values)
+            try:
+                camera, values = alone(values, self._camera)
+            except ValueError as error:
+                self._fault = str(error)
+            else:
+                topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}
+                self.seen.names.update({
+                    ours: full_name(topic, self.seen.namespace)
+                    for ours, topic in topics.items() if ours not in self._remaps})
         self.seen.parameters[node] = values
-
-    def _of_camera(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Use the topics of the camera to observe; return its values as those of a single one."""
-        try:
-            camera, values = alone(values, self._camera)
-        except ValueError as error:
-            self._fault = str(error)
-            return values
-        if camera.name:
-            for ours, topic in topics_of_camera(camera.image, camera.camera_info).items():
-                if ours not in self._remaps:
-                    self.seen.names[ours] = full_name(topic, self.seen.namespace)
-        return values
 
     def _nodes(self) -> list[str]:
         return sorted(f'{namespace.rstrip("/")}/{name}'
@@ -197,10 +185,10 @@ class Observer(Node):
                 self._subscribed.add(topic)
                 kind = message_class(TYPES[name])
                 self.create_subscription(kind, topic, partial(self._take, name, topic),
-                                         OBSERVED_QOS, raw=kind in READERS or name in COUNTED)
+                                         best_effort(50), raw=kind in READERS or name in COUNTED)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
-            self.create_subscription(Clock, '/clock', self._take_clock, OBSERVED_QOS)
+            self.create_subscription(Clock, '/clock', self._take_clock, best_effort(50))
 
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
@@ -240,20 +228,55 @@ class Observer(Node):
         own = {node: full for node in OURS
                if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
         problems = self.seen.file_problems
-        for node, path in files_of_processes():
-            if node in own and (problem := misses(path, own[node])) and problem not in problems:
-                problems.append(problem)
+        for process in processes():
+            for path in process.files if process.node in own else ():
+                if (problem := _misses(path, own[process.node])) and problem not in problems:
+                    problems.append(problem)
         if self._config is None:
             return
         problem = ''
         for node, full in own.items():
-            if problem := misses(str(self._config), full):
+            if problem := _misses(str(self._config), full):
                 problems += [problem] if 'but none for' in problem else []
             elif values := {
                     **shared([self._config], full), **given(self._config, full)}:
                 self.seen.file_parameters[node] = values
         if problem and not self.seen.file_parameters and not problems:
             problems.append(problem)
+
+
+def _misses(path: str, node: str) -> str:
+    """Return that a file holds parameters for no node, or for another node, or ''."""
+    try:
+        return unheeded(path, node)
+    except (ValueError, OSError) as problem:
+        return str(problem)
+
+
+class Process(NamedTuple):
+    """One of our nodes on this computer: its name, parameter files and environment."""
+
+    node: str
+    files: list[str]
+    environment: dict[str, str]
+
+
+def processes() -> Iterator[Process]:
+    """Yield our nodes that run on this computer, but those of other users."""
+    for folder in Path('/proc').glob('[0-9]*'):
+        with suppress(OSError):  # ended meanwhile, or of another user
+            words = _words(folder / 'cmdline')
+            for node in OURS:
+                if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
+                    yield Process(
+                        node, [str(Path(os.readlink(folder / 'cwd'), path))
+                               for path in files_in(words)],
+                        dict(entry.split('=', 1) for entry in _words(folder / 'environ')
+                             if '=' in entry))
+
+
+def _words(path: Path) -> list[str]:
+    return path.read_bytes().decode(errors='replace').split('\0')
 
 
 def _machine(idle: float | None) -> Machine:
@@ -271,8 +294,8 @@ def _machine(idle: float | None) -> Machine:
 def _open_nodes() -> list[str]:
     """Return our nodes on this computer that the network reaches; as check, where none is read."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    found = {node: reach(environment) for node, environment in environments_of_processes()
-             if environment.get('ROS_DOMAIN_ID', '0') == domain}
+    found = {process.node: reach(process.environment) for process in processes()
+             if process.environment.get('ROS_DOMAIN_ID', '0') == domain}
     return sorted(node for node, far in (found or {'check': reach(os.environ)}).items()
                   if far == NETWORK)
 

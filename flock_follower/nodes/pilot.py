@@ -15,7 +15,7 @@
 """
 The node of the command ``follow``: keys and reports in, service calls and a live line out.
 
-``flock_follower.flight_steps`` decides which call is due. The node subscribes ``/diagnostics``,
+``nodes.flight_steps`` decides which call is due. The node subscribes ``/diagnostics``,
 ``mavlink_bridge/state``, ``planner/distance`` and ``mavlink/battery``, and calls the services of
 ``planner`` and ``mavlink_bridge``. SIGINT, SIGTERM, SIGHUP and a closed terminal brake and hand
 over: the node handles the signals itself, so that ROS runs until the services have answered.
@@ -38,23 +38,28 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, Range
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.checks.observations import Observations
-from flock_follower.flight_steps import DISCOVERY, Flight, INTERRUPTED, loopback, Reports, SERVICES
-from flock_follower.live_line import LiveLine
 from flock_follower.nodes.call import patience
+from flock_follower.nodes.flight_steps import (
+    DISCOVERY,
+    Flight,
+    INTERRUPTED,
+    loopback,
+    Reports,
+    SERVICES,
+)
 from flock_follower.nodes.observer import Observer
 from flock_follower.nodes.support.diagnostics import internal_error
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Pilot(Node):
@@ -83,9 +88,10 @@ class Pilot(Node):
                          for step, (service, value) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
         self.create_subscription(String, 'mavlink_bridge/state', lambda message: setattr(
-            self._reports, 'bridge', message.data), STATE_QOS)
-        self.create_subscription(Range, 'planner/distance', self._take_distance, NEWEST_QOS)
-        self.create_subscription(BatteryState, 'mavlink/battery', self._take_battery, NEWEST_QOS)
+            self._reports, 'bridge', message.data), LATCHED_QOS)
+        self.create_subscription(Range, 'planner/distance', self._take_distance, best_effort())
+        self.create_subscription(
+            BatteryState, 'mavlink/battery', self._take_battery, best_effort())
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:

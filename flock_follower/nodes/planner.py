@@ -40,7 +40,7 @@ from typing import Any, TypeVar
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Range
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
@@ -59,33 +59,21 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
+from flock_follower.nodes.support.inputs import (
+    best_effort,
+    EvenClock,
+    LATCHED_QOS,
+    OwnOdometry,
+)
 from flock_follower.nodes.support.middleware import avoid_shared_memory
-from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.planner_table import build, SPECS
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.modes import (
-    ARMED_AT_TOPIC,
-    BEFORE_STEP,
-    BridgeState,
-    ClockWatch,
-    State,
-)
+from flock_follower.planner.modes import ARMED_AT_TOPIC, BridgeState, State
 from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
-
-# Best effort takes what reliable and best-effort publishers send alike.
-ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEIGHBORS_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-RECEIVED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-COMMAND_QOS = QoSProfile(depth=1)
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-DISTANCE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-BRIDGE_QOS = STATE_QOS  # latched: received at once by a planner that starts later
 
 Dated = TypeVar('Dated', OdometryState, AccelerationState)
 #: ns between the stamps of a neighbour's state and of its acceleration, two messages.
@@ -111,34 +99,34 @@ class Planner(FlockNode):
         self._guarded = 0
         self._limited = 0
         self._ticked = time.monotonic()
-        self._watch = ClockWatch()
+        self._even_clock = EvenClock(self)
         self._accelerations: dict[str, AccelerationState] = {}
-        self._simulated = bool(self.get_parameter('use_sim_time').value)
 
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
-            self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS, required=False),
-            self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS),
+            self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
+                      required=False),
+            self.poll(Odometry, 'odom', self._take_odom, best_effort(200)),
             self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
-                      self._take_acceleration, NEIGHBORS_QOS, required=False),
-            self.poll(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
-            self.poll(Odometry, 'neighbors/heard', self._take_received, RECEIVED_QOS,
+                      self._take_acceleration, best_effort(100), required=False),
+            self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(100)),
+            self.poll(Odometry, 'neighbors/heard', self._take_received, best_effort(50),
                       required=False),
             *(self.poll(CameraInfo, camera.camera_info,
-                        partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
+                        partial(self._take_camera_info, camera=camera.name), best_effort(),
                         required=False) for camera in configured)]
         self._poll_frames = self.poll(
-            Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+            Header, 'neighbors/frames', self._take_frame, best_effort(), required=False)
         inputs = self.diagnostics.inputs
         inputs['neighbors'].heartbeat = inputs['neighbors/frames']  # images without a leader
-        self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
+        self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, LATCHED_QOS,
                        required=False)
-        self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
+        self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, LATCHED_QOS, required=False)
         self._commands = self.create_publisher(
-            MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
-        self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
-        self._distances = self.create_publisher(Range, 'planner/distance', DISTANCE_QOS)
+            MultiDOFJointTrajectory, 'command/trajectory', QoSProfile(depth=1))
+        self._states = self.create_publisher(String, 'planner/state', LATCHED_QOS)
+        self._distances = self.create_publisher(Range, 'planner/distance', best_effort())
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
@@ -160,47 +148,29 @@ class Planner(FlockNode):
         return not self._loop.waiting(self._bridge_age()) and (
             self._settings.values['require_bridge'] or self._loop.engaged)
 
-    def _now(self) -> int:
-        """
-        Return the time, ns: of a clock that goes on evenly while the system clock is set.
-
-        All times that the loop gets are of that clock. With ``use_sim_time`` it is /clock's.
-        """
-        if self._simulated:
-            return int(self.get_clock().now().nanoseconds)
-        system, monotonic = self.read_clocks()
-        if step := self._watch.take(system, monotonic):
-            self.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
-        return system - self._watch.shift
-
-    def _fresh(self, topic: str, stamp: Any) -> bool:
-        """Return whether a stamp can be used; count it where it was made before a clock's step."""
-        fresh = self._simulated or not self._watch.before_step(stamp_to_nanoseconds(stamp))
-        if not fresh:
-            self.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp.sec} s')
-        return fresh
+    def _fresh(self, topic: str, message: Any) -> bool:
+        return self._even_clock.fresh(topic, stamp_to_nanoseconds(message.header.stamp))
 
     def _dated(self, state: Dated, arrival: int) -> Dated:
-        """Return a state with its stamp on the loop's clock, where none is later than arrival."""
-        if self._simulated:
+        """Return a state with its stamp on the loop's clock, and no later than its arrival."""
+        if self._even_clock.simulated:
             return state
-        shift = self._watch.shift
-        return state._replace(stamp=min(state.stamp, arrival) - shift)
+        return state._replace(stamp=min(state.stamp, arrival) - self._even_clock.shift)
 
     def _take_odom(self, message: Odometry, arrival: int) -> None:
-        shift = self._watch.shift
-        if not self._fresh('odom', message.header.stamp):
+        shift = self._even_clock.shift
+        if not self._fresh('odom', message):
             return
         state = self._own.take(message, arrival - shift, shift)
         if state is not None:
-            if not self._simulated:
+            if not self._even_clock.simulated:
                 state = state._replace(stamp=min(state.stamp, arrival - shift))
             self._loop.take_odometry(state, arrival - shift)
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
-        if self._fresh(MOTION_TOPIC, message.header.stamp):
+        if self._fresh(MOTION_TOPIC, message):
             self._loop.take_odometry(
-                self._dated(from_odometry(message), arrival), arrival - self._watch.shift)
+                self._dated(from_odometry(message), arrival), arrival - self._even_clock.shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -214,7 +184,7 @@ class Planner(FlockNode):
         return time.monotonic() - self._bridge_received
 
     def _take_neighbor(self, message: Odometry, arrival: int) -> None:
-        if self._fresh('neighbors', message.header.stamp):
+        if self._fresh('neighbors', message):
             state = self._dated(from_odometry(message), arrival)
             reported = self._accelerations.get(state.child)
             if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
@@ -222,11 +192,11 @@ class Planner(FlockNode):
             self._loop.take_neighbor(state)
 
     def _take_received(self, message: Odometry, arrival: int) -> None:
-        if self._fresh('neighbors/heard', message.header.stamp):
+        if self._fresh('neighbors/heard', message):
             self._loop.take_neighbor(self._dated(from_odometry(message), arrival), received=True)
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
-        if self._fresh('neighbors/acceleration', message.header.stamp):
+        if self._fresh('neighbors/acceleration', message):
             state = self._dated(from_acceleration(message), arrival)
             self._accelerations[state.child] = state
 
@@ -247,7 +217,7 @@ class Planner(FlockNode):
             self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
     def _take_frame(self, message: Header, arrival: int) -> None:
-        if self._loop.take_frame(arrival - self._watch.shift,
+        if self._loop.take_frame(arrival - self._even_clock.shift,
                                  stamp_to_nanoseconds(message.stamp)):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
@@ -278,17 +248,17 @@ class Planner(FlockNode):
 
     def _missing(self) -> list[str]:
         """Return the missing condition before it follows."""
-        fault = self._loop.odometry_fault(self._now(), self._settings.current)
+        fault = self._loop.odometry_fault(self._even_clock.now(), self._settings.current)
         missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
         missing += filter(None, [self._loop.waiting(self._bridge_age())])
         return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
-        self._now()  # a clock that was set is found before what waits is judged by it
+        self._even_clock.now()  # a clock that was set is found before what waits is judged by it
         self._poll_frames()
         for poll in self._polls:
             poll()
-        nanoseconds = self._now()
+        nanoseconds = self._even_clock.now()
         self._accelerations = {name: each for name, each in self._accelerations.items()
                                if nanoseconds - each.stamp < NANOSECONDS}
         self._ticked = time.monotonic()
@@ -297,10 +267,10 @@ class Planner(FlockNode):
             nanoseconds, self._settings.current, self._bridge_age())
         if command is not None:
             self._commands.publish(trajectory(
-                make, command._replace(stamp=command.stamp + self._watch.shift)))
+                make, command._replace(stamp=command.stamp + self._even_clock.shift)))
             self.diagnostics.rate('command').tick(self._ticked)
         if (known := self._loop.distance()) is not None:
-            stamp = nanoseconds_to_stamp(nanoseconds + self._watch.shift)
+            stamp = nanoseconds_to_stamp(nanoseconds + self._even_clock.shift)
             self._distances.publish(Range(
                 header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
         self._publish_state(decision, self._loop.seconds(nanoseconds))
@@ -318,15 +288,13 @@ class Planner(FlockNode):
         self._given_up = self._loop.memory.given_up
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
-        values = self.diagnostics.values
-        for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
-            del values[key]
-        values.update({'state': decision.state.value, 'reason': decision.reason,
-                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
-                       'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
-                       'guarded_commands': self._guarded, 'limits': decision.limits,
-                       'warnings': '; '.join(decision.warnings),
-                       'edges': ', '.join(decision.edges), 'known': len(decision.known)})
+        values = {'state': decision.state.value, 'reason': decision.reason,
+                  'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
+                  'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
+                  'guarded_commands': self._guarded, 'limits': decision.limits,
+                  'warnings': '; '.join(decision.warnings),
+                  'edges': ', '.join(decision.edges), 'known': len(decision.known)}
+        self.diagnostics.parts['tick'] = values
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
         if self._bridge is not None:

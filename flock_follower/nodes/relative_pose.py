@@ -34,8 +34,7 @@ from typing import Any
 
 from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
@@ -49,8 +48,8 @@ from flock_follower.messages import (
     read_stamp,
 )
 from flock_follower.nodes.support.conversions import make
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
-from flock_follower.nodes.support.own_odometry import OwnOdometry
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
+from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
@@ -61,14 +60,8 @@ from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
 
-# Best effort takes what reliable and best-effort publishers send alike.
-IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 # What comes between two images must not be lost: 200 messages are 1 s at 200 Hz.
-ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-RANGES_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEIGHBORS_QOS = QoSProfile(depth=10)
-FRAMES_QOS = QoSProfile(depth=1)
-
+ODOM_QOS = best_effort(200)
 POLL_PERIOD = 0.1  # s between two looks at odometry where no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
@@ -88,12 +81,13 @@ class _Camera:
         self._other_transport = 'raw' if compressed else 'compressed'
         self._other_topic = values.images(self._other_transport)
         node.subscribe(CompressedImage if compressed else Image, topic,
-                       partial(node.take_image, self), IMAGE_QOS, of=self.of, largest=None)
+                       partial(node.take_image, self), best_effort(), of=self.of, largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
-                       IMAGE_QOS, of=self.of)
+                       best_effort(), of=self.of)
         self._images = node.diagnostics.rates[f'{topic}_hz']
         self.debug_images = node.create_publisher(
-            Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image', IMAGE_QOS)
+            Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
+            best_effort())
         node.diagnostics.checks += [self._transport_problem, self._processing_problem]
 
     def reject(self, reason: str, detail: str = '') -> None:
@@ -124,7 +118,7 @@ class RelativePose(FlockNode):
         parameters = self.declare(SPECS, build)
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
-        now, steady = time.monotonic(), Clock(clock_type=ClockType.STEADY_TIME)
+        now = time.monotonic()
         self._processed = now
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
@@ -136,18 +130,18 @@ class RelativePose(FlockNode):
                                     awaited=self._awaited)
         self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
                                       required=False, awaited=self._awaited)
-        self.create_timer(POLL_PERIOD, self.poll_odom, clock=steady)
-        self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
-        self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
+        self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
+        self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
+        self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
         self._accelerations = self.create_publisher(
-            AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
-        self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
+            AccelWithCovarianceStamped, 'neighbors/acceleration', QoSProfile(depth=10))
+        self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
         self.diagnostics.checks += [
             self._sight_problem, self._duplicate_problem, self._show_learnt]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
-            clock=steady)
+            clock=STEADY)
         self._overdue.cancel()
 
     def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:
@@ -172,7 +166,7 @@ class RelativePose(FlockNode):
     def _take_motion(self, message: Odometry, arrival: int) -> None:
         self._use_odometry(from_odometry(message))
 
-    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+    def _take_odom(self, message: Odometry, arrival: int) -> None:
         state = self._own.take(message, arrival)
         if state is not None:
             self._use_odometry(state)

@@ -17,7 +17,7 @@ The visualizer node: the flight as markers and transforms for RViz and Foxglove.
 
 Publishes ``visualizer/markers`` (leader, band, command, field of view, guard), and, if tf2_msgs is
 installed, ``odom -> base_link -> camera`` and ``odom -> leader`` on ``/tf``. It works only while a
-viewer subscribes, and no other node waits for it. ``flock_follower.visualization`` has the shapes;
+viewer subscribes, and no other node waits for it. ``nodes.shapes`` has the shapes;
 the band and the cameras are parameters of planner and relative_pose.
 """
 
@@ -31,11 +31,11 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import ColorRGBA, String
@@ -49,22 +49,10 @@ from flock_follower.messages import (
     from_trajectory,
     OdometryState,
     set_quaternion,
+    set_stamp,
     set_vector,
 )
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
-from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import FlockNode, run, Waiting
-from flock_follower.nodes.support.transforms import (
-    AUTO,
-    BASE,
-    ODOM_TF,
-    StaticChild,
-    TransformBroadcaster,
-)
-from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras, CameraValues
-from flock_follower.parameters.spec import check_values, NAMES, Spec
-from flock_follower.ranges import Range
-from flock_follower.visualization import (
+from flock_follower.nodes.shapes import (
     Band,
     CameraSight,
     image_corners,
@@ -73,12 +61,26 @@ from flock_follower.visualization import (
     shapes,
     Snapshot,
 )
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
+from flock_follower.nodes.support.diagnostics import publishers, STEADY
+from flock_follower.nodes.support.inputs import (
+    BASE,
+    best_effort,
+    LATCHED_QOS,
+    StaticChild,
+    TF_STATIC,
+    transform_message,
+)
+from flock_follower.nodes.support.parameters import RemoteParameters
+from flock_follower.nodes.support.runtime import FlockNode, run, Waiting
+from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras, CameraValues
+from flock_follower.parameters.spec import check_values, NAMES, Spec
+from flock_follower.ranges import Range
 
 MARKERS_TOPIC = 'visualizer/markers'
-NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-LAST_TEN_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
+TF = '/tf'
+#: Whether to broadcast odom -> base_link.
+AUTO, ALWAYS, NEVER = ODOM_TF = 'auto', 'always', 'never'
 ASK_PERIOD = 3.0  # s between two requests for parameters of planner and relative_pose
 SETTLING = 2.0  # s in which tf_static is received before a camera's frame is taken as unknown
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
@@ -117,18 +119,17 @@ class Visualizer(FlockNode):
         self._perception = RemoteParameters(self, 'relative_pose', self._take_perception)
         self._planner = RemoteParameters(self, 'planner')
         self._inputs: list[tuple[Any, str, Callable[[Any], None], QoSProfile]] = [
-            (Odometry, 'odom', self._take_odom, NEWEST_QOS),
-            (Odometry, 'neighbors', self._take_neighbor, LAST_TEN_QOS),
-            (Odometry, 'neighbors/heard', self._take_neighbor, LAST_TEN_QOS),
-            (MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST_QOS),
+            (Odometry, 'odom', self._take_odom, best_effort()),
+            (Odometry, 'neighbors', self._take_neighbor, best_effort(10)),
+            (Odometry, 'neighbors/heard', self._take_neighbor, best_effort(10)),
+            (MultiDOFJointTrajectory, 'command/trajectory', self._take_command, best_effort()),
             (String, 'planner/state', self._take_state, LATCHED_QOS),
-            (DiagnosticArray, '/diagnostics', self._take_diagnostics, LAST_TEN_QOS)]
+            (DiagnosticArray, '/diagnostics', self._take_diagnostics, best_effort(10))]
         self._open: list[Subscription] = []
         self._static = StaticChild(self)
         self._transforms = TransformBroadcaster(self, self._static, values['odom_tf'])
         self._markers = self.create_publisher(MarkerArray, MARKERS_TOPIC, 1)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=steady)
+        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=STEADY)
 
     def _take_odom(self, message: Odometry) -> None:
         self._own = from_odometry(message)
@@ -163,7 +164,7 @@ class Visualizer(FlockNode):
             if name.startswith(('camera.', NAMES))})
         for camera in cameras({**values, **given}):
             self._inputs.append((CameraInfo, camera.camera_info,
-                                 partial(self._take_camera_info, camera), NEWEST_QOS))
+                                 partial(self._take_camera_info, camera), best_effort()))
 
     def _take_camera_info(self, camera: CameraValues, message: CameraInfo) -> None:
         link = Transform.from_quaternion(camera.position, quaternion_from_rpy(*camera.rpy))
@@ -179,9 +180,9 @@ class Visualizer(FlockNode):
         drawn = self._markers.get_subscription_count() > 0
         listened = self._transforms.wanted
         self.diagnostics.values['watched'] = drawn or listened
-        wanted = self._period if drawn or listened else IDLE_PERIOD
-        if self._timer.timer_period_ns != round(wanted * 1e9):
-            self._timer.timer_period_ns = round(wanted * 1e9)
+        period = round(1e9 * (self._period if drawn or listened else IDLE_PERIOD))
+        if self._timer.timer_period_ns != period:
+            self._timer.timer_period_ns = period
         if not (drawn or listened):
             self._forget()
             return
@@ -191,7 +192,9 @@ class Visualizer(FlockNode):
         if listened:
             self._broadcast(known)
         if drawn:
-            self._markers.publish(self._message(known))
+            stamp = nanoseconds_to_stamp(known.now)
+            self._markers.publish(MarkerArray(
+                markers=[marker(shape, self._frame, stamp) for shape in shapes(known)]))
             self.diagnostics.rate('drawn').tick(time.monotonic())
 
     def _forget(self) -> None:
@@ -231,9 +234,11 @@ class Visualizer(FlockNode):
         return next((state.frame for state in self._neighbors.values()), '')
 
     def _known(self) -> Snapshot:
-        now = self.get_clock().now().nanoseconds
-        return Snapshot(now, self._pose(), tuple(self._neighbors.values()), self._command,
-                        self._report, self._band(), self._cameras)
+        band = self._planner.values
+        return Snapshot(
+            self.get_clock().now().nanoseconds, self._pose(), tuple(self._neighbors.values()),
+            self._command, self._report,
+            None if band is None else Band(*(band[name] for name in PLANNER)), self._cameras)
 
     def _pose(self) -> tuple[int, Transform] | None:
         """Return the stamp of the newest odometry, ns, and where base_link is by it."""
@@ -247,10 +252,6 @@ class Visualizer(FlockNode):
             T_base_child = Transform.from_quaternion(position, quaternion_from_rpy(*rpy))
         T_odom_child = Transform.from_quaternion(state.position, state.quaternion)
         return state.stamp, T_odom_child @ T_base_child.inverse()
-
-    def _band(self) -> Band | None:
-        values = self._planner.values
-        return None if values is None else Band(*(values[name] for name in PLANNER))
 
     def _broadcast(self, known: Snapshot) -> None:
         if known.own is not None and self._transforms.owns_odometry:
@@ -267,10 +268,6 @@ class Visualizer(FlockNode):
                 self.diagnostics.values[f'frame {frame}'] = (
                     'published on /tf_static by another node')
 
-    def _message(self, known: Snapshot) -> MarkerArray:
-        stamp = nanoseconds_to_stamp(known.now)
-        return MarkerArray(markers=[marker(shape, self._frame, stamp) for shape in shapes(known)])
-
 
 def marker(shape: Shape, frame: str, stamp: Any) -> Marker:
     """Return the message of a shape; its name is the namespace, so that each can be hidden."""
@@ -283,6 +280,72 @@ def marker(shape: Shape, frame: str, stamp: Any) -> Marker:
     red, green, blue, opacity = shape.color
     message.color = ColorRGBA(r=red, g=green, b=blue, a=opacity)
     message.points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
+    return message
+
+
+class TransformBroadcaster:
+    """
+    Broadcasts the frames that a follower knows; nothing if tf2_msgs is not installed.
+
+    A frame has one parent: it jumps if two nodes broadcast its transform. So ``odom -> base_link``
+    is left to the odometry, which normally broadcasts it (REP-105), and the frame of a camera to
+    the node that broadcasts it on ``/tf_static``.
+
+    :param odom_tf: one of ``ODOM_TF``.
+    """
+
+    def __init__(self, node: Node, static: StaticChild, odom_tf: str) -> None:
+        self._node, self._static, self._odom_tf = node, static, odom_tf
+        self._type = transform_message()
+        self._stamps: dict[str, int] = {}
+        self._fixed: dict[str, TransformStamped] = {}
+        if self._type is not None:
+            self._moving = node.create_publisher(self._type, TF, QoSProfile(depth=100))
+            self._still = node.create_publisher(self._type, TF_STATIC, LATCHED_QOS)
+
+    @property
+    def wanted(self) -> bool:
+        """Return whether a node subscribes to moving frames."""
+        return self._type is not None and self._moving.get_subscription_count() > 0
+
+    @property
+    def owns_odometry(self) -> bool:
+        """Return whether to broadcast odom -> base_link here."""
+        others = set(publishers(self._node, TF)) - {self._node.get_fully_qualified_name()}
+        return self._odom_tf == ALWAYS or (self._odom_tf == AUTO and not others)
+
+    def move(self, stamp: int, frame: str, child: str, pose: Transform) -> None:
+        """Broadcast the pose of a frame, ``T_frame_child``, once for each stamp, ns."""
+        if not frame or not child or self._stamps.get(child) == stamp or not self.wanted:
+            return
+        self._stamps[child] = stamp
+        self._moving.publish(self._type(transforms=[_stamped(stamp, frame, child, pose)]))
+
+    def fix(self, stamp: int, frame: str, child: str, pose: Transform) -> bool:
+        """
+        Broadcast the pose of a static frame; return False if another node broadcasts it.
+
+        :param stamp: ns, without meaning for listeners.
+        """
+        if self._type is None:
+            return True
+        if child not in self._fixed and self._static.knows(child):
+            return False
+        stamped = _stamped(stamp, frame, child, pose)
+        before = self._fixed.get(child)
+        if before is None or before.transform != stamped.transform:
+            self._fixed[child] = stamped
+            # All of them: of a latched topic only the last message is kept.
+            self._still.publish(self._type(transforms=list(self._fixed.values())))
+        return True
+
+
+def _stamped(stamp: int, frame: str, child: str, pose: Transform) -> TransformStamped:
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, stamp)
+    set_vector(message.transform.translation, pose.translation)
+    set_quaternion(message.transform.rotation, pose.quaternion)
     return message
 
 

@@ -162,25 +162,22 @@ class OdometryBuffer:
     STEP = 0.03
 
     def __init__(self) -> None:
-        # Rows of samples; those held are from _first to before _end. Moved to the front when full.
-        self._rows: Array = np.empty((2 * self.CAPACITY, 17))
-        self._stamps = self._rows[:, 0]
-        self._first = self._end = 0
+        self._rows: Array = np.empty((0, 17))
         self._near = self._far = self._rough = 0.0
         self._looks = 0
 
     def __len__(self) -> int:
         """Return how many samples are held."""
-        return self._end - self._first
+        return len(self._rows)
 
     @property
     def newest(self) -> float | None:
         """Return the newest stamp, s, or None while empty."""
-        return float(self._stamps[self._end - 1]) if len(self) else None
+        return float(self._rows[-1, 0]) if len(self) else None
 
     def clear(self) -> None:
         """Forget all samples."""
-        self._first = self._end
+        self._rows = self._rows[:0]
 
     def add(self, sample: OdometrySample) -> bool:
         """
@@ -188,28 +185,21 @@ class OdometryBuffer:
 
         A sample that is only late, or a repetition, is ignored.
         """
-        jumped, newest = False, self.newest
-        if newest is not None and sample.stamp <= newest:
+        newest = self.newest
+        jumped = newest is not None and sample.stamp <= newest
+        if newest is not None and jumped:
             if newest - sample.stamp <= MAX_JUMP:
                 return False
-            self._first = self._end
-            jumped = True
-        travel = self._travel(sample)
-        if self._end == len(self._rows):
-            kept = self._rows[self._first:].copy()
-            self._first, self._end = 0, len(kept)
-            self._rows[:self._end] = kept
-        self._rows[self._end] = sample.row(travel)
-        self._end += 1
-        self._first = max(self._first, self._end - self.CAPACITY)
-        while sample.stamp - self._stamps[self._first] > self.HORIZON:
-            self._first += 1
+            self.clear()
+        old = np.count_nonzero(sample.stamp - self._rows[:, 0] > self.HORIZON)
+        row = sample.row(self._travel(sample))
+        self._rows = np.vstack([self._rows[max(old, len(self) + 1 - self.CAPACITY):], row])
         return jumped
 
     def _travel(self, sample: OdometrySample) -> Array:
         if not len(self):
             return np.array(sample.position, dtype=float)
-        last = self._rows[self._end - 1]
+        last = self._rows[-1]
         dt = sample.stamp - float(last[0])
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
         moved: Array = sample.position - last[_POSITION]
@@ -232,10 +222,10 @@ class OdometryBuffer:
         after = self._reaching(stamp, extrapolate)
         if isinstance(after, Missing):
             return after
-        if after == self._end:
-            return _extrapolated(OdometrySample.of_row(self._rows[after - 1].copy()), stamp)
-        if self._stamps[after] == stamp:
-            return OdometrySample.of_row(self._rows[after].copy())  # a copy, as rows move
+        if after == len(self):
+            return _extrapolated(OdometrySample.of_row(self._rows[-1].copy()), stamp)
+        if self._rows[after, 0] == stamp:
+            return OdometrySample.of_row(self._rows[after].copy())
         return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
     def places(self, stamps: Array, points: Array) -> Array | None:
@@ -244,7 +234,7 @@ class OdometryBuffer:
 
         Between two samples position and attitude are linear. None if a stamp is not covered.
         """
-        held = self._stamps[self._first:self._end]
+        held = self._rows[:, 0]
         if not len(held) or not held[0] <= stamps.min() <= stamps.max() <= held[-1]:
             return None
         after = held.searchsorted(stamps).clip(1)
@@ -252,7 +242,7 @@ class OdometryBuffer:
         if span.max() > self.MAX_GAP:
             return None
         part = (stamps - held[after - 1]) / span
-        poses = self._rows[self._first:self._end, 10:].T  # travel and attitude
+        poses = self._rows[:, 10:].T  # travel and attitude
         before = poses[:, after - 1]
         px, py, pz, x, y, z, w = before + part * (poses[:, after] - before)
         u, v, t = points.T
@@ -272,20 +262,19 @@ class OdometryBuffer:
         if not len(self):
             return Missing.EMPTY
         after = self._after(stamp, 'left')
-        if after == self._end:
-            ahead = stamp - float(self._stamps[after - 1])
+        if after == len(self):
+            ahead = stamp - float(self._rows[-1, 0])
             return after if extrapolate and ahead <= self.MAX_EXTRAPOLATION else (
                 Missing.TOO_NEW)
-        if self._stamps[after] == stamp:
+        if self._rows[after, 0] == stamp:
             return after
-        if after == self._first:
+        if after == 0:
             return Missing.TOO_OLD
-        wide = self._stamps[after] - self._stamps[after - 1] > self.MAX_GAP
+        wide = self._rows[after, 0] - self._rows[after - 1, 0] > self.MAX_GAP
         return Missing.GAP if wide else after
 
     def _after(self, stamp: float, side: Literal['left', 'right']) -> int:
-        held = self._stamps[self._first:self._end]
-        return self._first + int(held.searchsorted(stamp, side))
+        return int(self._rows[:, 0].searchsorted(stamp, side))
 
     def steadied(self, state: OdometrySample) -> OdometrySample:
         """

@@ -61,7 +61,7 @@ NOISE_TIME = 2.0
 
 class _WhiteJerk:
     """
-    What the axes of a vector share: covariance, gain, and the noise of a measurement.
+    A value along three axes, its ``rate`` and ``acceleration`` (3,) at ``stamp``, s.
 
     :param jerk: its spectral density, (unit/s^3)^2/Hz.
     :param noise: standard deviation of a measurement: initial, least, and largest.
@@ -71,15 +71,19 @@ class _WhiteJerk:
     def __init__(self, jerk: float, noise: tuple[float, float, float], rate: float,
                  acceleration: float) -> None:
         self._jerk, self._initial = jerk, (rate**2, 0.0, acceleration**2)
-        self.stamp: float | None = None
         self.variance, self._least, self._most = (std**2 for std in noise)
         """Variance of a measurement along an axis, and its limits."""
+        self.stamp = -math.inf
+        self.value: Array = np.zeros(3)
+        self.rate: Array = np.zeros(3)
+        self.acceleration: Array = np.zeros(3)
         # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
         # plain numbers: at hundreds of messages per second matrices so small cost more.
         self._covariance = (0.0,) * 6
 
-    def _begin(self, stamp: float) -> None:
-        self.stamp = stamp
+    def _restart(self, stamp: float, value: Array) -> None:
+        self.stamp, self.value = stamp, value
+        self.rate, self.acceleration = np.zeros(3), np.zeros(3)
         self._covariance = (self.variance, 0.0, 0.0, *self._initial)
 
     def _predict(self, dt: float) -> float:
@@ -95,8 +99,9 @@ class _WhiteJerk:
         self._covariance = pp, pv, pa, vv, va, aa
         return pp + self.variance
 
-    def _gains(self, stamp: float, dt: float, innovation: Array) -> tuple[float, float, float]:
-        """Return what a unit of innovation adds to value, rate and acceleration; learn from it."""
+    def _correct(self, stamp: float, innovation: Array) -> Array:
+        """Correct rate and acceleration; return the correction of the value; learn the noise."""
+        dt = stamp - self.stamp
         pp, pv, pa, vv, va, aa = self._covariance
         spread = pp + self.variance
         p, v, a = pp / spread, pv / spread, pa / spread
@@ -108,16 +113,14 @@ class _WhiteJerk:
         self.variance += min(1.0, dt / NOISE_TIME) * (seen - self.variance)
         self.variance = min(max(self.variance, self._least), self._most)
         self.stamp = stamp
-        return p, v, a
+        self.rate = self.rate + dt * self.acceleration + v * innovation
+        self.acceleration = self.acceleration + a * innovation
+        correction: Array = p * innovation
+        return correction
 
 
 class DerivedVelocity(_WhiteJerk):
-    """
-    The velocity of a point, from its positions.
-
-    ``position`` (3,), m, ``velocity`` (3,), m/s, and ``acceleration`` (3,), m/s^2, are those at
-    ``stamp``, s, in the frame of the positions.
-    """
+    """The velocity of a point, ``rate``, m/s, from its positions, m, in their frame."""
 
     #: Positions closer together than this, s, add no information: filter errors are not white.
     SHORTEST = 0.018
@@ -134,9 +137,6 @@ class DerivedVelocity(_WhiteJerk):
 
     def __init__(self) -> None:
         super().__init__(0.5, (0.003, 0.0003, 0.1), rate=1.0, acceleration=2.0)
-        self.position: Array = np.zeros(3)
-        self.velocity: Array = np.zeros(3)
-        self.acceleration: Array = np.zeros(3)
         self._steps = 0
         self._start = 0.0
 
@@ -147,17 +147,17 @@ class DerivedVelocity(_WhiteJerk):
 
     def velocity_at(self, stamp: float) -> Array:
         """Return the velocity (3,), m/s, at a stamp, s, soon after the newest position."""
-        return self.velocity + (stamp - (self.stamp or stamp)) * self.acceleration
+        return self.rate + (stamp - self.stamp) * self.acceleration
 
     def take(self, stamp: float, position: Array) -> float:
         """Take a position; return how far it jumped, m, else 0."""
-        dt = LONGEST_GAP + 1.0 if self.stamp is None else stamp - self.stamp
+        dt = stamp - self.stamp
         if not 0.0 < dt <= LONGEST_GAP:
-            self._restart(stamp, position)
+            self._begin(stamp, position)
             return 0.0
         if dt < self.SHORTEST:
             return 0.0
-        expected = self.position + dt * self.velocity + 0.5 * dt * dt * self.acceleration
+        expected = self.value + dt * self.rate + 0.5 * dt * dt * self.acceleration
         innovation = position - expected
         off = float(np.abs(innovation).max())
         far = off > POSITION_JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt
@@ -166,59 +166,45 @@ class DerivedVelocity(_WhiteJerk):
         often = self._steps >= self.MOST_STEPS
         self._steps = self._steps + 1 if step else 0
         if far and often:
-            self._restart(stamp, position)
-            return off
-        self.velocity = self.velocity + dt * self.acceleration
-        if step and not often:
+            self._begin(stamp, position)
+        elif step and not often:
             # The motion goes on, from another place.
             self._covariance = self.variance, 0.0, 0.0, *self._covariance[3:]
-            self.stamp, self.position = stamp, position
-            return off if far else 0.0
-        p, v, a = self._gains(stamp, dt, innovation)
-        self.position = expected + p * innovation
-        self.velocity = self.velocity + v * innovation
-        self.acceleration = self.acceleration + a * innovation
-        return 0.0
+            self.rate = self.rate + dt * self.acceleration
+            self.stamp, self.value = stamp, position
+        else:
+            self.value = expected + self._correct(stamp, innovation)
+            return 0.0
+        return off if far else 0.0
 
-    def _restart(self, stamp: float, position: Array) -> None:
-        self._begin(stamp)
-        self._start = stamp
-        self.position, self._steps = position, 0
-        self.velocity, self.acceleration = np.zeros(3), np.zeros(3)
+    def _begin(self, stamp: float, position: Array) -> None:
+        self._restart(stamp, position)
+        self._start, self._steps = stamp, 0
 
 
 class DerivedRates(_WhiteJerk):
     """
-    The angular velocity of a body, from its attitudes.
+    The angular velocity of a body, ``rate``, rad/s, in the body, from its attitudes.
 
-    ``quaternion`` (x, y, z, w) takes the body to odom; ``rates`` (3,), rad/s, and ``acceleration``
-    (3,), rad/s^2, are in the body, at ``stamp``, s.
+    ``value`` (x, y, z, w) takes the body to odom.
     """
 
     def __init__(self) -> None:
         super().__init__(300.0, (0.001, 0.0001, 0.05), rate=1.0, acceleration=5.0)
-        self.quaternion: Array = np.array([0.0, 0.0, 0.0, 1.0])
-        self.rates: Array = np.zeros(3)
-        self.acceleration: Array = np.zeros(3)
 
     def take(self, stamp: float, quaternion: Array) -> None:
         """Take an attitude."""
-        dt = LONGEST_GAP + 1.0 if self.stamp is None else stamp - self.stamp
+        dt = stamp - self.stamp
         if not 0.0 < dt <= LONGEST_GAP:
-            self._begin(stamp)
-            self.quaternion, self.rates = quaternion, np.zeros(3)
-            self.acceleration = np.zeros(3)
+            self._restart(stamp, quaternion)
             return
-        turn = dt * self.rates + 0.5 * dt * dt * self.acceleration
-        expected = quaternion_multiply(self.quaternion, rotation_vector_to_quaternion(turn))
+        turn = dt * self.rate + 0.5 * dt * dt * self.acceleration
+        expected = quaternion_multiply(self.value, rotation_vector_to_quaternion(turn))
         innovation = quaternion_to_rotation_vector(
             quaternion_multiply(quaternion_conjugate(expected), quaternion))
         self._predict(dt)
-        p, v, a = self._gains(stamp, dt, innovation)
-        self.quaternion = quaternion_multiply(
-            expected, rotation_vector_to_quaternion(p * innovation))
-        self.rates = self.rates + dt * self.acceleration + v * innovation
-        self.acceleration = self.acceleration + a * innovation
+        self.value = quaternion_multiply(
+            expected, rotation_vector_to_quaternion(self._correct(stamp, innovation)))
 
 
 CHILD: Final = 'child'

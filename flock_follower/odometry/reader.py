@@ -70,15 +70,14 @@ class UpAxis:
     """Watches attitudes."""
 
     def __init__(self) -> None:
-        self._stamp: float | None = None
+        self._stamp = -math.inf
         self._up = [0.0, 0.0, 0.0]  # in base_link, mean
 
     def take(self, stamp: float, rotation: Array) -> None:
         """Take an attitude (3, 3), base_link to odom, at a stamp, s."""
-        before = stamp if self._stamp is None else self._stamp
-        if self._stamp is not None and stamp - before < PERIOD:
+        if stamp - self._stamp < PERIOD:
             return
-        share = 1.0 if self._stamp is None else 1.0 - math.exp((before - stamp) / MEAN_TIME)
+        share = 1.0 - math.exp((self._stamp - stamp) / MEAN_TIME)
         self._up = [old + share * (new - old) for old, new in zip(self._up, rotation[2].tolist())]
         self._stamp = stamp
 
@@ -173,11 +172,9 @@ class OdometrySource:
     def _restart(self) -> None:
         self._stamp: int | None = None
         self._epoch = 0
-        self._velocity: Array | None = None
         self._reading = self.twist.frame
         self._fading: Array = np.zeros(3)
         self._doubt: Array = np.zeros(3)  # by how much the two readings differ, in odom
-        self._stepped = False
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
         self._attitudes: deque[tuple[float, Array]] = deque(maxlen=ATTITUDES)
@@ -276,7 +273,7 @@ class OdometrySource:
         for time, quaternion in self._attitudes:
             self.turning.take(time, quaternion)
         self._attitudes.clear()
-        return self.turning.rates
+        return self.turning.rate
 
     def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
               lever_velocity: Array | None) -> Array:
@@ -293,14 +290,12 @@ class OdometrySource:
             self._reading = self.twist.reading(child, odom)
             self._doubt = child - odom
             velocity = self._as_read(self._reading, time, child, odom)
-            if self._velocity is not None and before != self._reading:
+            if self._gaps and before != self._reading:
                 # The step that another reading would be is faded out.
                 self._fading = (self._fading + self._as_read(before, time, child, odom)) - velocity
-                self._stepped = True
-        if self._velocity is not None and self._stepped:
+        if self._fading.any():
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
             velocity = velocity + self._fading
-        self._velocity = velocity
         return velocity
 
     def _as_read(self, reading: str, time: float, child: Array, odom: Array) -> Array:
@@ -328,11 +323,9 @@ class OdometrySource:
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.variance_of_velocity
         wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
-        if not wrong and not self._stepped:
-            return pose, twist
-        for share, off in ((wrong, self._doubt), (float(self._stepped), self._fading)):
+        for share, off in ((wrong, self._doubt), (1.0, self._fading)):
             # The velocity may be the other reading, and a step being faded out is an error.
-            if share:
+            if share and off.any():
                 in_base = rotation.T.dot(off)
                 twist = twist.copy()
                 twist[:3, :3] += share * (in_base[:, None] * in_base)

@@ -26,8 +26,7 @@ import pytest
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.metrics import measure, of_runs, STATES
 from flock_desk.scenarios.flock import Flock, FollowerFailure
-from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Outage, RangeErrors, Scenario
+from flock_desk.scenarios.scenario import LeaderMotion, Outage, RangeErrors, Scenario
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.planner.modes import State
 

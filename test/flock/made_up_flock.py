@@ -89,11 +89,9 @@ class Report:
     """How a flight was for one who was told of another."""
 
     errors: list[float] = field(default_factory=list)
-    """Of the place told at the stamp, relative to oneself, m ..."""
-    errors_now: list[float] = field(default_factory=list)
-    """... and of what becomes of it by the time it is used."""
+    """Of the place told at the stamp, relative to oneself, m."""
     chi2: list[float] = field(default_factory=list)
-    """Of the latter."""
+    """Of what becomes of it by the time it is used."""
     since: float | None = None
     """When it was told first, s."""
     ticks: int = 0
@@ -254,7 +252,6 @@ class MadeUpFlock:
             error = state.position - self.relative(k, of, then, last)
             ahead = state.position + age * state.velocity - self.relative(k, of, last)
             record.errors.append(float(np.linalg.norm(error)))
-            record.errors_now.append(float(np.linalg.norm(ahead)))
             record.chi2.append(float(ahead @ np.linalg.solve(
                 state.pose_covariance[:3, :3], ahead)))
             record.ticks += 1

@@ -96,13 +96,6 @@ def test_a_switch_away_and_back_that_was_not_received_leaves_it_braking():
     assert 'command' in flight.kinds(10)
 
 
-def test_the_mode_of_a_px4_without_current_mode_is_that_of_its_heartbeat():
-    flight = Flight(faults=[Fault('drop', 0.0, 99.0, 'sent', message='CURRENT_MODE')]).follow(1.0)
-    flight.controller.pilot_switches('AUTO.LOITER')
-    flight.fly(1.1)
-    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
-
-
 def test_a_line_that_delivers_late_gets_no_setpoint_while_nothing_is_received():
     wire = MemoryLine()
     wire.delivers_late = True
@@ -131,19 +124,6 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
 
 
 # Refused, lost, late.
-
-
-@BOTH
-@pytest.mark.parametrize(('what', 'arguments'), [('land', []), ('offboard', [False])])
-def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(
-        personality, what, arguments):
-    flight = Flight(personality, announce_as_gcs=True, faults=[
-        Fault('refuse', 4.0, command='DO_SET_MODE', reason='no position')])
-    flight.follow(3.0)
-    outcome = flight.ask(what, *arguments)
-    assert not outcome.success and 'no position' in outcome.message
-    flight.fly(2.0)
-    assert flight.kinds(40) == {'brake'} and flight.speed < 0.1
 
 
 @BOTH

@@ -58,18 +58,6 @@ def test_two_whole_flights_from_arming_to_landing_need_nothing_but_the_services(
         assert flight.bridge.state(flight.now).startswith('INACTIVE')
 
 
-@pytest.mark.parametrize('faults', [
-    [Fault('drop', 0.0, share=0.1)],
-    [Fault('garbage', 3.0, share=0.5), Fault('duplicate', 3.0)]], ids=['losses', 'garbage'])
-def test_losses_garbage_and_duplicates_on_the_line_move_nothing(faults):
-    flight = Flight(faults=faults)
-    flight.fly(1.5)
-    flight.follow(4.0)
-    assert flight.mode == 'OFFBOARD' and 0.4 < flight.speed < 0.53
-    assert flight.kinds(40) == {'command'}
-    assert len(faults) == 1 or flight.bridge.link.ignored['undecodable'] > 0
-
-
 # Without GPS.
 
 

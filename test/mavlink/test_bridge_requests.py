@@ -161,17 +161,6 @@ def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, wo
     assert bridge.unready(flight.now) == words
 
 
-def test_the_mode_that_arm_leaves_first_speaks_against_nothing():
-    """After a landing out of OFFBOARD, PX4 is in OFFBOARD again, which it cannot fly."""
-    flight = Flight()
-    flight.engage()
-    assert flight.ask('land').success
-    flight.fly_until(lambda: not flight.controller.armed, 30.0)
-    flight.fly(5.0)
-    assert flight.mode == 'OFFBOARD' and flight.bridge.unready(flight.now) == ''
-    assert flight.ask('arm', True).success
-
-
 def test_arming_after_a_take_off_that_was_ended_by_a_landing_does_not_climb():
     """PX4 is in AUTO.TAKEOFF again, and takes off as soon as it is armed."""
     flight = Flight(start='landed')

@@ -119,13 +119,15 @@ def test_any_other_mode_once_or_a_new_request_cancels_the_landing(status):
 @pytest.mark.slow
 @BOTH
 def test_a_planner_that_dies_is_followed_by_hold_mode_within_four_seconds(personality):
-    flight = Flight(personality).follow(2.0)
+    flight = Flight(personality, bridge={'report_to_gcs': True}).follow(2.0)
     flight.planner, killed = None, flight.vehicle.position[2]
     took = flight.fly_until(lambda: flight.mode != flight.modes.offboard, 6.0)
     assert flight.mode == flight.modes.hold and 3.0 < took < 4.0
     assert abs(flight.vehicle.position[2] - killed) < 0.3
     flight.fly(1.0)
     assert flight.bridge.state(flight.now) == 'INACTIVE: given back (no command for 3 s)'
+    assert [m.text.rstrip('\0') for _, m in flight.received if m.get_type() == 'STATUSTEXT'] == [
+        'flock: hands over: no command for 3 s']
 
 
 @pytest.mark.slow

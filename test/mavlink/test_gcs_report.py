@@ -16,7 +16,6 @@
 
 import math
 
-from bridge_flight import BOTH, Flight
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.gcs_report import GroundStationReport, LONGEST_TEXT
@@ -70,15 +69,3 @@ def test_a_text_of_any_name_fits_one_message():
     report.take_distance('Gänsegeier' * 20, 2.0, 1.0)
     ((_, text),) = texts(report, 1.0)
     assert len(text) == LONGEST_TEXT and text.startswith('flock: TRACK G?nsegeier')
-
-
-@BOTH
-def test_a_bridge_without_commands_reports_that_it_hands_over(personality):
-    flight = Flight(personality, bridge={'ground_station': GroundStationReport()})
-    flight.engage()
-    flight.planner = (0.0, 0.0, 0.0)
-    flight.fly(1.0)
-    flight.planner = None
-    flight.fly(6.0)
-    assert [m.text.rstrip('\0') for _, m in flight.received if m.get_type() == 'STATUSTEXT'] == [
-        'flock: hands over: no command for 3 s']

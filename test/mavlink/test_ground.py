@@ -14,46 +14,19 @@
 
 """On the ground no setpoint leaves, whatever the noise: upward ones start PX4's take-off."""
 
-from bridge_flight import BOTH, Flight
+from bridge_flight import Flight
 import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import (
-    OffboardRequested,
     Permission,
 )
 from flock_follower.mavlink.setpoint_rules import NONE
 
 pytestmark = pytest.mark.slow
 OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
-
-
-class NoisyFlight(Flight):
-    """Odometry errs by 2 cm/s, white."""
-
-    def fly(self, seconds):
-        rng = np.random.default_rng(self.steps)
-        for _ in range(round(seconds / 0.01)):
-            self.odom_error = 0.02 * rng.normal(size=3)
-            super().fly(0.01)
-
-
-@BOTH
-def test_armed_on_the_ground_nothing_leaves_though_offboard_is_requested(personality):
-    flight = NoisyFlight(personality, start='landed', parameters={
-        'COM_DISARM_PRFLT' if personality == 'px4' else 'DISARM_DELAY': 0.0})
-    flight.fly(2.0)
-    assert flight.ask('arm', True).success
-    flight.planner = np.array([0.2, 0.0, 1.0])
-    for _ in range(3):
-        assert 'on the ground: arm, call takeoff' in flight.ask('offboard', True).message
-        flight.fly(3.0)
-        if personality == 'px4':
-            flight.controller.pilot_switches('OFFBOARD')  # the pilot's switch does not help
-    assert flight.controller.armed and not flight.setpoints()
-    assert max(abs(v) for v in flight.vehicle.position) < 0.01
 
 
 def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
@@ -66,7 +39,7 @@ def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
 @pytest.mark.parametrize('height', [0.2, None])
 def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(height):
     control = Gate(velocity_source='odom')
-    control.permit(OffboardRequested(0.0))
+    control.permit(Permission().requested(0.0))
     ended = []
     for k in range(60):
         now = 1.0 + 0.05 * k
@@ -79,4 +52,3 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
         ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
     assert control.permission == Permission(reason='on the ground')
-

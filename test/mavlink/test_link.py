@@ -15,9 +15,6 @@
 """The link: which sender is received and answered, on a line in memory."""
 
 from fuzz_mavlink import FuzzedLine
-from hypothesis import given
-from hypothesis import strategies as st
-from memory_line import MemoryLine
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
@@ -109,14 +106,6 @@ def test_garbage_and_floods_of_another_sender_cost_the_vehicle_nothing():
     assert bench.beats('vehicle') == ['HEARTBEAT']
     assert bench.link.ignored['flood'] > 20
     assert bench.link.ignored['unknown message'] + bench.link.ignored['undecodable'] < 2000
-
-
-@given(st.binary(min_size=1, max_size=300))
-def test_no_bytes_whatsoever_break_the_link(data):
-    link = Link(MemoryLine())
-    for now in (1.0, 2.0):
-        link.transport.arrived.append(data)
-        assert link.receive(now) == []
 
 
 # Signing.

@@ -26,21 +26,21 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
-    ForwardedOdometry,
     jumped,
     OdometryForwarder,
 )
+from flock_follower.messages import OdometryState
 
-POSE, TWIST, RATE = map(np.diag, (
-    [0.01, 0.02, 0.03, 0.1, 0.2, 0.3], [0.04, 0.05, 0.06], [0.4, 0.5, 0.6]))
+POSE, TWIST = map(np.diag, (
+    [0.01, 0.02, 0.03, 0.1, 0.2, 0.3], [0.04, 0.05, 0.06, 0.4, 0.5, 0.6]))
 
 
 def sample(time=10.0, position=(1.0, 2.0, 3.0), quaternion=(0.0, 0.0, 0.0, 1.0),
-           velocity=(0.4, 0.0, 0.0), rates=(0.0, 0.0, 0.0), pose=POSE,
-           twist=TWIST, rate=RATE):
-    return ForwardedOdometry(
-        time, np.array(position), np.array(quaternion), np.array(velocity), np.array(rates),
-        pose, twist, rate)
+           velocity=(0.4, 0.0, 0.0), rates=(0.0, 0.0, 0.0), pose=POSE, twist=TWIST):
+    """Return a state whose velocity covariance is in the odometry's frame, and its time."""
+    return OdometryState(
+        0, 'odom', 'base_link', np.array(position), np.array(quaternion), np.array(velocity),
+        np.array(rates), pose, twist, np.eye(3)), time
 
 
 def diagonal(triangle):
@@ -50,7 +50,7 @@ def diagonal(triangle):
 @pytest.mark.parametrize(('dialect', 'frame'), [
     (PX4, mavlink.MAV_FRAME_LOCAL_NED), (ARDUPILOT, mavlink.MAV_FRAME_LOCAL_FRD)])
 def test_each_autopilot_gets_its_frame_and_the_same_numbers(dialect, frame):
-    message = encode_odometry(sample(velocity=(0.4, 0.1, 0.2), rates=(0.1, 0.2, 0.3)), dialect, 0)
+    message = encode_odometry(*sample(velocity=(0.4, 0.1, 0.2), rates=(0.1, 0.2, 0.3)), dialect, 0)
     assert (message.frame_id, message.child_frame_id, message.estimator_type) == (
         frame, mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_ESTIMATOR_TYPE_VIO)
     assert (message.time_usec, message.x, message.y, message.z) == (10_000_000, 2.0, 1.0, -3.0)
@@ -66,7 +66,7 @@ def test_covariances_turn_with_their_axes():
     pose = POSE.copy()
     pose[0, 2] = pose[2, 0] = 0.005  # east with up
     message = encode_odometry(
-        sample(quaternion=quaternion_from_yaw(math.pi / 2), pose=pose), PX4, 0)
+        *sample(quaternion=quaternion_from_yaw(math.pi / 2), pose=pose), PX4, 0)
     # ENU x is NED y; a body that faces north has FLU x along ENU y.
     assert diagonal(message.pose_covariance) == pytest.approx([0.02, 0.01, 0.03, 0.2, 0.1, 0.3])
     assert diagonal(message.velocity_covariance) == pytest.approx(
@@ -79,7 +79,7 @@ def test_covariances_turn_with_their_axes():
     np.eye(6) - 1e308 * np.eye(6, k=1)])
 def test_a_covariance_that_is_none_is_replaced(bad):
     message = encode_odometry(
-        sample(pose=bad, twist=bad[:3, :3], rate=bad[3:, 3:]), ARDUPILOT, 0)
+        *sample(pose=bad, twist=bad), ARDUPILOT, 0)
     for triangle in (message.pose_covariance, message.velocity_covariance):
         assert diagonal(triangle) == pytest.approx([0.01] * 3 + [0.0025] * 3)
     message.pack(mavlink.MAVLink(None))  # which raises where a float32 cannot hold a number
@@ -93,13 +93,13 @@ def test_a_covariance_that_is_none_is_replaced(bad):
     ({'time': 10.5, 'position': (1.2, 2.0, 3.0)}, False),
     ({'time': 11.0, 'position': (1.0, 2.0, 3.0)}, True)])
 def test_a_jump_is_what_the_motion_does_not_explain(change, jump):
-    assert jumped(sample(), sample(**{'time': 10.1, **change})) == jump
+    assert jumped(*sample(), *sample(**{'time': 10.1, **change})) == jump
 
 
 def test_jumps_raise_the_reset_counter_of_every_message_after():
     forwarder, counters = OdometryForwarder(rate=30.0), []
     for n, east in enumerate([0.0, 0.02, 5.0, 5.02, 0.0]):
-        assert forwarder.take(sample(n * 0.05, (east, 0.0, 0.0)), n * 0.05) == ''
+        assert forwarder.take(*sample(n * 0.05, (east, 0.0, 0.0)), n * 0.05) == ''
         if n != 1:  # what waits keeps the counter it was taken with
             counters += [m.reset_counter for m in forwarder.messages(PX4, n * 0.05)]
     assert counters == [0, 0, 1, 1, 2] and forwarder.counters['jumps'] == 2
@@ -107,16 +107,16 @@ def test_jumps_raise_the_reset_counter_of_every_message_after():
 
 def test_what_is_too_old_or_from_the_future_is_not_sent_and_counted():
     forwarder = OdometryForwarder(rate=30.0)
-    assert forwarder.take(sample(10.0), 10.31) == 'too old to forward'
-    assert forwarder.take(sample(10.0), 9.8) == 'from the future, not forwarded'
+    assert forwarder.take(*sample(10.0), 10.31) == 'too old to forward'
+    assert forwarder.take(*sample(10.0), 9.8) == 'from the future, not forwarded'
     assert forwarder.messages(PX4, 9.8) == []
     for time in (20.0, 20.1, 20.2):
-        forwarder.take(sample(time, (0.4 * (time - 20.0), 0.0, 0.0)), time)
+        forwarder.take(*sample(time, (0.4 * (time - 20.0), 0.0, 0.0)), time)
     assert [m.time_usec for m in forwarder.messages(PX4, 20.35)] == [20_100_000, 20_200_000]
     assert forwarder.counters['too old to send'] == 1
     # A source that starts again is forwarded at once.
     resets = forwarder.reset_counter
-    forwarder.take(sample(5.0), 5.0)
+    forwarder.take(*sample(5.0), 5.0)
     assert [m.reset_counter for m in forwarder.messages(PX4, 5.0)] == [resets + 1]
 
 
@@ -127,7 +127,7 @@ def test_the_rate_is_limited_evenly_and_never_halved(source, rate, expected):
     for n in range(round(10 * source)):
         # A stamp that wanders by 2 ms.
         time = n / source + (0.002 if n % 3 else 0.0)
-        forwarder.take(sample(time, (0.4 * time, 0.0, 0.0)), time)
+        forwarder.take(*sample(time, (0.4 * time, 0.0, 0.0)), time)
         times += [m.time_usec * 1e-6 for m in forwarder.messages(PX4, time)]
     assert len(times) == pytest.approx(10 * expected, rel=0.02)
     assert np.diff(times).max() < 1.6 / expected

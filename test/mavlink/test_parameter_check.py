@@ -19,6 +19,7 @@ import struct
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.files import resource
 from flock_follower.mavlink.dialects import ARDUPILOT, DIALECTS, PX4
 from flock_follower.mavlink.parameter_check import (
     obstacle,
@@ -30,8 +31,6 @@ from flock_follower.mavlink.parameter_check import (
     rules,
     unread,
 )
-from flock_follower.parameters.mavlink_bridge_table import recommendations
-from flock_follower.resources import resource
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (
@@ -82,15 +81,6 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     assert {entry.name: entry.value for entry in always}.get('COM_OBL_RC_ACT', 5) == 5
     assert {rule.name for rule in RULES[dialect.name]} <= set(values)
     assert obstacle(dialect, checked(needed=NEEDED, **values), True) == ''
-
-
-@pytest.mark.parametrize(('takeoff_height', 'least'), [(1.5, 1.5), (2.5, 2.5), (10.0, 2.5)])
-def test_the_least_takeoff_height_recommended_is_none_that_takeoff_would_refuse(
-        takeoff_height, least):
-    found = recommendations(False, takeoff_height)
-    values = {entry.name: entry.value for entry in found['px4']}
-    assert values['MIS_TAKEOFF_ALT'] == least and values['COM_OF_LOSS_T'] == 0.5
-    assert not {entry.name for entry in found['ardupilot']} & {'VISO_TYPE', 'GPS1_TYPE'}
 
 
 def test_both_forms_of_file_are_read_and_a_line_that_is_no_parameter_is_named():

@@ -19,7 +19,6 @@ import pytest
 
 from flock_follower.mavlink.status_texts import (
     CHUNK_TIMEOUT,
-    MOST_UNFINISHED,
     StatusTexts,
 )
 
@@ -62,14 +61,6 @@ def test_a_text_whose_end_is_lost_is_told_after_a_while():
     texts.add(statustext(A, number=3), 1.0)
     assert new(texts, 1.0 + CHUNK_TIMEOUT) == []
     assert new(texts, 1.1 + CHUNK_TIMEOUT) == texts.since(1.0) == [A + '...']
-
-
-def test_many_unfinished_texts_are_told_and_do_not_add_up():
-    texts = StatusTexts()
-    for number in range(1, 101):
-        texts.add(statustext(f'{number:050}', number=number), 1.0)
-    assert new(texts, 1.0) == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
-    assert len(new(texts, 9.0)) == MOST_UNFINISHED and new(texts, 99.0) == []
 
 
 def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():

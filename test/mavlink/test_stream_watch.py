@@ -29,7 +29,7 @@ from flock_follower.mavlink.estimator_health import (
     RECENT,
     SHORTEST_WAIT,
 )
-from flock_follower.mavlink.telemetry import wanted_rates
+from flock_follower.mavlink.housekeeping import wanted_rates
 
 POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
@@ -89,13 +89,6 @@ def test_what_stays_low_is_asked_for_less_and_less_often():
     assert waits.min() >= SHORTEST_WAIT and waits[-1] >= LONGEST_WAIT
     # Nor is a rate that goes up and down a reason to ask every two seconds.
     assert len(asking(lambda now, times: now % 1.0 < 0.5, 200.0)) < 12
-
-
-def test_where_asking_helps_it_asks_at_once_each_time():
-    # Another one sets its rates every 15 s; what we ask for is obeyed half a second later.
-    times = asking(lambda now, times: now >= 15.0 and not (
-        times and times[-1] >= now // 15.0 * 15.0 - 0.01 and now - times[-1] > 0.5), 61.0)
-    assert times == pytest.approx([15.0, 30.0, 45.0, 60.0], abs=0.06)
 
 
 def intervals(flight, since=0.0):

@@ -26,7 +26,6 @@ from flock_follower.mavlink.velocity_check import (
     difference,
     displaced,
     finite_vector,
-    fresh,
     KnownMotion,
     LATCH_TIME,
     Motion,
@@ -56,18 +55,6 @@ def braking(known):
 
 
 # One source.
-
-@pytest.mark.parametrize(('age', 'is_fresh'), [
-    (0.3, True), (0.301, False), (0.0, True), (-0.1, True), (-0.101, False), (math.nan, False),
-    (math.inf, False), (-math.inf, False)])
-def test_an_age_is_fresh_within_its_timeout_and_a_step_of_clocks(age, is_fresh):
-    assert fresh(age, 0.3) == is_fresh
-    motion = SLOW._replace(velocity_age=age, yaw_age=age)
-    assert (motion.fresh_velocity(LIMITS) is not None) == is_fresh
-    assert motion.fresh_yaw(LIMITS) == (0.5 if is_fresh else None)
-    patient = GateLimits(odom_timeout=0.4)
-    assert (motion.fresh_yaw(patient) == 0.5) == (is_fresh or age == 0.301)
-
 
 @pytest.mark.parametrize('value', [
     (0.1, math.nan, 0.0), (math.inf, 0.0, 0.0), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4),
@@ -99,33 +86,6 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
                   by(ODOM, odom=turned._replace(**unusable), autopilot=SLOW)):
         assert known.yaw_difference(LIMITS) is None
         assert not known.yaws_disagree(LIMITS) and known.contradiction(LIMITS) == ''
-
-
-@pytest.mark.parametrize(('disagreeing_for', 'what'), [
-    (-math.inf, ''), (-0.01, ''), (math.nan, ''),
-    (0.0, 'velocities of odom and of the autopilot disagree'),
-    (9.0, 'velocities of odom and of the autopilot disagree')])
-def test_velocities_disagree_from_the_moment_that_is_told(disagreeing_for, what):
-    known = by(ODOM, disagreeing_for=disagreeing_for)
-    assert known.contradiction(LIMITS) == what
-    assert (braking(known) is None) == bool(what)
-    # Yaws are told first: they explain it.
-    turned = replace(known, odom=SLOW._replace(yaw=2.0))
-    assert turned.contradiction(LIMITS).startswith('yaws')
-
-
-@pytest.mark.filterwarnings('error')
-def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
-    own, stale = SLOW._replace(velocity=(0.0, 0.3, 0.0)), SLOW._replace(**LATE)
-    # As a parameter gives the source: another string object than the constant.
-    np.testing.assert_allclose(
-        by(''.join(['od', 'om']), autopilot=own).velocity_difference(LIMITS), (0.1, -0.3, 0.0))
-    # Odometry does not judge the autopilot where that is the source.
-    for known in (by(AUTOPILOT, autopilot=own), by(ODOM, autopilot=stale), by(ODOM, odom=stale)):
-        assert known.velocity_difference(LIMITS) is None
-    huge = by(ODOM, odom=SLOW._replace(velocity=(1.7e308, 0.0, 0.0)),
-              autopilot=SLOW._replace(velocity=(-1.7e308, 0.0, 0.0)))
-    assert huge.velocity_difference(LIMITS)[0] == math.inf
 
 
 @pytest.mark.parametrize(('known', 'velocity'), [
@@ -249,15 +209,6 @@ def test_what_is_old_or_interrupted_is_not_compared():
     for path in (first, second):
         path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
     assert difference(first, second, 0.0, 9.0) is None
-
-
-def test_motion_at_the_reported_velocity_is_no_jump_and_a_jump_in_motion_is_one():
-    velocity = np.array([0.0, 8.0, 0.0])
-    moving, _ = paths(2.0, lambda t: 8.0 * t * np.eye(3)[1], still, velocity=velocity)
-    assert moving.jumps == 0
-    moving, other = paths(2.0, lambda t: (8.0 * t + 1.5 * (t > 1.0)) * np.eye(3)[1],
-                          lambda t: 8.0 * t * np.eye(3)[1], velocity=velocity)
-    assert moving.jumps == 1 and np.linalg.norm(difference(moving, other, 0.0, 2.0)) < 1e-9
 
 
 @pytest.mark.parametrize(('axis', 'drift', 'std', 'height', 'contradicts'), [

@@ -26,75 +26,36 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from geometry_msgs.msg import Transform, Twist
+from driven import DEADLINE, Driven, overrides
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
-from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import COMMAND
-from flock_follower.messages import set_quaternion, set_vector, to_array
+from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
 
-DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
-OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'on_odometry', 'forward',
+OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'update_velocity', 'forward',
          'receive', 'cycle', 'stop')
 POSCTL, OFFBOARD = 3 << 16, 6 << 16
 SERVICES = {'offboard': SetBool, 'arm': SetBool, 'takeoff': Trigger, 'land': Trigger}
 
 
-def make_command(stamp: int, acceleration: tuple[float, ...],
-                 yaw: float = 0.0) -> MultiDOFJointTrajectory:
-    message = MultiDOFJointTrajectory(joint_names=['base_link'])
-    message.header.stamp, message.header.frame_id = nanoseconds_to_stamp(stamp), 'odom'
-    point = MultiDOFJointTrajectoryPoint(
-        transforms=[Transform()], accelerations=[Twist()], velocities=[Twist()])
-    set_quaternion(point.transforms[0].rotation, quaternion_from_yaw(yaw))
-    set_vector(point.accelerations[0].linear, acceleration)
-    message.points = [point]
-    return message
-
-
-class Outlet:
-    """Stands in for publishers and the logger; it keeps what comes, and waits if it is stuck."""
-
-    def __init__(self) -> None:
-        self.got: list[Any] = []
-        self.threads: set[str] = set()
-        self.released = threading.Event()
-        self.released.set()
-
-    def publish(self, what: Any) -> None:
-        self.got.append(what)
-        self.threads.add(threading.current_thread().name)
-        assert self.released.wait(2.0 * DEADLINE)
-
-    info = warning = error = publish
-
-    def get_subscription_count(self) -> int:
-        return 1
-
-
-class Bench:
+class Bench(Driven):
     """The node, an autopilot, and the threads in which its bridge was called."""
 
     def __init__(self, **parameters: Any) -> None:
-        self.node = MavlinkBridge(parameter_overrides=[
-            Parameter(name, value=value)
-            for name, value in {'connection': 'udpin:127.0.0.1:0', **parameters}.items()])
+        super().__init__(MavlinkBridge(parameter_overrides=overrides(
+            connection='udpin:127.0.0.1:0', **parameters)))
         self.bridge = self.node._bridge
-        self.log = Outlet()
-        self.node.get_logger = lambda: self.log
-        self.outlets = {}
-        for name in ('odometry', 'battery', 'states', 'armed_at'):
-            self.outlets[name] = Outlet()
-            setattr(self.node._outputs, f'_{name}', self.outlets[name])
+        self.node._outputs._odometry.get_subscription_count = lambda: 1
+        self.log: list[str] = []
+        self.node.get_logger = lambda: SimpleNamespace(
+            info=self.log.append, warning=self.log.append, error=self.log.append)
         self.calls: list[tuple[str, str]] = []
         owners = self.bridge, self.bridge.requests, self.bridge.gate
         for name in OWNED:
@@ -111,12 +72,6 @@ class Bench:
 
     def count(self, name: str) -> int:
         return sum(called == name for called, _ in self.calls)
-
-    def wait(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, (self.calls[-50:], self.log.got[-10:])
-            time.sleep(0.002)
 
     def send(self, *messages: Any) -> None:
         for message in messages:
@@ -146,8 +101,8 @@ class Bench:
 
     def command(self, east: float = 0.3, age: float = 0.0, number: int | None = 1) -> None:
         now = self.node.get_clock().now().nanoseconds
-        self.node._on_command((make_command(now - round(age * 1e9), (east, 0.0, 0.0)), {
-            'publication_sequence_number': number, 'received_timestamp': 0}))
+        self.give('command/trajectory', trajectory(make, Command(
+            (east, 0.0, 0.0), 0.0, frame='odom', stamp=now - round(age * 1e9))), number)
 
     def fly(self) -> None:
         """Permit setpoints to a vehicle that reports that it flies them."""
@@ -156,7 +111,7 @@ class Bench:
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
         self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
         gate = self.bridge.gate
-        self.node._stream.submit(lambda: gate.permit(OffboardRequested(time.monotonic())))
+        self.node._stream.submit(lambda: gate.permit(gate.permission.requested(time.monotonic())))
         self.wait(lambda: gate.permission.streams)
         self.beat()
         self.wait(self.node._flying)
@@ -173,21 +128,18 @@ class Bench:
         request = kind.Request(data=data) if kind is SetBool else kind.Request()
         return self.node._serve(name, request, kind.Response())
 
-    def call(self, name: str, data: bool = False) -> Any:
-        """Await a service as an executor does."""
-        answer, end = self.serve(name, data), time.monotonic() + DEADLINE
-        while time.monotonic() < end:
+    def ask(self, name: str, data: bool = False) -> Any:
+        """Await a service as an executor does; return its answer."""
+        answer, ended = self.serve(name, data), []
+
+        def done() -> bool:
             try:
                 answer.send(None)
             except StopIteration as stopped:
-                return stopped.value
-            time.sleep(0.002)
-        raise AssertionError('never answered')
-
-    def problems(self, ahead: float = 0.0) -> str:
-        """Return what /diagnostics reports, or will after that many seconds of the same."""
-        return '; '.join(text for _, text in
-                         self.node.diagnostics.problems(time.monotonic() + ahead))
+                ended.append(stopped.value)
+            return bool(ended)
+        self.wait(done)
+        return ended[0]
 
     def close(self) -> None:
         if not self.closed:
@@ -218,7 +170,7 @@ def test_only_the_setpoint_thread_calls_what_changes_the_bridge(make_bench):
         with suppress(StopIteration):  # refused already
             bench.serve(name).send(None)
     bench.wait(lambda: all(bench.count(name) for name in SERVICES))
-    assert bench.node.set_parameters([Parameter('a_max', value=1.5)])[0].successful
+    assert bench.set(a_max=1.5) == ''
     bench.wait(lambda: bench.bridge.gate.limits.a_max == 1.5)
     bench.close()
     assert {name for name, _ in bench.calls} == set(OWNED)
@@ -236,7 +188,7 @@ def test_a_command_leaves_in_ned_and_one_that_must_not_fly_is_counted(make_bench
         0x83F, mavlink.MAV_FRAME_LOCAL_NED, 0.0, pytest.approx(math.pi / 2))
     bench.command(east=math.nan, number=2)
     bench.command(age=0.5, number=3)
-    counters = bench.node.diagnostics.counters
+    counters = bench.counters
     bench.wait(lambda: bench.problems() and counters['command too old'])
     assert counters['command not finite'] == 1
 
@@ -246,15 +198,15 @@ def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_br
     bench.fly()
     for value, reason in ((1.5, ''), (2.0, 'in flight it can only be lowered'),
                           (-1.0, 'must be a number in [0.01, 20]')):
-        result, = bench.node.set_parameters([Parameter('a_max', value=value)])
-        assert result.successful == (not reason) and reason in result.reason
+        refused = bench.set(a_max=value)
+        assert bool(refused) == bool(reason) and reason in refused
     for number in (None, None, 5, 1):
         assert bench.node._flying()
         bench.command(number=number)
     bench.wait(lambda: not bench.node._flying())
     reason = bench.bridge.gate.permission.reason
     assert reason == 'two nodes command:  on /command/trajectory' and reason in bench.problems()
-    assert sum('numbers no messages' in str(text) for text in bench.log.got) == 1
+    assert sum('numbers no messages' in text for text in bench.log) == 1
 
 
 def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):
@@ -263,9 +215,9 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
     bench.wait(lambda: bench.bridge.telemetry.status)
     bench.odometry()
     bench.receive()
-    bench.wait(lambda: all(outlet.got for outlet in bench.outlets.values()))
-    odom, battery, place = (bench.outlets[name].got[-1]
-                            for name in ('odometry', 'battery', 'armed_at'))
+    topics = ('mavlink/odom', 'mavlink/battery', 'mavlink_bridge/armed_at')
+    bench.wait(lambda: all(bench.sent[topic] for topic in topics))
+    odom, battery, place = (bench.sent[topic][-1] for topic in topics)
     assert (odom.header.frame_id, odom.child_frame_id) == ('odom', 'base_link')
     np.testing.assert_allclose(to_array(odom.pose.pose.position), [2, 1, 3])
     assert odom.pose.pose.orientation.z == pytest.approx(math.sqrt(0.5), abs=1e-6)
@@ -275,8 +227,8 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
     assert (battery.voltage, battery.current, battery.percentage) == pytest.approx(
         (15.2, -18.5, 0.81))
     assert place.point.z == 2.0
-    bench.wait(lambda: 'autopilot: words' in bench.log.got)
-    states = bench.outlets['states'].got
+    bench.wait(lambda: 'autopilot: words' in bench.log)
+    states = bench.sent['mavlink_bridge/state']
     before = len(states)
     bench.wait(lambda: len(states) > before + 2)  # repeated, though nothing changed
     assert 'INACTIVE: offboard was not requested' in {state.data for state in states}
@@ -290,9 +242,8 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
         nanoseconds_to_stamp(arrived), 'odom', 'base_link', (0.0, 0.0, 2.0), IDENTITY_QUATERNION,
         (0.2, 0.0, 0.0)), arrived)
     bench.node._hand_over_odom()
-    bench.wait(lambda: bench.count('on_odometry') == 1)
-    bench.wait(lambda: bench.bridge.gate._sources['odom'].velocity is not None)
     known = bench.bridge.gate._sources['odom']
+    bench.wait(lambda: known.velocity_time > 0.0)
     assert known.velocity[0] == pytest.approx(0.2)
     # Both the velocity and the yaw: lost odometry brakes no later for having been polled.
     assert known.velocity_time == pytest.approx(sent, abs=0.05)
@@ -301,30 +252,38 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
 
 def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_bench):
     bench = make_bench(stream_rate=50.0)
-    for stuck in (bench.outlets['odometry'], bench.log):
-        stuck.released.clear()
-        stuck.got.clear()
+    released, stuck = threading.Event(), []
+
+    def wait(_: Any) -> None:
+        stuck.append(threading.current_thread().name)
+        assert released.wait(2.0 * DEADLINE)
+    bench.node._outputs._odometry.publish = wait
+    for logging in (False, True):
+        if logging:
+            bench.node.get_logger = lambda: SimpleNamespace(info=wait, warning=wait, error=wait)
+        released.clear()
+        stuck.clear()
         bench.receive()
-        bench.wait(lambda stuck=stuck: stuck.got)
+        bench.wait(lambda: stuck)
         cycles = bench.count('cycle')
         bench.wait(lambda cycles=cycles: bench.count('cycle') >= cycles + 10)
-        assert stuck.threads == {'publisher'}
-        stuck.released.set()
+        assert {*stuck} == {'publisher'}
+        released.set()
     bench.node.diagnostics.publish()
-    assert bench.node.diagnostics.values['dropped: publishing took too long'] == 0
+    assert bench.values['dropped: publishing took too long'] == 0
 
 
 def test_a_request_that_fails_inside_is_answered_and_the_stream_goes_on(make_bench):
     bench = make_bench()
     bench.bridge.requests.land = lambda now: 1 / 0
-    answer = bench.call('land')
+    answer = bench.ask('land')
     assert (answer.success, answer.message) == (
         False, 'internal error: ZeroDivisionError: division by zero')
     bench.problems()
-    assert bench.node.diagnostics.counters['internal error in the stream'] == 1
-    assert 'no HEARTBEAT' in bench.call('offboard').message  # the thread goes on
+    assert bench.counters['internal error in the stream'] == 1
+    assert 'no HEARTBEAT' in bench.ask('offboard').message  # the thread goes on
     bench.node._stream.stop()
-    assert not bench.call('land').success
+    assert not bench.ask('land').success
 
 
 def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
@@ -333,7 +292,7 @@ def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
     bench.wait(lambda: bench.bridge.telemetry.status is not None)
     waiting = [bench.serve('arm') for _ in range(2)]
     waiting[0].send(None)
-    bench.wait(lambda: bench.node._pending)  # the autopilot never acknowledges
+    bench.wait(lambda: bench.node._calls[0].request)  # the autopilot never acknowledges
     finish = bench.bridge.finish
 
     def submit_last(now):
@@ -365,7 +324,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     bench.receive()
     bench.odometry(yaw=0.0)
     bench.wait(lambda: 'differ by' in bench.problems())
-    assert not bench.call('offboard', True).success
+    assert not bench.ask('offboard', True).success
     bench.command(age=7200.0)
     assert 'does use_sim_time differ' in bench.problems()
     bench.node._stream.stop()
@@ -384,8 +343,8 @@ def test_parameters_of_the_autopilot_that_differ_are_logged_once_and_shown(make_
         result=lambda: SimpleNamespace(differing=1, answered=3, unanswered=0, lines=[line]))
     bench.problems()
     bench.problems()
-    assert bench.log.got.count(f'parameter {line}') == 1
-    values = bench.node.diagnostics.values
+    assert bench.log.count(f'parameter {line}') == 1
+    values = bench.values
     assert values['parameters'] == '1 of 3 differ, 0 unanswered'
     assert values['parameter COM_OF_LOSS_T'] == '= 1, recommended 0.5: why'
 
@@ -397,6 +356,6 @@ def test_limits_of_the_planner_that_differ_are_a_warning(make_bench):
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
             ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
             ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than')):
-        bench.node._report.planner_changed(values)
+        bench.node._report.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)

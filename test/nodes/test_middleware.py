@@ -29,8 +29,9 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
+from flock_follower.files import resource
 from flock_follower.nodes import mavlink_bridge, planner
-from flock_follower.nodes.support.files_in_use import environments_of_processes
+from flock_follower.nodes.observer import processes
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
     avoid_shared_memory_for_images,
@@ -42,7 +43,6 @@ from flock_follower.nodes.support.middleware import (
     reach,
     segment_size,
 )
-from flock_follower.resources import resource
 
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -150,8 +150,8 @@ def test_the_environment_of_a_running_node_is_read(tmp_path):
     environment = {RANGE: 'SUBNET', 'ROS_DOMAIN_ID': '99', 'KEY': str(tmp_path)}
 
     def found_now():
-        return [own for node, own in environments_of_processes()
-                if node == 'planner' and own.get('KEY') == str(tmp_path)]
+        return [found.environment for found in processes()
+                if found.node == 'planner' and found.environment.get('KEY') == str(tmp_path)]
     with subprocess.Popen([str(stand_in), '30'], env=environment) as process:
         try:  # the kernel shows it a moment after it was started
             wait_until(found_now, 5.0, 'the process')

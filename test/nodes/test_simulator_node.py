@@ -14,7 +14,6 @@
 
 """The simulator node as a real process: what subscribers receive, and what it refuses."""
 
-from collections import defaultdict
 import signal
 import subprocess
 import sys
@@ -22,8 +21,6 @@ import time
 
 from nav_msgs.msg import Odometry
 import numpy as np
-from odometry_series import states
-import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
@@ -32,7 +29,6 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.support.conversions import stamp_to_nanoseconds
-from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
 
 DEADLINE = 40.0  # s, for what should take a few
@@ -49,59 +45,49 @@ def simulator(*parameters, namespace=''):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-@pytest.fixture(scope='module')
-def seen_messages():
-    """Give a second of what the simulator publishes, by topic, and how it ended."""
-    rclpy.init()
-    node = rclpy.create_node('ear')
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    raw = defaultdict(list)
-    for topic, message_type in TOPICS.items():
-        # Depths to hold all: this machine may be busy with rendering.
-        qos = qos_profile_sensor_data if topic in ('image_raw', 'camera_info') else QoSProfile(
-            depth=1000)
-        node.create_subscription(message_type, topic, raw[topic].append, qos, raw=True)
-    child = simulator('scenario:=hover')
-    try:
-        deadline = time.monotonic() + DEADLINE
-        while len(raw['image_raw']) < 20 or len(raw['odom']) < 150:
-            assert time.monotonic() < deadline and child.poll() is None
-            executor.spin_once(timeout_sec=0.05)
-        child.send_signal(signal.SIGINT)
-        output, errors = child.communicate(timeout=10.0)
-    finally:
-        child.kill()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown()
-    messages = {topic: [deserialize_message(data, TOPICS[topic]) for data in received]
-                for topic, received in raw.items()}
-    return messages, child.returncode, output, errors
+class Ear:
+    """A node that keeps raw messages by topic."""
+
+    def __init__(self, **topics):
+        self.node = rclpy.create_node('ear')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.raw = {topic: [] for topic in topics}
+        for topic, kind in topics.items():
+            # Depths to hold all: this machine may be busy with rendering.
+            qos = qos_profile_sensor_data if topic in ('image_raw', 'camera_info') else QoSProfile(
+                depth=1000)
+            self.node.create_subscription(kind, topic, self.raw[topic].append, qos, raw=True)
+
+    def wait(self, child, condition):
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            assert time.monotonic() < end and child.poll() is None
 
 
 def stamps(messages):
     return np.array([stamp_to_nanoseconds(m.header.stamp) for m in messages])
 
 
-def test_it_ends_on_ctrl_c_without_a_traceback(seen_messages):
-    _, code, output, errors = seen_messages
-    assert code == 0
-    assert 'Traceback' not in output + errors
+def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(ros):
+    ear = Ear(**TOPICS)
+    child = simulator('scenario:=hover')
+    try:
+        ear.wait(child, lambda: len(ear.raw['image_raw']) >= 20 and len(ear.raw['odom']) >= 150)
+        child.send_signal(signal.SIGINT)
+        output, errors = child.communicate(timeout=10.0)
+    finally:
+        child.kill()
+        ear.node.destroy_node()
+    assert child.returncode == 0 and 'Traceback' not in output + errors
     assert 'waiting for offboard mode and planner/engage' in errors
-
-
-def test_odometry_has_a_stamp_every_10_ms(seen_messages):
-    odometry = seen_messages[0]['odom']
-    assert np.all(np.diff(stamps(odometry)) == 10_000_000)
-    for message in odometry:
+    messages = {topic: [deserialize_message(data, TOPICS[topic]) for data in received]
+                for topic, received in ear.raw.items()}
+    assert np.all(np.diff(stamps(messages['odom'])) == 10_000_000)
+    for message in messages['odom']:
         assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
-        covariance = np.reshape(message.pose.covariance, (6, 6))
-        assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
-
-
-def test_every_image_has_its_calibration_and_its_truth_on_the_same_stamp(seen_messages):
-    messages = seen_messages[0]
+        assert np.all(np.linalg.eigvalsh(np.reshape(message.pose.covariance, (6, 6))) > 0.0)
     images = stamps(messages['image_raw'])
     gaps = np.diff(images) * 30e-9
     assert np.all(np.abs(gaps - np.rint(gaps)) < 1e-6) and np.all(gaps > 0.5)
@@ -110,53 +96,24 @@ def test_every_image_has_its_calibration_and_its_truth_on_the_same_stamp(seen_me
         within = images[(images >= others[0]) & (images <= others[-1])]
         # Images and calibrations are sent best effort: some may be lost.
         assert np.isin(within, others).mean() > (0.8 if topic == 'camera_info' else 0.999)
-    assert {m.child_frame_id for m in messages['truth/neighbors']} == {'leader'}
-    assert {m.header.frame_id for m in messages['truth/neighbors']} == {'odom'}
+    assert {(m.header.frame_id, m.child_frame_id) for m in messages['truth/neighbors']} == {
+        ('odom', 'leader')}
+    image, info = messages['image_raw'][-1], messages['camera_info'][0]
+    assert (image.width, image.height, image.step, image.encoding) == (640, 480, 640, 'mono8')
+    assert image.header.frame_id == info.header.frame_id == 'camera_optical_frame'
+    pixels = np.frombuffer(image.data, np.uint8).reshape(480, 640)
+    assert list(detect(pixels, 'DICT_4X4_50').ids) == [0]
 
 
-def test_images_are_mono8_and_show_the_marker_where_truth_projects(seen_messages):
-    messages = seen_messages[0]
-    own, leader = (states(messages[f'truth/{name}']) for name in ('odom', 'neighbors'))
-    info = messages['camera_info'][0]
-    camera = CameraModel.from_calibration(
-        info.k, info.d, info.distortion_model, info.width, info.height)
-    checked = 0
-    for image in messages['image_raw'][::5]:
-        assert (image.width, image.height, image.step) == (640, 480, 640)
-        assert image.encoding == 'mono8' and len(image.data) == 640 * 480
-        assert image.header.frame_id == info.header.frame_id == 'camera_optical_frame'
-        stamp = stamp_to_nanoseconds(image.header.stamp)
-        if stamp not in own.stamps or stamp not in leader.stamps:
-            continue
-        pixels = np.frombuffer(image.data, np.uint8).reshape(480, 640)
-        seen = detect(pixels, 'DICT_4X4_50')
-        assert list(seen.ids) == [0]
-        # Both hover facing along x: the marker is 0.2 m this side of the leader, the camera
-        # 0.1 m ahead of the follower; optical axes are -y, -z, x.
-        x, y, z = leader.at(stamp)[0] - own.at(stamp)[0] - [0.3, 0.0, 0.0]
-        middle = camera.project([[-y, -z, x]])[0]
-        assert seen.corners[0].mean(axis=0) == pytest.approx(middle, abs=8.0)  # px
-        checked += 1
-    assert checked >= 2
-
-
-def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
-    rclpy.init()
-    node = rclpy.create_node('ear')
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    seen = []
-    node.create_subscription(Odometry, '/behind/truth/neighbors', seen.append, 10)
+def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that(ros):
+    ear = Ear(**{'/behind/truth/neighbors': Odometry})
     ahead = simulator('scenario:=straight', namespace='ahead')
     behind = simulator('scenario:=straight', 'leader_topic:=/ahead/truth/motion',
                        'leader_offset:=[2.0, 0.5, 0.0]', namespace='behind')
     try:
-        deadline = time.monotonic() + DEADLINE
-        while len(seen) < 5:
-            assert time.monotonic() < deadline
-            assert behind.poll() is None, behind.communicate()
-            executor.spin_once(timeout_sec=0.05)
-        leader = seen[-1].pose.pose.position
+        ((_, seen),) = ear.raw.items()
+        ear.wait(behind, lambda: len(seen) >= 5)
+        leader = deserialize_message(seen[-1], Odometry).pose.pose.position
         np.testing.assert_allclose([leader.x, leader.y, leader.z], [2.0, 0.5, 1.5], atol=0.05)
         ahead.send_signal(signal.SIGINT)
         output, errors = behind.communicate(timeout=10.0)
@@ -165,6 +122,4 @@ def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
         for child in (ahead, behind):
             child.kill()
             child.communicate()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown()
+        ear.node.destroy_node()

@@ -23,21 +23,15 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
-import time
 from typing import Any, NamedTuple
 
+from driven import Driven, overrides, START
 from launch_files import launched
 from launch_files import Node as Started
 from marker_images import render
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
 from flock_follower.geometry import (
@@ -53,9 +47,6 @@ from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_od
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.tracker import camera_mounting
 
-START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
-DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
-RELIABLE, SENSOR = QoSProfile(depth=2), qos_profile_sensor_data
 INFRARED = CameraModel(np.array([[383.0, 0.0, 320.5], [0.0, 383.0, 238.2], [0.0, 0.0, 1.0]]),
                        np.zeros(5), 'plumb_bob', 640, 480)
 FISHEYE = CameraModel(np.array([[285.2, 0.0, 421.0], [0.0, 285.3, 400.1], [0.0, 0.0, 1.0]]),
@@ -72,8 +63,8 @@ class Source(NamedTuple):
     """
     What the odometry and the camera of a recipe send, and what is found out about them.
 
-    ``twist`` is the frame of the velocity, or 'none'; ``rate`` in Hz. Where it ``lacks`` them
-    there are no angular rates and no covariances. Its messages come ``late``, s.
+    ``twist`` is the frame of the velocity, or 'none'; ``rate`` in Hz. If it ``lacks`` them there
+    are no angular rates and no covariances. Its messages come ``late``, s.
     """
 
     recipe: str
@@ -83,10 +74,8 @@ class Source(NamedTuple):
     rate: int
     lacks: bool = False
     late: float = 0.0
-    odom_qos: QoSProfile = RELIABLE
     camera: CameraModel = INFRARED
     encoding: str = 'mono8'
-    image_qos: QoSProfile = RELIABLE
     arguments: tuple[tuple[str, str], ...] = ()
 
 
@@ -98,7 +87,7 @@ SOURCES = {
         arguments=(('odom', '/odometry'),)),
     'rtabmap': Source('d435i_rtabmap', 'odom', 'camera_link', 'child', 30),
     'T265': Source('t265', 'camera_odom_frame', 'camera_pose_frame', 'child', 200,
-                   odom_qos=SENSOR, camera=FISHEYE),
+                   camera=FISHEYE),
     'as REP-105': Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM,
                          encoding='yuv422_yuy2'),
     'ORB-SLAM3': Source('usb_camera', 'map', 'camera', 'none', 30, lacks=True, camera=WEBCAM,
@@ -127,11 +116,11 @@ def stamp(t: float) -> Any:
 
 
 class Rig:
-    """The nodes of a recipe, and one that plays its camera and its odometry."""
+    """The nodes of a recipe, with its camera and its odometry."""
 
     def __init__(self, source: Source, **arguments: str) -> None:
-        nodes, said = launched('camera.launch.py', recipe=source.recipe,
-                               **dict(source.arguments), **arguments)
+        nodes, self.topics = launched('camera.launch.py', recipe=source.recipe,
+                                      **dict(source.arguments), **arguments)
         given = nodes['relative_pose'].parameters[-1]
         self.source = source
         self.T_base_child = Transform.from_quaternion(
@@ -139,41 +128,19 @@ class Rig:
             quaternion_from_rpy(*given.get('odom_child_rpy', [0.0] * 3)))
         self.perception = start(RelativePose, nodes['relative_pose'])
         self.planner = start(Planner, nodes['planner'], require_bridge=False)
-        self.node = Node('drivers')
-        self.executor = SingleThreadedExecutor()
-        for node in (self.perception, self.planner, self.node):
-            self.executor.add_node(node)
-        self.found: list[Odometry] = []
-        self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
-        self.clock = self.node.create_publisher(Clock, '/clock', 10)
-        self.odom = self.node.create_publisher(Odometry, said['odom'], source.odom_qos)
-        self.infos = self.node.create_publisher(CameraInfo, said['camera_info'], RELIABLE)
-        self.images = self.node.create_publisher(Image, said['image'], source.image_qos)
-        self.wait(lambda: [p.get_subscription_count() for p in (
-            self.clock, self.odom, self.infos, self.images)] == [2, 2, 2, 1]
-            and self.node.count_publishers('neighbors')
-            and self.planner.count_publishers('neighbors'))
+        self.found = self.perception.sent['neighbors']
         mounting = camera_mounting(given['camera_position'], given['camera_rpy'])
         self.image = image(source, render(source.camera, {
             0: mounting.inverse() @ POLE @ TAIL}))
         camera = source.camera
-        self.send(self.infos, CameraInfo(
+        self.give('camera_info', CameraInfo(
             width=camera.width, height=camera.height, distortion_model=camera.model,
-            k=camera.matrix.ravel(), d=camera.distortion.tolist()), 'camera_info')
+            k=camera.matrix.ravel(), d=camera.distortion.tolist()))
 
-    def wait(self, condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def send(self, publisher: Any, message: Any, topic: str) -> None:
-        """Publish a message, and wait until every node that takes it has it."""
-        rates = [node.diagnostics.rates[f'{topic}_hz'] for node in (self.perception, self.planner)
-                 if f'{topic}_hz' in node.diagnostics.rates]
-        counts = [rate.count for rate in rates]
-        publisher.publish(message)
-        self.wait(lambda: all(r.count > c for r, c in zip(rates, counts)))
+    def give(self, topic: str, message: Any) -> None:
+        """Pass a message to the nodes on the topic that the launch file gives them."""
+        for node in (self.perception, self.planner)[:1 if topic == 'image' else 2]:
+            node.give(self.topics[topic], message)
 
     def odometry(self, t: float) -> Odometry:
         """Return what the source sends at t, s."""
@@ -195,30 +162,26 @@ class Rig:
         rate = self.source.rate
         for k in range(round(since * rate), round(until * rate)):
             t = k / rate
-            now = START + round(t * 1e9)
-            self.clock.publish(Clock(clock=stamp(t)))
-            self.wait(lambda now=now: all(node.get_clock().now().nanoseconds == now
-                                          for node in (self.perception, self.planner)))
+            for node in (self.perception, self.planner):
+                node.pass_time(START + round(t * 1e9))
             if t - self.source.late >= since - 1e-9:
-                self.send(self.odom, self.odometry(t - self.source.late), 'odom')
+                self.give('odom', self.odometry(t - self.source.late))
             if k % (rate // 10) == 0:
                 self.image.header.stamp = stamp(t)
-                self.send(self.images, self.image, 'image_raw')
+                self.give('image', self.image)
 
     def close(self) -> None:
-        self.executor.shutdown()
-        for node in (self.perception, self.planner, self.node):
-            node.destroy_node()
+        self.perception.close()
+        self.planner.close()
 
 
-def start(kind: Callable[..., Any], as_launched: Started, **values: Any) -> Any:
+def start(kind: Callable[..., Any], as_launched: Started, **values: Any) -> Driven:
     """Return a node with the parameters and remappings of its launch file."""
     *files, given = as_launched.parameters
     arguments = [word for file in files for word in ('--params-file', file)] + [
         word for rule in as_launched.remappings for word in ('-r', ':='.join(rule))]
-    values = {**given, **values, 'use_sim_time': True}
-    return kind(cli_args=['--ros-args', *arguments], parameter_overrides=[
-        Parameter(name, value=value) for name, value in values.items()])
+    return Driven(kind(cli_args=['--ros-args', *arguments], parameter_overrides=overrides(
+        **{**given, **values, 'use_sim_time': True})))
 
 
 def image(source: Source, pixels: Any) -> Image:
@@ -231,8 +194,7 @@ def image(source: Source, pixels: Any) -> Image:
 
 
 @pytest.fixture
-def rig() -> Iterator[Callable[..., Rig]]:
-    rclpy.init()
+def rig(ros: None) -> Iterator[Callable[..., Rig]]:
     made: list[Rig] = []
 
     def make(source: Source, **arguments: str) -> Rig:
@@ -242,7 +204,6 @@ def rig() -> Iterator[Callable[..., Rig]]:
     yield make
     for one in made:
         one.close()
-    rclpy.shutdown()
 
 
 @pytest.mark.parametrize('name', SOURCES)
@@ -251,7 +212,6 @@ def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
     source = SOURCES[name]
     r, most = rig(source), 0.15 if source.twist == 'none' else 0.1
     r.fly(0.0, 3.0)
-    r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp >= START + 2_800_000_000)
     late = [from_odometry(message) for message in r.found if (
         stamp_to_nanoseconds(message.header.stamp) > START + 2_000_000_000)]
     assert len(late) >= 8
@@ -259,16 +219,16 @@ def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
         t = (state.stamp - START) * 1e-9
         np.testing.assert_allclose(state.position, (own(t) @ POLE).translation, atol=0.02)
         np.testing.assert_allclose(state.velocity, velocity(t, POLE.translation), atol=most)
-    mine = r.planner._loop.memory.own
+    mine = r.planner.node._loop.memory.own
     np.testing.assert_allclose(mine.velocity, velocity(mine.stamp, np.zeros(3)), atol=most)
     for node in (r.perception, r.planner):
         node.diagnostics.publish()
-        values = node.diagnostics.values
+        values = node.values
         assert values['odom_twist'].startswith(f'auto: {source.twist}, ')
         assert ('angular velocity' in values['odom_lacks']) == source.lacks
         assert float(values['odom_latency_s']) == pytest.approx(source.late, abs=1e-6)
         # Of the first sighting nobody knows how fast the leader is.
-        assert node.diagnostics.counters.keys() <= {'estimate too uncertain'}
+        assert node.counters.keys() <= {'estimate too uncertain'}
 
 
 def test_axes_that_nobody_has_set_are_told(rig: Callable[..., Rig]) -> None:
@@ -277,6 +237,5 @@ def test_axes_that_nobody_has_set_are_told(rig: Callable[..., Rig]) -> None:
         -np.pi / 2.0, 0.0, -np.pi / 2.0))
     r.fly(0.0, 0.2)
     for node in (r.perception, r.planner):
-        problems = [text for _, text in node.diagnostics.problems(time.monotonic())]
         assert ('axes of odom: base_link has -y up instead of z: set odom_child_rpy to how the '
-                'child frame of odom lies on it') in problems
+                'child frame of odom lies on it') in node.problems()

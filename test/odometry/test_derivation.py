@@ -71,14 +71,14 @@ def test_a_velocity_that_changes_at_once_is_followed() -> None:
     for k in range(100):
         t = k / 20.0
         derived.take(t, np.array([0.0 if t < 3.0 else 1.5 * (t - 3.0), 0.0, 0.0]))
-    np.testing.assert_allclose(derived.velocity, [1.5, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(derived.rate, [1.5, 0.0, 0.0], atol=0.1)
 
 
 def test_positions_that_make_no_sense_do_not_run_away() -> None:
     rng, derived = np.random.default_rng(0), DerivedVelocity()
     for k in range(1000):
         derived.take(k / 20.0, 5.0 * rng.standard_normal(3))
-        assert np.linalg.norm(derived.velocity) < 50.0
+        assert np.linalg.norm(derived.rate) < 50.0
 
 
 @pytest.mark.parametrize('rate', [10.0, 30.0, 200.0])
@@ -97,5 +97,5 @@ def test_at_the_start_noise_is_not_taken_for_steps() -> None:
             wander = wander + rng.normal(0.0, 0.02 / 30.0**0.5, 3)
             derived.take(k / 30.0, wander + rng.normal(0.0, 0.003, 3))
             if k >= 5:
-                speeds.append(derived.velocity)
+                speeds.append(derived.rate)
     assert np.sqrt(np.mean(np.sum(np.square(speeds), axis=1))) < 0.25

@@ -63,16 +63,24 @@ def message(t: float, position_noise: Array | None = None) -> Any:
                     np.diag([1e-4] * 6), np.diag([4e-4] * 6))
 
 
+def taken(source: OdometrySource, sent: Any, t: float) -> OdometryState:
+    state = source.take(sent, START + round(t * 1e9))
+    assert state is not None
+    return state
+
+
 def read(source: OdometrySource, kind: Source, seconds: float, rate: float = RATE,
-         noise: float = 0.0) -> list[tuple[float, OdometryState]]:
-    """Return what a source makes of a flight, with the times."""
-    alter, found, rng = rewrite(kind), [], np.random.default_rng(0)
-    for t in np.arange(0.0, seconds, 1.0 / rate).tolist():
-        state = source.take(alter(message(t, noise * rng.standard_normal(3)), t),
-                            START + round(t * 1e9))
-        assert state is not None
-        found.append((t, state))
-    return found
+         noise: float = 0.0, start: float = 0.0) -> list[tuple[float, OdometryState]]:
+    """Return what a source makes of a flight that it joins at ``start``, s, with the times."""
+    alter, rng = rewrite(kind), np.random.default_rng(0)
+    return [(t, taken(source, alter(message(t, noise * rng.standard_normal(3)), t), t))
+            for t in (start + np.arange(0.0, seconds - 1e-9, 1.0 / rate)).tolist()]
+
+
+def first_second(kind: Source, start: float, rate: float, seconds: float = 1.0
+                 ) -> tuple[OdometrySource, list[tuple[float, OdometryState]]]:
+    source = OdometrySource(IMU if kind.imu else None)
+    return source, read(source, kind, seconds, rate, 0.001, start)
 
 
 @pytest.mark.parametrize('kind', [
@@ -98,8 +106,7 @@ def test_every_source_tells_the_motion_of_base_link(kind: Source, rate: float) -
 def test_where_rates_cease_they_are_derived_from_there_on() -> None:
     source = OdometrySource()
     for t in np.arange(0.0, 4.0, 0.01).tolist():
-        state = source.take(rewrite(Source(rates=t < 2.0))(message(t), t), START + round(t * 1e9))
-        assert state is not None
+        state = taken(source, rewrite(Source(rates=t < 2.0))(message(t), t), t)
         assert ('angular velocity' in source.missing) is (t >= 2.0)
         np.testing.assert_allclose(state.angular_velocity, motion(t)[3], atol=0.05)
 
@@ -110,10 +117,9 @@ def test_until_the_readings_differ_nothing_is_decided(reported: float) -> None:
     derived = []
     for k in range(1000):
         t = 0.01 * k
-        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
-                                     [0.5 * t, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0],
-                                     [reported, 0.0, 0.0]), START + round(t * 1e9))
-        assert state is not None
+        state = taken(source, odometry(
+            empty, START + round(t * 1e9), 'odom', 'base_link', [0.5 * t, 0.0, 1.0],
+            [0.0, 0.0, 0.0, 1.0], [reported, 0.0, 0.0]), t)
         derived.append(state.derived)
         if t > 0.5:
             np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.02)
@@ -121,30 +127,6 @@ def test_until_the_readings_differ_nothing_is_decided(reported: float) -> None:
     assert reported == 0.0 or 'not known yet' in source.twist.describe
     # It is used as soon as the positions could contradict it, and do not; zeros are none.
     assert derived[20:] == [reported == 0.0] * 980
-
-
-def first_second(kind: Source, start: float, rate: float, seconds: float = 1.0, seed: int = 0
-                 ) -> tuple[OdometrySource, list[tuple[float, OdometryState]]]:
-    """Return what a source makes of a flight that it joins at ``start``, s, with the times."""
-    source, alter = OdometrySource(IMU if kind.imu else None), rewrite(kind)
-    states, rng = [], np.random.default_rng(seed)
-    for k in range(round(seconds * rate)):
-        t = start + k / rate
-        state = source.take(alter(message(t, 0.001 * rng.standard_normal(3)), t),
-                            START + round(t * 1e9))
-        assert state is not None
-        states.append((t, state))
-    return source, states
-
-
-@pytest.mark.parametrize('rate', [30.0, 200.0])
-@pytest.mark.parametrize('kind', [Source(twist='odom')], ids=str)
-def test_the_likelier_reading_is_used_from_the_first_window_on(kind: Source, rate: float) -> None:
-    _, states = first_second(kind, 2.0, rate, 1.0)
-    for t, state in states[round(0.65 * rate):]:
-        assert not state.derived
-        if t > 2.9:  # the difference to the derived velocity is faded out
-            np.testing.assert_allclose(state.velocity, motion(t)[2], atol=0.05)
 
 
 def test_it_starts_from_the_child_frame_where_the_reading_does_not_matter() -> None:
@@ -175,33 +157,6 @@ def test_a_wrong_start_is_small_soon_over_and_admitted(kind: Source, rate: float
             assert source.twist.found == kind.twist
 
 
-@pytest.mark.parametrize('twist', ['odom'])
-def test_processes_that_start_at_other_times_read_the_same(twist: str) -> None:
-    """Planner and bridge each read odom for themselves: one restarts, one misses messages."""
-    readers = [first_second(Source(twist=twist), start, rate, 8.0 - start)
-               for start, rate in ((0.0, 200.0), (3.1, 200.0), (5.0, 50.0))]
-    assert {source.twist.found for source, _ in readers} == {twist}
-    velocities = [{round(t * 50.0): state.velocity for t, state in states}
-                  for _, states in readers]
-    for k in range(round(6.5 * 50.0), round(7.9 * 50.0)):
-        for other in velocities[1:]:
-            np.testing.assert_allclose(other[k], velocities[0][k], atol=0.1)
-
-
-def test_when_the_vehicle_turns_before_the_frame_is_known_the_velocity_is_derived() -> None:
-    source = OdometrySource()
-    for k in range(600):
-        t = 0.01 * k
-        yaw = max(0.0, t - 4.0)
-        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
-                                     [0.5 * t, 0.0, 1.0], quaternion_from_rpy(0.0, 0.0, yaw),
-                                     [0.5, 0.0, 0.0]), START + round(t * 1e9))
-        assert state is not None
-        if t > 0.5:  # the twist is in odom; by how much the readings may differ
-            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.11)
-    assert source.twist.found == 'odom'
-
-
 @pytest.mark.parametrize('twist', ['child', 'odom', 'none'])
 def test_no_finding_makes_a_step_in_velocity(twist: str) -> None:
     source = OdometrySource()
@@ -220,8 +175,7 @@ def test_a_velocity_that_is_contradicted_is_dropped_and_believed_again() -> None
     off, found = [], []
     for k, kind in enumerate(kinds):
         t = 0.01 * k
-        state = source.take(alters[kind](message(t), t), START + round(t * 1e9))
-        assert state is not None
+        state = taken(source, alters[kind](message(t), t), t)
         off.append(float(np.linalg.norm(state.velocity - motion(t)[2])))
         if source.twist.found not in found[-1:]:
             found.append(source.twist.found)
@@ -264,9 +218,7 @@ def test_a_jump_of_the_position_is_survived_and_told() -> None:
     source = OdometrySource(SourceParams(twist_frame='none'))
     read(source, Source(twist='none'), 3.0)
     for k in range(300, 400):
-        moved = message(0.01 * k, np.array([2.0, 0.0, 0.0]))
-        state = source.take(moved, START + round(0.01e9 * k))
-        assert state is not None
+        state = taken(source, message(0.01 * k, np.array([2.0, 0.0, 0.0])), 0.01 * k)
         assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.1
     assert [reason for reason, _ in source.new_events()] == ['odom jumped']
 
@@ -278,8 +230,7 @@ def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
         odd = message(0.01 * k)
         set_vector(odd.twist.twist.linear, np.zeros(3))
         odd.twist.covariance = np.diag([9999.0] * 6).reshape(36)
-        state = source.take(odd, START + round(0.01e9 * k))
-        assert state is not None
+        state = taken(source, odd, 0.01 * k)
         assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.05
     assert 'velocity' in source.missing
 

@@ -73,7 +73,7 @@ def ordered(values):
 def make_node(ros):
     import rclpy
 
-    from flock_follower.nodes.support.node_parameters import ValidatedNode
+    from flock_follower.nodes.support.parameters import ValidatedNode
     nodes = []
 
     def make(*arguments):
@@ -136,7 +136,7 @@ def test_descriptors_tell_unit_and_range(make_node):
 def test_what_is_told_of_a_file_is_what_ros_does_with_it(tmp_path, section, namespace):
     import rclpy
 
-    from flock_follower.nodes.support.node_parameters import ValidatedNode
+    from flock_follower.nodes.support.parameters import ValidatedNode
     path = tmp_path / 'x.yaml'
     path.write_text(f'{section!r}: {{ros__parameters: {{a_max: 3.0}}}}')
     context = rclpy.Context()

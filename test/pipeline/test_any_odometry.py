@@ -26,11 +26,10 @@ from rewritten_odometry import rewritten_bag, Source, sources
 
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_desk.runs.summary import evaluation_figures
+from flock_follower.files import resource
 from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.planner.modes import State
-from flock_follower.resources import resource
 
-BAG = Path(__file__).parents[2] / 'bags' / 'sample'
 ATTITUDE_NOISE = np.radians(0.3)
 
 
@@ -58,7 +57,7 @@ CASES.update({name: case._replace(recall=0.95, velocity=0.075) for name, case in
 
 
 def evaluated(case: Case, folder: Path) -> tuple[Evaluation, dict[str, Any]]:
-    bag = rewritten_bag(BAG, folder / 'bag', case.source, case.offset, case.jitter)
+    bag = rewritten_bag(folder / 'bag', case.source, case.offset, case.jitter)
     values = read_parameters(resource('config/follower.yaml'), TABLE)
     reported = parse_parameters({'/**': {'ros__parameters': case.source.parameters}}, TABLE)
     for node in values:

@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 import math
 from pathlib import Path
 import time
@@ -24,17 +23,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from bag_excerpts import excerpt
+from driven import Driven, overrides
 from geometry_msgs.msg import AccelWithCovarianceStamped
 from memory_line import MemoryLine
 from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -42,18 +37,18 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
-from flock_follower.resources import resource
+from flock_follower.parameters.files import parse_parameters, TABLE
 
-DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
-PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage}
+PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage,
+          '/neighbors': Odometry, '/neighbors/acceleration': AccelWithCovarianceStamped,
+          '/command/trajectory': MultiDOFJointTrajectory}
 
 
 @pytest.fixture(scope='module')
@@ -68,73 +63,33 @@ def result(bag: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def ros() -> Iterator[None]:
-    rclpy.init()
-    yield
-    rclpy.shutdown()
-
-
 def published(path: Path, topic: str) -> list[tuple[int, Any]]:
     with open_bag(path) as result:
         return [(m.stamp_ns, deserialize(m.data, m.msgtype)) for m in result.messages([topic])]
 
 
 def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result: Path) -> None:
-    node = RelativePose(parameter_overrides=[
-        Parameter('image_transport', value='compressed'),
-        *(Parameter(name, value=value) for name, value in PATIENT.items())])
-    player = Node('player')
-    found: list[Odometry] = []
-    player.create_subscription(Odometry, 'neighbors', found.append, 100)
-    outputs = {topic: player.create_publisher(kind, topic, qos_profile_sensor_data)
-               for topic, kind in PLAYED.items()}
-    executor = SingleThreadedExecutor()
-    for one in (node, player):
-        executor.add_node(one)
-
-    def wait(condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            node.poll_odom()  # odometry that nothing waits for is taken with the next image
-            executor.spin_once(timeout_sec=0.01)
-
-    wait(lambda: player.count_publishers('neighbors') and all(
-        output.get_subscription_count() for output in outputs.values()))
-    expected = [message for _, message in published(result, '/neighbors')]
-    with open_bag(bag) as messages:
-        for topic, _, _, data in messages.messages(list(PLAYED)):
-            rate = node.diagnostics.rates[f'{topic[1:]}_hz']
-            count = rate.count
-            outputs[topic].publish(data)
-            wait(lambda rate=rate, count=count: rate.count > count)
-    wait(lambda: len(found) == len(expected))
-    executor.shutdown()
-    for one in (node, player):
-        one.destroy_node()
-
-    assert len(expected) == 60
-    for mine, theirs in zip(found, expected):
+    node = Driven(RelativePose(parameter_overrides=overrides(
+        image_transport='compressed', **PATIENT)))
+    for _, topic, message in messages_of(
+            (bag, ['/camera_info', '/odom', '/image_raw/compressed'])):
+        node.give(topic, message)
+    node.wait(lambda: len(node.sent['neighbors']) == 60)  # the last image waits for odometry
+    node.close()
+    for mine, (_, theirs) in zip(node.sent['neighbors'], published(result, '/neighbors'),
+                                 strict=True):
         for a, b in zip(from_odometry(mine), from_odometry(theirs)):
             assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize(('node', 'changed'), [(RelativePose, 'max_wait'), (Planner, 'v_max')])
-def test_nodes_take_the_parameter_file_of_all(
-        node: type[RelativePose | Planner], changed: str, tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / 'follower.yaml'
-    path.write_text(resource('config/follower.yaml').read_text().replace(
-        'v_max: 0.5', 'v_max: 0.4').replace('rectified:', 'max_wait: 0.02\n    rectified:'))
-    rclpy.init(args=['--ros-args', '--params-file', str(path)])
-    monkeypatch.setattr(node, 'parameter_files', [str(path)])  # as runtime.run sets them
-    made = node()
-    name, value = made.get_name(), made.get_parameter(changed).value
-    made.destroy_node()
-    rclpy.shutdown()
-    assert value == read_parameters(path, TABLE)[name][changed]
-    assert value == {'max_wait': 0.02, 'v_max': 0.4}[changed]
+def messages_of(*sources: tuple[Path, list[str]]) -> list[tuple[int, str, Any]]:
+    """Return stamps, ns, topics and messages in order; of one stamp in the order of the topics."""
+    found = []
+    for path, topics in sources:
+        with open_bag(path) as bag:
+            found += [(m.stamp_ns, topic, deserialize_message(m.data, PLAYED[topic]))
+                      for topic in topics for m in bag.messages([topic])]
+    return sorted(found, key=lambda each: each[0])
 
 
 class BagClock:
@@ -148,31 +103,21 @@ class BagClock:
 
 def test_planner_gives_the_same_commands_at_the_same_ticks(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Planner(parameter_overrides=[
-        Parameter('require_bridge', value=False), Parameter('use_sim_time', value=True)])
-    clock, sent = BagClock(), []
-    monkeypatch.setattr(node, 'get_clock', lambda: clock)
-    monkeypatch.setattr(node._commands, 'publish', sent.append)
-    node._loop.engage(True)
+    node = Driven(Planner(parameter_overrides=overrides(
+        require_bridge=False, use_sim_time=True)))
+    clock, sent = BagClock(), node.sent['command/trajectory']
+    monkeypatch.setattr(node.node, 'get_clock', lambda: clock)
+    node.call('engage', data=True)
     expected = published(result, '/command/trajectory')
-    with open_bag(bag) as messages:
-        events = [(m.stamp_ns, node._take_odom, Odometry, m.data)
-                  for m in messages.messages(['/odom'])]
-        (info, *_) = [m.data for m in messages.messages(['/camera_info'])]
-    node._take_camera_info(deserialize_message(info, CameraInfo))
-    with open_bag(result) as messages:
-        for topic, take, kind in (
-                ('/neighbors/acceleration', node._take_acceleration, AccelWithCovarianceStamped),
-                ('/neighbors', node._take_neighbor, Odometry)):
-            events += [(m.stamp_ns, take, kind, m.data) for m in messages.messages([topic])]
-    events.sort(key=lambda event: event[0])
+    events = messages_of((bag, ['/camera_info', '/odom']),
+                         (result, ['/neighbors/acceleration', '/neighbors']))
     for tick, _ in expected:
         while events and events[0][0] < tick:
-            _, take, kind, data = events.pop(0)
-            take(deserialize_message(data, kind), clock.nanoseconds)
+            clock.nanoseconds, topic, message = events.pop(0)
+            node.give(topic, message)
         clock.nanoseconds = tick
-        node._tick()
-    node.destroy_node()
+        node.node._tick()
+    node.close()
 
     assert len(sent) == len(expected) == 19
     for mine, (_, theirs) in zip(sent, expected):
@@ -185,7 +130,7 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
 def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open_bag(bag) as messages:
-        start = next(iter(messages.messages(list(PLAYED)))).stamp_ns
+        start = messages.start_ns
     clock, line = BagClock(), MemoryLine()
     clock.nanoseconds = start
 
@@ -198,9 +143,9 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     monkeypatch.setattr(SetpointThread, 'stop', lambda self: None)
     monkeypatch.setattr(SetpointThread, 'submit', lambda self, action: action() or True)
     # As evaluate: the vehicle of a bag does not obey, so no wind can be told from that.
-    node = mavlink_bridge.MavlinkBridge(parameter_overrides=[
-        Parameter('wind_compensation', value='never')])
-    node._simulated = True
+    node = mavlink_bridge.MavlinkBridge(parameter_overrides=overrides(wind_compensation='never'))
+    driven = Driven(node)
+    node._even_clock.simulated = True
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)
     in_air = mavlink.MAVLink_extended_sys_state_message(
@@ -211,26 +156,17 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
             mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
         node._bridge.receive(seconds())
-    node._bridge.gate.permit(OffboardRequested(-math.inf))
+    node._bridge.gate.permit(Permission().requested(-math.inf))
     beat()
 
     expected = published(result, '/setpoint')
-    with open_bag(bag) as messages:
-        events = [(m.stamp_ns, 1, node._take_odom, m.data, Odometry)
-                  for m in messages.messages(['/odom'])]
-
-    def take_command(message: MultiDOFJointTrajectory) -> None:
-        node._on_command((message, {'publication_sequence_number': None,
-                                      'received_timestamp': 0}))
-    with open_bag(result) as messages:  # a command is taken at its tick, before an odometry
-        events += [(m.stamp_ns, 0, take_command, m.data, MultiDOFJointTrajectory)
-                   for m in messages.messages(['/command/trajectory'])]
-    events.sort(key=lambda event: event[:2])
+    events = messages_of((result, ['/command/trajectory']), (bag, ['/odom']))
     sent = []
     for cycle, _ in expected:
-        while events and events[0][:2] < (cycle, 1):
-            clock.nanoseconds, _, take, data, kind = events.pop(0)
-            take(deserialize_message(data, kind))
+        # A command is taken at its tick, before an odometry.
+        while events and (events[0][0], events[0][1] == '/odom') < (cycle, True):
+            clock.nanoseconds, topic, message = events.pop(0)
+            driven.give(topic, message)
         node._hand_over_odom()
         clock.nanoseconds = cycle
         if (cycle - start) % 500_000_000 == 0:

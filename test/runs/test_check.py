@@ -39,8 +39,8 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.observations import NodeStatus, Observations
+from flock_follower.files import resource
 from flock_follower.perception.markers import draw_marker
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 SAMPLE = resource('bags/sample')
@@ -230,7 +230,7 @@ def configured(tmp_path: Path, text: str) -> Path:
 
 def test_the_axes_of_an_imu_are_named_unless_they_are_configured(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = rewritten_bag(SAMPLE, tmp_path / 'bag', Source(imu=True), image_offset=-0.05)
+    bag = rewritten_bag(tmp_path / 'bag', Source(imu=True), image_offset=-0.05)
     code, found = checked(capsys, bag)
     assert code == 1
     assert_told(found, ('error', 'odom up', '-y of base_link is up',

@@ -18,27 +18,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import math
-import time
 from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
-from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.telemetry import AutopilotEstimate, Battery, estimate
+from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
-from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
+from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.publisher_thread import PublisherThread
+from flock_follower.nodes.support.runtime import FlockNode
 
-# Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
 
@@ -50,7 +47,7 @@ class BridgeOutputs:
     Both decide from the bridge's state, and submit functions that create a message.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, report: BridgeReport,
+    def __init__(self, node: FlockNode, bridge: Bridge, report: BridgeReport,
                  publisher: PublisherThread) -> None:
         self._node = node
         self._bridge = bridge
@@ -62,8 +59,9 @@ class BridgeOutputs:
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
             bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
-        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', STATE_QOS)
+        self._states = node.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
+        self._armed_at = node.create_publisher(
+            PointStamped, 'mavlink_bridge/armed_at', LATCHED_QOS)
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
         self.place: tuple[OdometryState, float] | None = None
@@ -83,11 +81,10 @@ class BridgeOutputs:
             if distrusted := self._bridge.distrusted(now):
                 self._report.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
-                self._send_estimate(known)
+                self._send_estimate(*known)
         motion = self._bridge.motion
         if motion is not None and attitude is not None and attitude.time == now and self._motions:
-            self._publish(self._motions, lambda: from_state(
-                make, motion[0]._replace(stamp=self._stamp(motion[1]))))
+            self._publish(self._motions, lambda: self._odometry_message(*motion))
         if battery is not None and battery.time == now:
             self._publish(self._battery, lambda: self._battery_state(battery))
         self._send_arming(now)
@@ -120,15 +117,13 @@ class BridgeOutputs:
         if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
             self._publish(self._armed_at, lambda: _point(place[0]))
 
-    def _send_estimate(self, known: AutopilotEstimate) -> None:
-        if known.time <= self._last_estimate:
+    def _send_estimate(self, state: OdometryState, valid: float) -> None:
+        if valid <= self._last_estimate:
             # TIMESYNC has just corrected the age of messages, so the stamp steps back.
             self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
             return
-        self._last_estimate = known.time
-        self._publish(self._odometry, lambda: to_odometry(
-            nanoseconds_to_stamp(self._stamp(known.time)), 'odom', 'base_link',
-            known.position, known.quaternion, known.velocity, known.angular_velocity))
+        self._last_estimate = valid
+        self._publish(self._odometry, lambda: self._odometry_message(state, valid))
 
     def _publish(self, publisher: Publisher, make: Callable[[], Any]) -> None:
         """Have the publisher thread make a message and publish it; odometry if subscribed."""
@@ -149,15 +144,14 @@ class BridgeOutputs:
 
     # The publisher thread.
 
+    def _odometry_message(self, state: OdometryState, valid: float) -> Any:
+        """Return the message of a state of a time, s, on the monotonic clock."""
+        return from_state(make, state._replace(stamp=self._stamp(valid)))
+
     def _stamp(self, valid: float) -> int:
         """Return the ROS time, ns, of a time on the monotonic clock, s, never in the future."""
-        for _ in range(3):  # between its two readings the thread may have had to wait
-            before = time.monotonic()
-            now = self._node.get_clock().now().nanoseconds
-            after = time.monotonic()
-            if after - before < 1e-3:
-                break
-        return max(0, now - max(0, round((after - valid) * 1e9)))
+        system, monotonic = self._node.read_clocks()
+        return max(0, system - max(0, round((monotonic - valid) * 1e9)))
 
     def _battery_state(self, battery: Battery) -> BatteryState:
         message = BatteryState(

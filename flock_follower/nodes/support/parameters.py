@@ -15,6 +15,8 @@
 """
 Parameters of a node: declared in one table, validated in one place, settable while flying.
 
+Those of other nodes are read by their services.
+
 A node has its parameters as a table of ``Spec`` and gives a ``build`` function that turns the
 values into one frozen object of the pure core; both are in ``flock_follower.parameters``. Every
 value, from the command line, a file or ``ros2 param set``, passes the same checks; a change is
@@ -23,7 +25,10 @@ taken whole or refused with a reason that names the parameter, its value and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 import math
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -35,19 +40,25 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
+import yaml
 
-from flock_follower.parameters.files import shared, unheeded
+from flock_follower.checks.topic_names import full_name
+from flock_follower.files import resource
+from flock_follower.nodes.support.diagnostics import internal_error
+from flock_follower.parameters.files import FLOWN, shared, unheeded
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
     refuse_unknown,
     Spec,
 )
-from flock_follower.resources import resource
 
 T = TypeVar('T')
+_NEIGHBORS = 'neighbors_file'
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -196,6 +207,107 @@ class ValidatedNode(Node):
     def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
         """Set one by one; see :meth:`set_parameters_atomically`."""
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
+
+
+class RemoteParameters:
+    """
+    Parameters of another node; ``values`` is None until it has answered.
+
+    :param other: its name, in the namespace of ``node`` unless it begins with /.
+    :param changed: is called with the values if they differ from those before.
+    """
+
+    def __init__(self, node: Node, other: str,
+                 changed: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
+        self.values: dict[str, Any] | None = None
+        self._node, self._other, self._changed = node, other, changed
+        self._get = node.create_client(GetParameters, f'{other}/get_parameters')
+        self._list: Client | None = None  # each client costs time whenever the executor waits
+
+    def ask(self, names: Collection[str] = ()) -> bool:
+        """
+        Ask for parameters, for all if no names are given.
+
+        Returns False if the other node was not found; one just started is found a moment later.
+        """
+        if not names and self._list is None:
+            self._list = self._node.create_client(
+                ListParameters, f'{self._other}/list_parameters')
+        client = self._get if names else self._list
+        assert client is not None
+        if not (client.service_is_ready() and self._get.service_is_ready()):
+            return False
+        if names:
+            self._get.call_async(GetParameters.Request(names=[*names])).add_done_callback(
+                partial(self._take_values, [*names]))
+        else:
+            client.call_async(ListParameters.Request()).add_done_callback(
+                lambda future: self.ask(future.result().result.names))
+        return True
+
+    def _take_values(self, names: list[str], future: Any) -> None:
+        try:
+            found = map(parameter_value_to_python, future.result().values)
+            values = {name: list(value) if isinstance(value, array) else value
+                      for name, value in zip(names, found)}
+            if values != self.values:
+                self.values = values
+                self._changed(values)
+        except Exception as error:  # would end the executor
+            where = f'on parameters of {self._other}'
+            if hasattr(self._node, 'diagnostics'):
+                self._node.diagnostics.internal_error(where, error)
+            else:
+                self._node.get_logger().error(internal_error(error, where))
+
+
+class FlownParameters:
+    """
+    Parameters of flying nodes as a parameter file for ``evaluate``; read again after each change.
+
+    :param nodes: their names, in the namespace of ``node``.
+    :param note: called with the name and the text of each new file.
+    """
+
+    def __init__(self, node: Node, nodes: Collection[str],
+                 note: Callable[[str, str], None]) -> None:
+        self._note = note
+        full_names = [full_name(name, node.get_namespace()) for name in nodes]
+        self._remote = {name: RemoteParameters(node, name, self._write) for name in full_names}
+        self._due = set(full_names)
+
+    def changed(self, name: str) -> None:
+        """Take it that the node of a full name has new parameters, or has been started."""
+        if name in self._remote:
+            self._due.add(name)
+
+    def ask(self) -> None:
+        """Ask those nodes whose parameters are not known, if they run."""
+        for name in sorted(self._due):
+            self._due.discard(name)
+            if not self._remote[name].ask():
+                self._due.add(name)
+
+    def _write(self, _: dict[str, Any]) -> None:
+        """Write the files: the neighbours beside the parameters, which name them there."""
+        files: dict[str, str] = {}
+        by_node = {}
+        for name, remote in sorted(self._remote.items()):
+            if remote.values is None:
+                continue
+            own = {key: value for key, value in remote.values.items() if value is not None}
+            if _NEIGHBORS in own and (own[_NEIGHBORS] or name.endswith('/relative_pose')):
+                path = Path(own[_NEIGHBORS] or resource('config/neighbors.yaml'))
+                with suppress(OSError, UnicodeDecodeError):  # its node reports that, if it must
+                    text = path.read_text(encoding='utf-8')
+                    file = next((key for key in files if files[key] == text),
+                                f'neighbors{len(files) or ""}.yaml')
+                    files[file], own[_NEIGHBORS] = text, file
+            by_node[name.rsplit('/', 1)[-1]] = {'ros__parameters': own}
+        for file, text in files.items():
+            self._note(file, text)
+        self._note(FLOWN, '# The parameters flown, as the nodes had them last.\n' + yaml.safe_dump(
+            by_node, default_flow_style=False, allow_unicode=True))
 
 
 _HOW = """\

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from flock_follower.flight_steps import (
+from flock_follower.nodes.flight_steps import (
     DISCOVERY,
     Flight,
     INTERRUPTED,
@@ -31,19 +31,32 @@ from flock_follower.flight_steps import (
 )
 
 GROUND = {'armed': 'False', 'flying': 'False'}
-AIR = {'armed': 'True', 'flying': 'True'}
+ARMED, AIR = {**GROUND, 'armed': 'True'}, {'armed': 'True', 'flying': 'True'}
 HOVER = 'INACTIVE: offboard was not requested'
+TAKEN_OVER = 'TAKEN_OVER: offboard was left for POSCTL'
+ALL = ['disengage', 'hand over']
+#: What the nodes report once a step has been reached.
+REACHED = {'arm': (ARMED, ''), 'takeoff': (AIR, ''), 'offboard': (None, 'ACTIVE')}
 
 
 class Desk:
     """A flight, and the nodes' reports of it, in made-up time."""
 
-    def __init__(self, confirm: bool = True, vehicle: dict[str, str] | None = None,
-                 bridge: str = HOVER) -> None:
+    def __init__(self, vehicle: dict[str, str] = AIR, bridge: str = HOVER, confirm: bool = True,
+                 until: str = 'check') -> None:
         self.now = 100.0
         self.flight, self.reports = Flight(self.now, confirm), Reports()
         self.engaged = 'False'
-        self.begun = self.report(vehicle or AIR, bridge)
+        self.begun = self.report(vehicle, bridge)
+        for each in ('check', 'arm', 'takeoff', 'offboard', 'engage'):
+            if each == until:
+                break
+            if self.press(each[0]):
+                self.answer(each)
+                self.engaged = str(each == 'engage')
+                self.report(*REACHED.get(each, (None, '')))
+        if until != 'check':
+            self.shown()
 
     def report(self, vehicle: dict[str, str] | None = None, bridge: str = '') -> list[str]:
         """Let a second pass, have every node report, and return what is requested then."""
@@ -63,121 +76,80 @@ class Desk:
     def answer(self, step: str, success: bool = True, message: str = 'done') -> list[str]:
         return self.flight.answer(step, success, message, self.reports, self.now)
 
-    def asked(self) -> str:
+    def end(self, insist: bool = True) -> list[str]:
+        return self.flight.end(INTERRUPTED, self.reports, insist)
+
+    def shown(self) -> str:
         """Return the last line, and forget all."""
         lines, self.flight.lines = self.flight.lines, []
         return lines[-1] if lines else ''
 
-    def until(self, step: str) -> None:
-        """Have every step before one confirmed and answered."""
-        reached = {'arm': ({**GROUND, 'armed': 'True'}, ''), 'takeoff': (AIR, ''),
-                   'offboard': (None, 'ACTIVE')}
-        for each in ('check', 'arm', 'takeoff', 'offboard', 'engage'):
-            if each == step:
-                break
-            if not self.press(each[0]):
-                continue
-            self.answer(each)
-            self.engaged = str(each == 'engage')
-            self.report(*reached.get(each, (None, '')))
-
 
 def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> None:
-    desk = Desk(vehicle=GROUND)
-    for step, vehicle, bridge in (
-            ('check', GROUND, HOVER), ('arm', {**GROUND, 'armed': 'True'}, HOVER),
-            ('takeoff', AIR, HOVER), ('offboard', AIR, 'ACTIVE')):
-        assert desk.asked().endswith(f'press {step[0]} for {step}')
-        assert desk.report() == [] and desk.asked() == ''  # it waits, and asks once
+    desk = Desk(GROUND)
+    for step, vehicle, bridge in (('check', GROUND, HOVER), ('arm', ARMED, HOVER),
+                                  ('takeoff', AIR, HOVER), ('offboard', AIR, 'ACTIVE')):
+        assert desk.shown().endswith(f'press {step[0]} for {step}')
+        assert desk.report() == [] and desk.shown() == ''  # it waits, and asks once
+        others = 'caotelx\n '.replace(step[0], '')
+        assert desk.press(others if vehicle is GROUND else 'x') == []  # only the key that is due
         assert desk.press(step[0]) == [step]
         assert desk.press(step[0]) == [] and desk.report() == []  # until it is answered
         desk.answer(step)
+        # An old report does not ask again for what was just done.
+        assert desk.flight.step(desk.reports, desk.now + 0.5) == [] and desk.shown() == 'done'
         assert desk.report(vehicle, bridge) == []
     assert desk.press('e') == ['engage']
     desk.answer('engage')
     desk.engaged = 'True'
     desk.report()
-    assert desk.asked().startswith('the follower flies') and desk.flight.code is None
-
-
-def test_only_the_key_of_the_step_that_is_due_does_anything() -> None:
-    desk = Desk(vehicle=GROUND)
-    assert desk.press('atoelx\n ') == []
-    assert desk.press('checkarm') == ['check']
+    assert desk.shown().startswith('the follower flies') and desk.flight.code is None
 
 
 def test_what_is_reached_already_is_left_out() -> None:
-    desk = Desk(vehicle=AIR)
-    assert desk.press('c') == ['check']
-    desk.answer('check')
+    desk = Desk(until='arm')
     desk.report()
-    assert desk.asked() == f'{HOVER}: press o for offboard'
+    assert desk.press('a') == [] and desk.press('o') == ['offboard']
 
 
-def test_a_refusal_shows_the_reason_and_goes_no_further() -> None:
-    desk = Desk(vehicle=GROUND)
-    desk.until('arm')
-    desk.press('a')
-    assert desk.answer('arm', False, 'arm refused: compass') == []
-    assert desk.asked() == 'arm refused: compass'
+@pytest.mark.parametrize(('step', 'vehicle'), [('check', AIR), ('arm', GROUND)])
+def test_a_refusal_shows_the_reason_and_goes_no_further(
+        step: str, vehicle: dict[str, str]) -> None:
+    desk = Desk(vehicle, until=step)
+    desk.press(step[0])
+    assert desk.answer(step, False, 'refused: compass') == []
+    assert desk.shown() == 'refused: compass'
     desk.report()
-    assert desk.asked().endswith('press a for arm')
-    desk = Desk()
-    desk.press('c')
-    desk.answer('check', False, 'not ready to fly')
-    desk.report()
-    assert desk.asked().endswith('press c for check')
-
-
-def test_an_old_report_does_not_ask_again_for_what_was_just_done() -> None:
-    desk = Desk(vehicle=GROUND)
-    desk.until('arm')
-    desk.asked()
-    desk.press('a')
-    desk.answer('arm')
-    assert desk.flight.step(desk.reports, desk.now + 0.5) == []
-    assert desk.asked() == 'done'
+    assert desk.shown().endswith(f'press {step[0]} for {step}')
 
 
 def test_after_a_takeover_offboard_is_due_again_by_its_key_only() -> None:
-    desk = Desk()
-    desk.until('')
-    desk.asked()
+    desk = Desk(until='')
     desk.engaged = 'False'
-    assert desk.report(bridge='TAKEN_OVER: offboard was left for POSCTL') == []
-    assert desk.asked() == 'TAKEN_OVER: offboard was left for POSCTL: press o for offboard'
+    assert desk.report(bridge=TAKEN_OVER) == []
+    assert desk.shown() == f'{TAKEN_OVER}: press o for offboard'
     assert desk.press('e') == [] and desk.press('o') == ['offboard']
 
 
 @pytest.mark.parametrize(('bridge', 'requested'), [
-    ('ACTIVE', ['disengage', 'hand over']), ('READY: waiting', ['disengage', 'hand over']),
-    ('NO_AUTOPILOT: lost, ACTIVE before', ['disengage', 'hand over']),
+    ('ACTIVE', ALL), ('READY: waiting', ALL), ('NO_AUTOPILOT: lost, ACTIVE before', ALL),
     ('NO_AUTOPILOT: lost, INACTIVE: on the ground before', ['disengage']),
-    (HOVER, ['disengage']), ('TAKEN_OVER: offboard was left for POSCTL', ['disengage'])])
+    (HOVER, ['disengage']), (TAKEN_OVER, ['disengage'])])
 def test_ctrl_c_takes_the_vehicle_from_nobody_but_the_follower(
         bridge: str, requested: list[str]) -> None:
-    desk = Desk()
-    desk.until('')
+    desk = Desk(until='')
     desk.report(bridge=bridge)
-    assert desk.flight.end(INTERRUPTED, desk.reports) == requested
+    assert desk.end() == requested
     assert desk.flight.code is None and desk.press('cl') == [] and desk.report() == []
     for step in requested:
         desk.answer(step)
     assert desk.flight.code == INTERRUPTED
 
 
-def test_ctrl_c_on_the_ground_requests_nothing_and_ends() -> None:
-    desk = Desk(vehicle=GROUND)
-    assert desk.flight.end(INTERRUPTED, desk.reports) == []
-    assert desk.flight.code == INTERRUPTED
-
-
-@pytest.mark.parametrize(('step', 'vehicle'), [('takeoff', GROUND), ('offboard', AIR)])
+@pytest.mark.parametrize(('step', 'vehicle'), [('takeoff', ARMED), ('offboard', AIR)])
 def test_ctrl_c_ends_what_is_under_way(step: str, vehicle: dict[str, str]) -> None:
-    desk = Desk(vehicle={**vehicle, 'armed': 'True'})
-    desk.until(step)
-    assert desk.press(step[0]) == [step]
-    assert desk.flight.end(INTERRUPTED, desk.reports) == ['disengage', 'hand over']
+    desk = Desk(vehicle, until=step)
+    assert desk.press(step[0]) == [step] and desk.end() == ALL
     desk.answer(step, False, 'superseded by hold')
     desk.answer('disengage')
     assert desk.flight.code is None
@@ -186,68 +158,59 @@ def test_ctrl_c_ends_what_is_under_way(step: str, vehicle: dict[str, str]) -> No
 
 
 def test_a_second_ctrl_c_ends_without_the_answer_and_a_second_hangup_does_not() -> None:
+    desk = Desk(GROUND)
+    assert desk.end() == [] and desk.flight.code == INTERRUPTED  # on the ground at once
     desk = Desk(bridge='ACTIVE')
-    desk.flight.end(INTERRUPTED, desk.reports)
-    assert desk.flight.end(INTERRUPTED, desk.reports, insist=False) == []
-    assert desk.flight.code is None
-    assert desk.flight.end(INTERRUPTED, desk.reports) == []
-    assert desk.flight.code == INTERRUPTED
-
-
-def test_l_ends_a_takeoff_before_the_vehicle_is_in_the_air() -> None:
-    desk = Desk(vehicle={**GROUND, 'armed': 'True'})
-    desk.until('takeoff')
-    assert desk.press('l') == []  # on the ground
-    assert desk.press('tl') == ['takeoff', 'disengage', 'land']
+    desk.end()
+    assert desk.end(insist=False) == [] and desk.flight.code is None
+    assert desk.end() == [] and desk.flight.code == INTERRUPTED
 
 
 def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None:
+    desk = Desk(ARMED, until='takeoff')
+    assert desk.press('l') == []  # on the ground
+    assert desk.press('tl') == ['takeoff', 'disengage', 'land']
     desk = Desk()
-    assert desk.press('l') == ['disengage', 'land']
-    assert desk.press('ll') == []
-    desk.answer('disengage')
-    desk.answer('land')
-    desk.report()
-    assert desk.flight.code is None
-    assert desk.flight.end(INTERRUPTED, desk.reports) == []  # the landing goes on
-    desk = Desk()
-    desk.press('l')
+    assert desk.press('l') == ['disengage', 'land'] and desk.press('ll') == []
     desk.answer('disengage')
     desk.answer('land', False, 'land refused')
     desk.report()
     assert desk.press('l') == ['disengage', 'land']
-    desk.answer('land')
-    desk.answer('disengage')
-    desk.report({**AIR, 'armed': ''})
-    assert desk.flight.code is None  # lost, not disarmed
+    for step in ('land', 'disengage'):
+        desk.answer(step)
+    for vehicle in (AIR, {**AIR, 'armed': ''}):  # lost, not disarmed
+        desk.report(vehicle)
+        assert desk.flight.code is None
     desk.report(GROUND)
     assert desk.flight.code == 0
+    desk = Desk()
+    desk.press('l')
+    assert desk.end() == []  # the landing goes on
 
 
 def test_without_keys_each_step_is_requested_once() -> None:
-    desk = Desk(confirm=False, vehicle=GROUND)
+    desk = Desk(GROUND, confirm=False)
     requested = list(desk.begun)
-    armed = {**GROUND, 'armed': 'True'}
-    for vehicle, bridge in ((GROUND, HOVER), (armed, HOVER), (AIR, HOVER), (AIR, 'ACTIVE')):
+    for vehicle, bridge in ((GROUND, HOVER), (ARMED, HOVER), (AIR, HOVER), (AIR, 'ACTIVE')):
         assert desk.report(vehicle, bridge) == []  # before the answer
         desk.answer(requested[-1])
         requested += desk.report(vehicle, bridge)
     assert requested == ['check', 'arm', 'takeoff', 'offboard', 'engage']
     desk.answer('engage')
     desk.engaged = 'True'
-    assert desk.report() == [] and desk.asked().startswith('the follower flies')
+    assert desk.report() == [] and desk.shown().startswith('the follower flies')
     desk.engaged = 'False'
     assert desk.report(bridge='TAKEN_OVER: offboard was left') == []
-    assert 'offboard is due again' in desk.asked() and desk.flight.code == 1
+    assert 'offboard is due again' in desk.shown() and desk.flight.code == 1
 
 
 def test_without_keys_a_refusal_ends_it_and_hands_over() -> None:
     desk = Desk(confirm=False)
     assert desk.answer('check', False, 'not ready') == [] and desk.flight.code == 1
-    desk = Desk(confirm=False, bridge='ACTIVE')
+    desk = Desk(bridge='ACTIVE', confirm=False)
     desk.answer('check')
     assert desk.report() == ['engage']
-    assert desk.answer('engage', False, 'no answer') == ['disengage', 'hand over']
+    assert desk.answer('engage', False, 'no answer') == ALL
 
 
 def test_missing_nodes_are_named_once_and_end_it_before_the_first_step() -> None:
@@ -256,36 +219,28 @@ def test_missing_nodes_are_named_once_and_end_it_before_the_first_step() -> None
     assert desk.flight.step(desk.reports, 100.0 + SILENCE) == [] and desk.flight.code is None
     desk.flight.lines.clear()
     desk.reports.nodes['relative_pose'] = desk.reports.nodes['mavlink_bridge'] = (109.0, {})
-    assert desk.flight.step(desk.reports, 101.0 + DISCOVERY) == []
-    assert desk.flight.code == 1
-    assert desk.asked().startswith('missing: planner (no diagnostics for 3 s)')
+    assert desk.flight.step(desk.reports, 101.0 + DISCOVERY) == [] and desk.flight.code == 1
+    assert desk.shown().startswith('missing: planner (no diagnostics for 3 s)')
 
 
-@pytest.mark.parametrize(('confirm', 'requested'), [
-    (True, []), (False, ['disengage', 'hand over'])])
+@pytest.mark.parametrize(('confirm', 'requested'), [(True, []), (False, ALL)])
 def test_a_node_that_dies_in_flight_is_named_and_keys_still_work(
         confirm: bool, requested: list[str]) -> None:
-    desk = Desk()
-    desk.until('')
+    desk = Desk(until='')
     desk.flight._confirm = confirm
-    desk.asked()
     late = desk.now + DISCOVERY + 1.0
     for node in ('planner', 'mavlink_bridge'):
         desk.reports.nodes[node] = late, desk.reports.nodes[node][1]
     assert desk.flight.step(desk.reports, late) == requested
     assert desk.flight.code is None
     assert any(line.startswith('missing: relative_pose') for line in desk.flight.lines)
-    if confirm:
-        assert desk.press('l') == ['disengage', 'land']
+    assert desk.press('l') == (['disengage', 'land'] if confirm else [])
 
 
 def test_while_the_autopilot_is_not_received_nothing_is_due() -> None:
-    desk = Desk()
-    desk.until('')
-    desk.asked()
-    lost = {'armed': '', 'flying': ''}
-    assert desk.report(lost, 'NO_AUTOPILOT: lost, ACTIVE before') == [] and desk.asked() == ''
-    assert desk.press('a') == []
+    desk = Desk(until='')
+    assert desk.report({'armed': '', 'flying': ''}, 'NO_AUTOPILOT: lost, ACTIVE before') == []
+    assert desk.shown() == '' and desk.press('a') == []
 
 
 def test_the_live_line_shows_states_distance_battery_and_reasons() -> None:

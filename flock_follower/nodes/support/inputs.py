@@ -1,0 +1,187 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Inputs of the nodes: the own state from ``odom``, static frames, and steps of the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from flock_follower.geometry import Transform
+from flock_follower.messages import OdometryState, to_array
+from flock_follower.nodes.support.diagnostics import Problem, WARN
+from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.odometry.buffer import StaticFrames
+from flock_follower.odometry.derivation import NONE
+from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters.spec import filled
+from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
+
+BASE, TF_STATIC = 'base_link', '/tf_static'
+LARGEST = 65536  # bytes of a message on /tf_static: about 500 transforms
+#: Reliable, and the last message is kept for subscribers that start later. Never KEEP_ALL: a
+#: stopped subscriber would block the publisher.
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def best_effort(depth: int = 1) -> QoSProfile:
+    """Return the QoS that takes what reliable and best-effort publishers send alike."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class EvenClock:
+    """
+    The time of a node, which goes on evenly if the system clock is set.
+
+    ``shift`` is the sum of all steps of the system clock, ns. With ``use_sim_time`` the time is
+    that of /clock, and every stamp is used.
+    """
+
+    def __init__(self, node: FlockNode) -> None:
+        self._node, self._watch = node, ClockWatch()
+        self.simulated = bool(node.get_parameter('use_sim_time').value)
+
+    @property
+    def shift(self) -> int:
+        """Return the time by which the system clock was set, ns."""
+        return self._watch.shift
+
+    def now(self) -> int:
+        """Return the time, ns; find a step of the system clock, and count it."""
+        if self.simulated:
+            return int(self._node.get_clock().now().nanoseconds)
+        system, monotonic = self._node.read_clocks()
+        if step := self._watch.take(system, monotonic):
+            self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
+        return system - self._watch.shift
+
+    def fresh(self, topic: str, stamp: int) -> bool:
+        """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
+        fresh = self.simulated or not self._watch.before_step(stamp)
+        if not fresh:
+            self._node.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
+        return fresh
+
+
+class StaticChild:
+    """
+    The frames of ``/tf_static``; none if tf2_msgs is not installed.
+
+    :param changed: is called after each message.
+    """
+
+    def __init__(self, node: Node, changed: Callable[[], None] = lambda: None) -> None:
+        self._frames = StaticFrames()
+        self._changed = changed
+        if (kind := transform_message()) is not None:
+            subscribe = (partial(node.subscribe, required=False, largest=LARGEST)
+                         if isinstance(node, FlockNode) else node.create_subscription)
+            subscribe(kind, TF_STATIC, self.take, QoSProfile(
+                depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+
+    def take(self, message: Any) -> None:
+        """Take a TFMessage."""
+        for stamped in message.transforms:
+            turn = stamped.transform.rotation
+            self._frames.add(
+                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
+                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+        self._changed()
+
+    def transform(self, child: str) -> Transform | None:
+        """Return ``T_base_child``; None if it is unknown, or base_link itself."""
+        return None if child == BASE else self._frames.pose(child, BASE)
+
+    def knows(self, frame: str) -> bool:
+        """Return whether a frame has a parent on ``/tf_static``."""
+        return self._frames.knows(frame)
+
+
+def transform_message() -> Any:
+    """Return the type of the messages on /tf; None without tf2_msgs, as in the PyPI runtime."""
+    try:
+        from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+    except ImportError:
+        return None
+    return TFMessage
+
+
+class OwnOdometry:
+    """
+    Reads a node's ``odom``; counts dropped messages, and reports the frames in use.
+
+    :param values: the node's parameters, see ``odometry.reader.SourceParams``.
+    :raises ValueError: if a parameter is out of range.
+    """
+
+    def __init__(self, node: FlockNode, values: Mapping[str, Any]) -> None:
+        self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
+        self._node = node
+        self._described = self._child = self._placed = ''
+        node.diagnostics.checks += [self._problem, self._axes_problem]
+        configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
+        self._static = None if configured else StaticChild(node, self._place)
+
+    def _place(self) -> None:
+        """Pass the pose of the child frame from tf_static to the source, if published."""
+        pose = self._static.transform(self._child) if self._static and self._child else None
+        if pose is not None and self._placed != self._child:
+            self._placed = self._child  # a static transform is passed once
+            self.source.place_child(pose)
+            self._node.get_logger().info(
+                f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE} by '
+                'tf_static')
+
+    def take(self, message: Odometry, arrival: int, shift: int = 0) -> OdometryState | None:
+        """
+        Return the own state, of base_link; None if the message repeats the last one.
+
+        :param arrival: when it came, ns of the node's clock.
+        :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
+            ``arrival`` and the stamp returned are on one that goes on evenly (``EvenClock``).
+        :raises ValueError: if the message is invalid.
+        """
+        if message.child_frame_id != self._child:
+            self._child = message.child_frame_id
+            self._place()
+        state = self.source.take(message, arrival, shift)
+        for event in self.source.new_events():
+            self._node.diagnostics.reject(*event)
+        described = self.source.twist.describe
+        if described != self._described:
+            self._node.get_logger().info(f'velocity of odom: {described}')
+            self._described = self._node.diagnostics.values['odom_twist'] = described
+        return state
+
+    def _problem(self, now: float) -> Problem | None:
+        source, values = self.source, self._node.diagnostics.values
+        values['odom_latency_s'] = f'{source.latency:.3f}'
+        values['odom_lacks'] = '; '.join(
+            f'{what}: {instead}' for what, instead in sorted(source.missing.items()))
+        twist = source.twist
+        if twist.wanted in (twist.found, NONE) or not twist.found:
+            return None
+        if twist.found == NONE or twist.wanted in ('child', 'odom'):
+            return WARN, f'velocity of odom: {twist.describe}'
+        return None
+
+    def _axes_problem(self, now: float) -> Problem | None:
+        fault = self.source.up.fault
+        return (WARN, f'axes of odom: {fault}') if fault else None

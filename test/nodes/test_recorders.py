@@ -1,0 +1,263 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Black box and recorder: kills, a full disk, a slow end, and the content of a recording."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+import errno
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import time
+
+from driven import Driven, overrides
+from full_disk import disk_of
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+from flock_desk import recorder_node
+from flock_desk.runs.processes import wait_until
+from flock_follower.bags.bag import BagError, deserialize, open_bag
+from flock_follower.messages import NANOSECONDS
+from flock_follower.nodes import black_box, SHUTDOWN_TIMEOUT
+from flock_follower.nodes.support.inputs import LATCHED_QOS
+from flock_follower.parameters.files import parameters_flown, TABLE
+from flock_follower.perception.images import decode_compressed
+
+#: A node as a program, after some lines of Python.
+PROGRAM = """
+import sys
+sys.argv = ['flock_follower/{name}', *sys.argv[1:]]
+from {package} import {name}
+{patch}
+sys.exit({name}.main(sys.argv[1:]))
+"""
+#: A bag that takes long to close, as one of some gigabytes does.
+SLOW = f"""
+import time
+from flock_follower.bags import writer
+describe = writer.describe
+
+def slow(folder, files):
+    time.sleep({SHUTDOWN_TIMEOUT} + 0.5)
+    describe(folder, files)
+
+writer.describe = slow
+"""
+PIXELS = (np.add.outer(np.arange(480), np.arange(640)) // 5 % 256).astype(np.uint8)
+
+
+class Vehicle:
+    """Publishes numbered odometry, and starts programs."""
+
+    def __init__(self) -> None:
+        self.node = Node('vehicle')
+        self.odom = self.node.create_publisher(Odometry, '/vio/odom', 10)
+        self.sent = 0
+        self.processes: list[subprocess.Popen[str]] = []
+
+    def publish(self) -> None:
+        message = Odometry()
+        message.pose.pose.position.x = float(self.sent)
+        self.odom.publish(message)
+        self.sent += 1
+
+    def fly(self, seconds: float, until: Callable[[], object] = lambda: False) -> None:
+        """Publish at 100 Hz, for a time or until a condition holds."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not until():
+            self.publish()
+            time.sleep(0.01)
+
+    def start(self, package: str, name: str, patch: str,
+              *arguments: str) -> subprocess.Popen[str]:
+        self.processes.append(subprocess.Popen(
+            [sys.executable, '-c', PROGRAM.format(package=package, name=name, patch=patch),
+             *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return self.processes[-1]
+
+
+@pytest.fixture
+def vehicle(ros: None) -> Iterator[Vehicle]:
+    made = Vehicle()
+    yield made
+    for process in made.processes:
+        process.kill()
+        process.communicate()
+    made.node.destroy_node()
+
+
+@pytest.fixture
+def box(vehicle: Vehicle, tmp_path: Path) -> Iterator[Driven]:
+    """Give a black box without threads: tests have it take and write."""
+    made = Driven(black_box.BlackBox(namespace='/drone1', cli_args=[
+        '--ros-args', '-r', 'odom:=/vio/odom'], parameter_overrides=overrides(
+            record_folder=str(tmp_path / 'box'), disk_free=10.0)))
+    wait_until(vehicle.odom.get_subscription_count, 20.0, 'the subscription')
+    yield made
+    made.close()
+
+
+def numbers(path: Path) -> list[int]:
+    """Return the numbers of the odometry messages in a recording; none if it cannot be read."""
+    try:
+        with open_bag(path) as bag:
+            return [round(deserialize(m.data, m.msgtype).pose.pose.position.x)
+                    for m in bag.messages(['odom'])]
+    except BagError:
+        return []
+
+
+def test_a_killed_black_box_has_all_but_the_last_second_and_the_next_finishes_it(
+        vehicle: Vehicle, tmp_path: Path) -> None:
+    for number in (1, 2):
+        process = vehicle.start(
+            'flock_follower.nodes', 'black_box', '', '--ros-args', '-r', 'odom:=/vio/odom',
+            '-p', f'record_folder:={tmp_path}', '-p', 'disk_free:=10.0')
+        vehicle.fly(20.0, lambda number=number: any(
+            file.stat().st_size > 20_000 for file in tmp_path.glob(f'{number:04d}_*/*.mcap')))
+        vehicle.fly(random.Random(number).uniform(0.0, 0.8))
+        process.kill()
+        killed = time.time()
+        process.wait()
+        path, = tmp_path.glob(f'{number:04d}_*')
+        with open_bag(path) as bag:
+            assert bag.incomplete.startswith('still being written')
+            assert killed - bag.end_ns / NANOSECONDS < 1.0
+        found = numbers(path)
+        assert found == list(range(found[0], found[-1] + 1))
+    with open_bag(min(tmp_path.iterdir())) as bag:
+        assert bag.incomplete == ''
+
+
+def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
+        vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', full)
+        for _ in range(2):
+            vehicle.publish()
+            box.node._take()
+            box.node._write()
+        told = f'not recording to {tmp_path / "box"}: No space left on device'
+        assert box.problems() == told
+    assert box.counters['not recorded'] >= 2
+    box.node._retry = 0.0
+
+    def recorded() -> list[int]:
+        vehicle.publish()
+        box.node._take()
+        box.node._write()
+        return [n for path in (tmp_path / 'box').iterdir() for n in numbers(path)]
+    wait_until(recorded, 10.0, 'a recording')
+    assert box.problems() == ''
+    box.node._recording.close()
+
+
+def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
+        vehicle: Vehicle, box: Driven, tmp_path: Path) -> None:
+    planner = Node('planner', namespace='drone1')
+    planner.declare_parameter('v_max', 0.75)
+    planner.declare_parameter('epsilon', 1e-5)
+    planner.create_publisher(String, 'planner/state', LATCHED_QOS).publish(String(data='IDLE'))
+    images = planner.create_publisher(Image, 'image_raw', 1)
+    executor = SingleThreadedExecutor()
+    for node in (planner, box.node):
+        executor.add_node(node)
+
+    def kept(text: str) -> bool:
+        vehicle.publish()
+        images.publish(Image(height=480, width=640, step=640, encoding='mono8',
+                             data=array('B', PIXELS.tobytes())))
+        executor.spin_once(timeout_sec=0.01)
+        box.node._take()
+        box.node._write()
+        return any(text in file.read_text()
+                   for file in (tmp_path / 'box').glob('*/parameters.yaml'))
+    wait_until(lambda: kept('v_max: 0.75\n'), 20.0, 'the parameters')
+    assert kept('    epsilon: 1.0e-05\n')
+    planner.undeclare_parameter('epsilon')
+    planner.set_parameters([Parameter('v_max', value=0.5)])
+    wait_until(lambda: kept('v_max: 0.5\n'), 20.0, 'the parameters')
+    box.node._recording.close()
+    executor.shutdown()
+    planner.destroy_node()
+    path, = (tmp_path / 'box').iterdir()
+    with open_bag(path) as bag:
+        counts = {name: topic.count for name, topic in bag.topics.items()}
+        assert bag.topics['/planner/state'].latched and counts['/planner/state'] == 1
+        image = next(bag.messages(['/image_raw/compressed']))
+        stamps = [m.stamp_ns for m in bag.messages(['/odom'])]
+    decoded = decode_compressed(deserialize(image.data, image.msgtype).data)
+    assert np.abs(decoded.astype(int) - PIXELS).mean() < 1.0
+    assert counts['/image_raw/compressed'] > 1 and '/image_raw' not in counts
+    assert np.all(np.diff(stamps) >= 0)
+    values = parameters_flown(path, TABLE)
+    assert values is not None and values['planner']['v_max'] == 0.5
+
+
+def test_it_records_in_its_threads_until_it_is_asked_to_end(
+        vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(black_box, 'spin', lambda node: vehicle.fly(
+        10.0, lambda: 'recording' in box.values))
+    assert box.node.record() == 0
+    path, = (tmp_path / 'box').iterdir()
+    with open_bag(path) as bag:
+        assert bag.incomplete == '' and bag.message_count > 0
+
+
+def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
+        vehicle: Vehicle, tmp_path: Path) -> None:
+    process = vehicle.start('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
+                            '/vio/odom:nav_msgs/msg/Odometry')
+    wait_until(vehicle.odom.get_subscription_count, 20.0, 'the recorder')
+    vehicle.fly(1.0)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=20.0)
+    assert (process.returncode, 'Traceback' in error) == (0, False), error
+    assert f'closing {tmp_path / "bag"}' in out
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete == '' and bag.message_count > 5
+
+
+def test_a_full_disk_ends_the_recorder_and_keeps_what_it_holds(
+        ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    recorder = recorder_node.Recorder(str(tmp_path / 'bag'), {'words': 'std_msgs/msg/String'})
+
+    def fill(node: recorder_node.Recorder) -> None:
+        for _ in range(10_000):
+            node._write('words', 'std_msgs/msg/String', random.randbytes(1000))
+    monkeypatch.setattr(recorder_node, 'spin', fill)
+    with disk_of(3_000_000):
+        assert recorder.record() == 1
+    recorder.destroy_node()
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f'error: {tmp_path / "bag"}: File too large; the recording so far is kept, '
+        'marked incomplete')
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete and bag.message_count > 100
