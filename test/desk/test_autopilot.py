@@ -22,6 +22,8 @@ import subprocess
 import sys
 
 from embedded_flight import Flight, MASK_YAW, setpoint
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.vehicles.embedded import STEP
