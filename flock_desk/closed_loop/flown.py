@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 
 from flock_desk.closed_loop.scenario_run import ScenarioRun
-from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP
+from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP, Motion
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
 from flock_desk.vehicles.flight_log import FlightLog
@@ -122,6 +122,12 @@ def _motion(time_ns: int, position: Array, velocity: Array, before: Array,
                     rotation.T @ velocity, matrix_to_rotation_vector(before.T @ rotation) / STEP)
 
 
+def as_odometry(time: float, motion: Motion) -> Odometry:
+    """Return a motion at a time, s, as odometry without covariances."""
+    return Odometry(time, motion.position, motion.quaternion,
+                    quaternion_to_matrix(motion.quaternion).T @ motion.velocity, motion.angular)
+
+
 class ScenarioLeader:
     """
     A leader on the scenario's course; its motion is None before it appears.
@@ -182,9 +188,7 @@ class ExternalLeader:
         if newest is None or at - newest > LONGEST_GAP:
             return None
         leader = self._motion.at(at)
-        return Odometry(time, self._origin + leader.position, leader.quaternion,
-                        quaternion_to_matrix(leader.quaternion).T @ leader.velocity,
-                        leader.angular)
+        return as_odometry(time, leader._replace(position=self._origin + leader.position))
 
     def knows(self, time_ns: int) -> bool:
         """Return whether poses were reported shortly before and after."""

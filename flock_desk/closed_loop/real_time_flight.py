@@ -33,12 +33,14 @@ from numpy.typing import NDArray
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import (
+    as_odometry,
     EmbeddedVehicle,
     FlownLeader,
     FlownVehicle,
     ScenarioLeader,
 )
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
+from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
@@ -46,7 +48,6 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,
-    slerp,
     Transform,
 )
 
@@ -95,8 +96,11 @@ class RealTimeFlight:
         self._images = 0
         self._leader = leader or ScenarioLeader(
             self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
-        self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
-        self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
+        self.follower = vehicle.step(0)
+        """The follower's true motion at the last step."""
+        self._past = ExternalMotion()
+        self._remember()
+        self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
@@ -118,16 +122,11 @@ class RealTimeFlight:
         return (math.nan if leader is None
                 else float(np.linalg.norm(leader.position - self.follower.position)))
 
-    @property
-    def follower(self) -> Odometry:
-        """Return the follower's true motion at the last step."""
-        return self._past[-1]
-
     def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
-        state = self.vehicle.step(self.time_ns)
-        self._past.append(state)
+        self.follower = state = self.vehicle.step(self.time_ns)
+        self._remember()
         if self.began_ns is None and engaged and self.vehicle.offboard:
             self.began_ns = self.time_ns
             self.skipped_images = 0
@@ -179,19 +178,15 @@ class RealTimeFlight:
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
                              self.truth(stamp_ns), leader, usable)
 
+    def _remember(self) -> None:
+        state = self.follower
+        self._past.add(Motion(
+            self.time_ns, state.position, quaternion_to_matrix(state.quaternion) @ state.linear,
+            state.quaternion, state.angular))
+
     def truth(self, time_ns: int) -> Odometry:
-        """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
-        time = time_ns * 1e-9
-        after = next((k for k, state in enumerate(self._past) if state.time >= time),
-                     len(self._past) - 1)
-        b = self._past[after]
-        a = self._past[max(after - 1, 0)]
-        share = 1.0 if b.time == a.time else min(max((time - a.time) / (b.time - a.time), 0.0),
-                                                 1.0)
-        mixed = [(1.0 - share) * x + share * y
-                 for x, y in ((a.position, b.position), (a.linear, b.linear))]
-        return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular)
+        """Return the follower's true motion at a time of the last second, without covariances."""
+        return as_odometry(time_ns * 1e-9, self._past.at(time_ns))
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
