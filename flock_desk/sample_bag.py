@@ -37,9 +37,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Renderer, Sensor
+from flock_desk.camera.renderer import Renderer, Sensor, T_BODY_OPTICAL
 from flock_desk.runs.console import guarded, Options, parsed, Progress
 from flock_desk.runs.processes import pooled
 from flock_desk.scenarios.scenario import VioErrors
