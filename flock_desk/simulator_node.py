@@ -52,8 +52,7 @@ from flock_desk.closed_loop.real_time_flight import (
     RenderedImage,
     STEP_NS,
 )
-from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.external_vehicles import ExternalVehicles
+from flock_desk.external.external_autopilot import ExternalAutopilot, ExternalVehicles
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time

@@ -92,6 +92,17 @@ def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
     assert of_runs(measure(flights), flights)['min_separation'][0] > 1.0
 
 
+@pytest.mark.parametrize('run', [87_000, pytest.param(90_000, marks=pytest.mark.sweep)])
+def test_a_line_whose_first_follower_fails_finds_its_leader(run: int) -> None:
+    """In these runs the others turned to each other and drifted away, without the leader."""
+    line = load('flock_line')
+    assert line.flock is not None
+    flights = fly(replace(line, duration=50.0, flock=replace(
+        line.flock, fails=FollowerFailure(1, 12.0))), [run], True)
+    runs = of_runs(measure(flights), flights)
+    assert not runs['lost'].any() and runs['min_separation'].min() >= 0.9
+
+
 def test_a_flock_whose_leader_was_hidden_for_5_s_finds_it_again() -> None:
     """In this run the first follower turned to the second, and both hovered until the end."""
     line = replace(load('flock_line'), outages=(Outage('marker', 20.0, 5.0),), duration=35.0)
