@@ -54,7 +54,6 @@ PLANNER_STEPS = 12
 
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
-        noise: PerceptionNoise | None = None,
         cpu_time: Callable[[], float] = lambda: 0.0,
         law: type[FlockingParams] = FlockingParams) -> Flights:
     """
@@ -65,7 +64,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     :param law: the law, or a controller in its place: see ``controllers``.
     """
-    world, noise = World(scenario, runs), noise or _noise(scenario)
+    world, noise = World(scenario, runs), _noise(scenario)
     lookout = Lookout(world, noise)
     followers = _followers(world, guard, noise, cpu_time, law)
     flock, radio = scenario.company, _radio(scenario, runs)
