@@ -33,14 +33,12 @@ from numpy.typing import NDArray
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import (
-    as_odometry,
     EmbeddedVehicle,
     FlownLeader,
     FlownVehicle,
     ScenarioLeader,
 )
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
-from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
@@ -98,8 +96,6 @@ class RealTimeFlight:
             self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
         self.follower = vehicle.step(0)
         """The follower's true motion at the last step."""
-        self._past = ExternalMotion()
-        self._remember()
         self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
         self._due = Due(scenario.odometry.rate)
@@ -126,7 +122,6 @@ class RealTimeFlight:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
         self.follower = state = self.vehicle.step(self.time_ns)
-        self._remember()
         if self.began_ns is None and engaged and self.vehicle.offboard:
             self.began_ns = self.time_ns
             self.skipped_images = 0
@@ -173,20 +168,10 @@ class RealTimeFlight:
         motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
         leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
         pixels = self.camera.image(
-            self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
+            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                             self.truth(stamp_ns), leader, usable)
-
-    def _remember(self) -> None:
-        state = self.follower
-        self._past.add(Motion(
-            self.time_ns, state.position, quaternion_to_matrix(state.quaternion) @ state.linear,
-            state.quaternion, state.angular))
-
-    def truth(self, time_ns: int) -> Odometry:
-        """Return the follower's true motion at a time of the last second, without covariances."""
-        return as_odometry(time_ns * 1e-9, self._past.at(time_ns))
+                             self.vehicle.at(stamp_ns), leader, usable)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
