@@ -67,7 +67,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     world, noise = World(scenario, runs), _noise(scenario)
     lookout = Lookout(world, noise)
     followers = _followers(world, guard, noise, cpu_time, law)
-    flock, radio = scenario.company, _radio(scenario, runs)
+    flock = scenario.company
+    radio: Radio[OdometryState] = Radio(
+        flock.followers, flock.delay, flock.loss, world.random('radio'))
     failing = [] if flock.fails is None else followers[
         flock.fails.follower - 1::flock.followers]
     count = round(scenario.duration / STEP)
@@ -132,10 +134,3 @@ def _followers(world: World, guard: bool, noise: PerceptionNoise,
         followers.append(SimulatedFollower(
             scenario, guard, run, frame, T_world_odom.inverse(), start, view, name, cpu_time, law))
     return followers
-
-
-def _radio(scenario: Scenario, runs: Sequence[int]) -> Radio[OdometryState]:
-    flock = scenario.company
-    return Radio(flock.followers, flock.delay, flock.loss, [
-        scenario.random(run, 'radio', number)
-        for run in runs for number in range(1, flock.followers + 1)])
