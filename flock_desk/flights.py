@@ -36,7 +36,7 @@ import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
-from flock_desk.closed_loop.flight_metrics import (
+from flock_desk.closed_loop.metrics import (
     band_exits,
     joined,
     measure,

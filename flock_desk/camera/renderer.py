@@ -31,12 +31,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from flock_desk.camera.leader import Face, leader
 from flock_desk.camera.lens import Camera
 from flock_follower.files import resource
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
+from flock_follower.perception.markers import draw_marker
 
 Image = NDArray[np.float32]
 
@@ -195,30 +195,16 @@ class _Panorama:
         return full[_CELL:_CELL + self._shape[0], _CELL:_CELL + self._shape[1]]
 
 
-class _Window(NamedTuple):
-    """A part of an image, with first and last + 1 column and row."""
+def _around(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return first and last + 1 column and row (2,) of the part of a window with pixels (n, 2)."""
+    return (np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, low),
+            np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN, high))
 
-    left: int
-    top: int
-    right: int
-    bottom: int
 
-    def around(self, pixels: Array) -> _Window:
-        """Return the part of it that holds pixels (n, 2)."""
-        low = np.floor(pixels.min(axis=0)).astype(int) - _MARGIN
-        high = np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN
-        return _Window(max(low[0], self.left), max(low[1], self.top),
-                       min(high[0], self.right), min(high[1], self.bottom))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return width and height."""
-        return max(self.right - self.left, 0), max(self.bottom - self.top, 0)
-
-    def of(self, image: Image, n: int = 1, left: int = 0, top: int = 0) -> Image:
-        """Return this part of an image that begins at (left, top), with n samples per pixel."""
-        return image[n * (self.top - top):n * (self.bottom - top),
-                     n * (self.left - left):n * (self.right - left)]
+def _part(image: Image, low: Any, high: Any, n: int = 1) -> Image:
+    """Return a window of an image that has n samples per pixel."""
+    (left, top), (right, bottom) = n * low, n * high
+    return image[top:bottom, left:right]
 
 
 class _Drawing:
@@ -241,18 +227,18 @@ class _Drawing:
         n, pose = self._n, camera.inverse() @ body
         points = pose.apply(self._points)
         ahead = points[:, 2] > NEAR
-        whole = _Window(0, 0, self._camera.width, self._camera.height)
         if not ahead.any():
             return
         pixels = self._camera.project(np.where(ahead[:, None], points, 1.0))
-        window = whole.around(pixels[ahead])
-        if not all(window.size):
+        low, high = _around(pixels[ahead], 0, (self._camera.width, self._camera.height))
+        if not (low < high).all():
             return
-        fine = np.zeros((n * window.size[1], n * window.size[0], 2), np.float32)
+        size = (high - low).tolist()
+        fine = np.zeros((n * size[1], n * size[0], 2), np.float32)
         light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(
             self._normals @ body.rotation.T @ _SUN, 0.0)
         # The centre of a sample lies half a sample from the edge of its pixel.
-        corners = np.rint((((pixels - window[:2]) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
+        corners = np.rint((((pixels - low) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         eye = pose.inverse().translation
         shown = np.logical_and.reduceat(ahead, self._starts) & (
             self._two_sided | (np.sum(self._normals * (eye - self._middles), axis=1)
@@ -266,37 +252,35 @@ class _Drawing:
             if texture is None and face.opacity == 1.0:
                 cv2.fillConvexPoly(fine, corners[part], colour, shift=_SHIFT)
                 continue
-            inner = window.around(pixels[part])
-            if not all(inner.size):
+            first, end = _around(pixels[part], low, high)
+            if not (first < end).all():
                 continue
+            behind = _part(fine, first - low, end - low, n)
             if texture is not None:
-                self._print(fine, window, inner, points[part],
+                self._print(behind, _part(self._rays, first, end), points[part],
                             texture * np.array([light[k], 1.0], np.float32))
                 continue
-            behind = inner.of(fine, n, window.left, window.top)
             painted = behind.copy()
-            offset = n * 2 ** _SHIFT * np.subtract(inner[:2], window[:2], dtype=np.int32)
+            offset = (n * 2 ** _SHIFT * (first - low)).astype(np.int32)
             cv2.fillConvexPoly(painted, corners[part] - offset, colour, shift=_SHIFT)
             behind += np.float32(face.opacity) * (painted - behind)
-        drawn = cv2.resize(fine, window.size, interpolation=cv2.INTER_AREA)
-        seen = window.of(image)
+        drawn = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+        seen = _part(image, low, high)
         seen[:] = drawn[..., 0] + (1.0 - drawn[..., 1]) * seen
 
-    def _print(self, fine: Image, window: _Window, inner: _Window, corners: Array,
-               texture: Image) -> None:
+    def _print(self, behind: Image, rays: Image, corners: Array, texture: Image) -> None:
         """Draw a print whose corners (4, 3) are in the optical frame, on light and cover."""
         # A ray meets the plane of the print at corner 0 + s (1 - 0) + t (3 - 0), in shares s, t.
         # Texels are at places / nearness.
         to_print = np.linalg.inv(np.stack(
             [corners[1] - corners[0], corners[3] - corners[0], corners[0]], axis=1))
         to_print[:2] *= np.reshape(texture.shape[1::-1], (2, 1))
-        column, row, nearness = cv2.split(cv2.transform(inner.of(self._rays), to_print))
+        column, row, nearness = cv2.split(cv2.transform(rays, to_print))
         nearness, n = np.maximum(nearness, np.float32(1e-3)), self._n
         places = cv2.resize(cv2.merge([column / nearness, row / nearness]) - np.float32(0.5),
                             None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
-        part = inner.of(fine, n, window.left, window.top)
         seen = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderValue=0)
-        part[:] = seen + (1.0 - seen[..., 1:]) * part
+        behind[:] = seen + (1.0 - seen[..., 1:]) * behind
 
 
 def _texture(cells: Array) -> Image:
@@ -308,3 +292,86 @@ def _texture(cells: Array) -> Image:
 def render_in_one_thread() -> None:
     """Keep OpenCV from sharing an image's work out: its threads take twice the time, waiting."""
     cv2.setNumThreads(1)
+
+
+#: The camera optical frame on the follower's body (FLU).
+T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
+#: The marker on the leader's body (FLU): on the tail, facing backwards.
+T_BODY_MARKER = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                          np.array([-0.20, 0.0, 0.0]))
+SIDE_LENGTH = 0.16  # m, of the marker
+INK, PAPER = 0.03, 0.72
+_SQUARE = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+
+
+class Face(NamedTuple):
+    """A flat convex part of a body, in the frame of that body; all values are reflectances."""
+
+    outline: Array
+    """(k, 3), m; of a print from its top left corner clockwise."""
+    normal: Array
+    """(3,), outwards."""
+    middle: Array
+    """(3,), m, of the box that it is part of: farther boxes are painted first."""
+    value: float = 0.0
+    opacity: float = 1.0
+    """Below 1 it is seen from both sides."""
+    cells: Array | None = None
+    """(rows, columns), of a print."""
+
+
+def box(pose: Transform, size: ArrayLike, value: float) -> list[Face]:
+    """Return the faces of a box about its pose's origin, of a size (3,), m."""
+    half, faces = np.asarray(size, dtype=float) / 2.0, []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            normal = sign * np.eye(3)[axis]
+            outline = np.roll(np.pad(_SQUARE, ((0, 0), (1, 0))), axis, axis=1) + normal
+            faces.append(Face(pose.apply(half * outline), pose.rotation @ normal,
+                              pose.translation, value))
+    return faces
+
+
+def marker_print(cells: Array, cell: float, middle: Transform = T_BODY_MARKER) -> Face:
+    """
+    Return a print seen from the z side of its pose.
+
+    :param cells: (rows, columns), 0 black, 1 white; :param cell: size of each, m.
+    """
+    half = np.array([cells.shape[1], cells.shape[0], 0.0]) * cell / 2.0
+    return Face(middle.apply(half * np.pad(_SQUARE, ((0, 0), (0, 1)))), middle.rotation[:, 2],
+                middle.translation, cells=INK + (PAPER - INK) * cells)
+
+
+def board(face: Face, thickness: float = 0.01) -> list[Face]:
+    """Return the board, half a cell wider than a print of 8 x 8, that it is stuck on."""
+    sides = face.outline[1] - face.outline[0], face.outline[0] - face.outline[3]
+    lengths = [float(np.linalg.norm(side)) for side in sides]
+    axes = np.stack([*(side / n for side, n in zip(sides, lengths)), face.normal], axis=1)
+    return box(Transform(axes, face.middle - 0.6 * thickness * face.normal),
+               [*(9 / 8 * n for n in lengths), thickness], 0.60)
+
+
+def second_print() -> Face:
+    """Return marker 0 of DICT_4X4_50 alone, in the body frame of a leader that would carry it."""
+    code = draw_marker('DICT_4X4_50', 0, 6) > 127
+    return marker_print(np.pad(code, 1, constant_values=True).astype(float), SIDE_LENGTH / 6)
+
+
+def leader(marker: Face | None = None) -> list[Face]:
+    """Return a quadrotor with a marker on its tail, by default marker 0 of DICT_4X4_50."""
+    marker = marker or second_print()
+    faces = [*box(Transform(), [0.30, 0.11, 0.07], 0.025), *board(marker), marker]
+    angle = np.arange(24) * 2 * np.pi / 24
+    disc = 0.11 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    for x in (-0.16, 0.16):
+        for y in (-0.25, 0.25):
+            arm = Transform(rotation_vector_to_matrix([0.0, 0.0, np.arctan2(y, x)]),
+                            np.array([0.6 * x, 0.6 * y, 0.0]))
+            motor, leg, rotor = (np.array([s * x, s * y, z]) for s, z in (
+                (1.0, 0.018), (0.8, -0.05), (1.0, 0.045)))
+            faces += [*box(arm, [0.24, 0.018, 0.014], 0.025),
+                      *box(Transform(translation=motor), [0.026, 0.026, 0.034], 0.07),
+                      *box(Transform(translation=leg), [0.01, 0.01, 0.1], 0.025),
+                      Face(disc + rotor, np.array([0.0, 0.0, 1.0]), rotor, 0.06, 0.21)]
+    return faces

@@ -30,20 +30,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
-from flock_desk.closed_loop.flown_vehicle import FlownVehicle
+from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import (
+    EmbeddedVehicle,
+    FlownLeader,
+    FlownVehicle,
+    ScenarioLeader,
+)
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.radio import Radios
+from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
-from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import STEP
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,
-    slerp,
     Transform,
 )
 
@@ -90,9 +92,11 @@ class RealTimeFlight:
         self.camera = camera
         self._latest_ns = latest_ns
         self._images = 0
-        self._leader = leader or ScenarioLeader(self.scenario, vehicle.in_place)
-        self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
-        self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
+        self._leader = leader or ScenarioLeader(
+            self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
+        self.follower = vehicle.step(0)
+        """The follower's true motion at the last step."""
+        self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
@@ -110,30 +114,20 @@ class RealTimeFlight:
     @property
     def distance(self) -> float:
         """Return the true distance between the vehicles, m; NaN without a leader."""
-        leader = self._leader.pose(self.time_ns, self.time)
+        leader = self._leader.motion(self.time_ns, self.time)
         return (math.nan if leader is None
-                else float(np.linalg.norm(leader.translation - self.follower.position)))
-
-    @property
-    def follower(self) -> Odometry:
-        """Return the follower's true motion at the last step."""
-        return self._past[-1]
-
-    def before_step(self) -> None:
-        """Let the wind blow as it will during the next step of the autopilot."""
-        self.vehicle.blow(self.scenario.wind(self.time))
+                else float(np.linalg.norm(leader.position - self.follower.position)))
 
     def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
-        state = self.vehicle.step(self.time_ns)
-        self._past.append(state)
+        self.follower = state = self.vehicle.step(self.time_ns)
         if self.began_ns is None and engaged and self.vehicle.offboard:
             self.began_ns = self.time_ns
             self.skipped_images = 0
         self._leader.step(state, self.time, self.vehicle.offboard)
         estimate = self._vio.step(state)
-        if self._due.at(state.time) and not self._fails('vio', self.time) and (
+        if self._due.at(state.time) and not self.scenario.scenario.fails('vio', self.time) and (
                 self.vehicle.knows(self.time_ns)):
             self._under_way.append((self.time_ns, estimate))
         arrived = []
@@ -151,9 +145,6 @@ class RealTimeFlight:
             return None
         return float(radios.measure(np.array([self.distance]))[0])
 
-    def _fails(self, what: str, time: float) -> bool:
-        return self.scenario.scenario.fails(what, time)
-
     def look(self, now_ns: int) -> RenderedImage | None:
         """Return the next image, if its exposure is over; leave out images that are too late."""
         while True:
@@ -170,31 +161,17 @@ class RealTimeFlight:
     def _frame(self, stamp_ns: int) -> RenderedImage:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
-        hidden = self._fails('marker', time)
+        hidden = self.scenario.scenario.fails('marker', time)
         leader = self._leader.motion(stamp_ns, time)
         usable = not (hidden or leader is None or self.scenario.blinding(time)
-                      or self._fails('vio', time))
-        poses = [self._leader.pose(t, self._scenario_time(t)) for t in moments]
-        leaders = [] if hidden else [pose for pose in poses if pose is not None]
+                      or self.scenario.scenario.fails('vio', time))
+        motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
+        leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
         pixels = self.camera.image(
-            self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
+            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                             self.truth(stamp_ns), leader, usable)
-
-    def truth(self, time_ns: int) -> Odometry:
-        """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
-        time = time_ns * 1e-9
-        after = next((k for k, state in enumerate(self._past) if state.time >= time),
-                     len(self._past) - 1)
-        b = self._past[after]
-        a = self._past[max(after - 1, 0)]
-        share = 1.0 if b.time == a.time else min(max((time - a.time) / (b.time - a.time), 0.0),
-                                                 1.0)
-        mixed = [(1.0 - share) * x + share * y
-                 for x, y in ((a.position, b.position), (a.linear, b.linear))]
-        return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular)
+                             self.vehicle.at(stamp_ns), leader, usable)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9

@@ -252,10 +252,6 @@ class ExternalVehicles:
         """Return until when, s on the monotonic clock, the follower's motion is known."""
         return self.follower.known(now)
 
-    def wake(self, due: float) -> float:
-        """Return when to look whether a step can be flown that is due: once a pose has come."""
-        return math.inf
-
     def step(self, now: float) -> None:
         """Do nothing: they fly by themselves."""
 

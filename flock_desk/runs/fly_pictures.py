@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER
+from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER
 from flock_desk.closed_loop.real_time_flight import real_time_camera, T_BODY_OPTICAL
 from flock_desk.runs.plots import (
     add_key,

@@ -116,7 +116,7 @@ class LiveRecord(FlightRecord):
     A flight of a scenario, in the odom frame without drift.
 
     An image of the table counts as one with the leader in view if the simulator says that the
-    leader can be seen and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the
+    leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
 

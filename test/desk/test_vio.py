@@ -21,7 +21,7 @@ import pytest
 
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly
-from flock_desk.sensors.vio import Due, odometry, true_odometry, turned, Vio
+from flock_desk.sensors.vio import Due, odometry, true_odometry
 from flock_follower.geometry import (
     quaternion_conjugate,
     quaternion_multiply,
@@ -83,34 +83,6 @@ def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, r
     np.testing.assert_allclose(late[[0, 1, 2, 5]] / early[[0, 1, 2, 5]], 2.0, rtol=0.35)
     np.testing.assert_allclose(
         late[3:5], math.hypot(VioErrors().tilt, VioErrors().tilt_bias), rtol=0.25)
-
-
-def test_many_runs_drift_with_the_root_of_time_and_know_their_velocity():
-    n, period, errors = 200, 1.0 / 60.0, VioErrors(height_walk=0.05)
-    position = np.zeros((n, 3))
-    vio = Vio(position, position, [np.random.default_rng(k) for k in range(n)], errors, period)
-    velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
-    for _ in range(960):
-        position = position + period * velocity
-        vio.step(position, velocity)
-    drift = vio.position - position
-    assert drift[:, 2].std() == pytest.approx(4.0 * errors.height_walk, rel=0.15)
-    assert drift[:, 0].std() == pytest.approx(4.0 * errors.position_walk, rel=0.15)
-    assert vio.yaw_error.std() == pytest.approx(4.0 * errors.yaw_walk, rel=0.15)
-    error = vio.velocity - turned(velocity, vio.yaw_error)
-    assert error.std() == pytest.approx(np.hypot(errors.velocity, errors.velocity_white), rel=0.1)
-
-
-def test_a_run_does_not_depend_on_those_beside_it():
-    position, velocity = np.zeros((3, 3)), np.tile([0.5, 0.1, 0.0], (3, 1))
-    together = Vio(position, velocity, [np.random.default_rng(k) for k in range(3)], VioErrors(),
-                   0.02)
-    alone = Vio(position[:1], velocity[:1], [np.random.default_rng(2)], VioErrors(), 0.02)
-    for k in range(1, 300):
-        together.step(0.02 * k * velocity, velocity)
-        alone.step(0.02 * k * velocity[:1], velocity[:1])
-    np.testing.assert_array_equal(together.position[2], alone.position[0])
-    np.testing.assert_array_equal(together.velocity[2], alone.velocity[0])
 
 
 @pytest.mark.parametrize(('rate', 'steps'), [(200.0, 1), (100.0, 1), (50.0, 2), (20.0, 5)])

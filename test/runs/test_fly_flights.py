@@ -32,7 +32,7 @@ import pytest
 
 from flock_desk.fly import main
 from flock_desk.runs.processes import free_udp_port
-from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.estimator import GROUND_AMSL
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 AUTOPILOT = str(Path(__file__).parents[1] / 'faulty_autopilot.py')

@@ -20,9 +20,8 @@ import numpy as np
 import pytest
 
 from flock_desk import sample_bag as sample
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Sensor
+from flock_desk.camera.renderer import Sensor, SIDE_LENGTH, T_BODY_MARKER
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.files import resource
 from flock_follower.perception import markers as neighbors
