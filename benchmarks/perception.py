@@ -50,14 +50,14 @@ import cv2
 from detectors import ARUCO, detectors, Look, TAG
 import numpy as np
 
-from flock_desk.camera.leader import (
+from flock_desk.camera.renderer import (
     leader,
     marker_print,
+    Renderer,
     SIDE_LENGTH,
     T_BODY_MARKER,
     T_BODY_OPTICAL,
 )
-from flock_desk.camera.renderer import Renderer
 from flock_desk.runs.frame_errors import FrameErrors
 from flock_desk.sample_bag import (
     IMAGE_RATE,

@@ -47,7 +47,7 @@ from typing import Any, NamedTuple
 
 import cv2
 
-from flock_desk.runs.console import explained, guarded, parsed
+from flock_desk.runs.console import explained, guarded, Options, parsed
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_desk.runs.judge import check_names, Judgement, load_bounds
 from flock_desk.runs.processes import mapped
@@ -58,7 +58,7 @@ from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.files import resource
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
 
-_OPTIONS = {
+_OPTIONS: Options = {
     'bag': {'type': Path, 'nargs': '+', 'help': '.mcap, .db3, .bag or ROS 2 bag folder'},
     '--config': {'type': Path, 'help': 'ROS 2 parameter file (default: those flown, of a '
                  'recording of the black box, else config/follower.yaml of this package)'},

@@ -43,7 +43,7 @@ from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
-from flock_desk.runs.console import aligned, guarded, parsed, Progress
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
 from flock_desk.runs.record import last_flight, read_flown
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.bag import BagError, failures
@@ -63,13 +63,13 @@ FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 
 
-_OPTIONS = {
+_OPTIONS: Options = {
     '--out': {'type': Path, 'default': Path('build/figures'), 'help': '%(default)s'},
     '--flights': {'type': Path, 'default': Path('build/fly'), 'metavar': 'FOLDER',
                   'help': 'folder of the flights of fly; %(default)s'},
     '--campaign': {'type': Path, 'default': Path('build/flights/flights.json'), 'metavar': 'FILE',
                    'help': 'results of flights; %(default)s'}}
-_FLOCK = {
+_FLOCK: Options = {
     '--agents': {'type': int, 'metavar': 'N', 'help': 'how many, instead of the paper'},
     '--dim': {'type': int, 'choices': (2, 3), 'default': 2, 'help': '%(default)s'},
     '--seed': {'type': int, 'default': 1, 'help': 'of the start; %(default)s'},
@@ -240,13 +240,14 @@ def one_flock(options: argparse.Namespace) -> list[str]:
 def row(scenario: str, name: str, run: Simulation) -> Row:
     """Return the line of the table that a simulation fills."""
     m = run.metrics
-    least, greatest = (extremum(m.time, values, least=side)
-                       for values, side in ((m.min_r2, True), (m.max_r2, False)))
+    (nearest_at, nearest), (farthest_at, farthest) = (
+        extremum(m.time, values, least=side)
+        for values, side in ((m.min_r2, True), (m.max_r2, False)))
     mean = run.velocities[-1].mean(axis=0)
     heading = np.degrees(np.arctan2(mean[1], mean[0]))
-    kept = least.value > run.params.d0 and greatest.value < run.params.d1
-    return (scenario, name, _text(least.value, 6), _text(least.time, 3), _text(greatest.value, 6),
-            _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
+    kept = nearest > run.params.d0 and farthest < run.params.d1
+    return (scenario, name, _text(nearest, 6), _text(nearest_at, 3), _text(farthest, 6),
+            _text(farthest_at, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
             _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
             _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
 

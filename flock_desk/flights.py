@@ -23,15 +23,11 @@ OUTPUT/flights.json. The same seed gives the same file for any number of jobs.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
-import json
-import multiprocessing
 import os
 from pathlib import Path
-import signal
 import sys
 import time
 from typing import NamedTuple
@@ -40,7 +36,7 @@ import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
-from flock_desk.closed_loop.flight_metrics import (
+from flock_desk.closed_loop.metrics import (
     band_exits,
     joined,
     measure,
@@ -48,8 +44,9 @@ from flock_desk.closed_loop.flight_metrics import (
     of_runs,
     summary,
 )
-from flock_desk.runs.console import aligned, guarded, parsed, Progress
-from flock_desk.runs.processes import mapped
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
+from flock_desk.runs.processes import mapped, pooled
+from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
     key_tables,
@@ -58,7 +55,6 @@ from flock_desk.scenarios.scenario_file import (
     ScenarioError,
     with_flock,
 )
-from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
@@ -109,10 +105,7 @@ class Flown(NamedTuple):
     """Which runs left the band, when and why, one line each."""
 
 
-_OPTIONS = {
-    '--scenario': {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
-                   'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is '
-                   'the default'},
+_OPTIONS: Options = {
     '--controllers': {'nargs': '+', 'choices': CONTROLLERS, 'default': list(CONTROLLERS),
                       'metavar': 'NAME', 'help': f'{", ".join(CONTROLLERS)}; a flock flies '
                       f'{" and ".join(IN_FLOCKS)} only (all)'},
@@ -136,7 +129,10 @@ def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='flights', description='Fly scenarios many times, with several controllers.')
-    options = parsed(parser, args, _OPTIONS,
+    scenario = {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
+                'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is the '
+                'default'}
+    options = parsed(parser, args, {'--scenario': scenario, **_OPTIONS},
                      valid={'runs': _COUNTS, 'jobs': _COUNTS, 'seed': _SEEDS})
     if options.keys:
         print(key_tables())
@@ -153,8 +149,7 @@ def _campaign(options: argparse.Namespace) -> int:
     results, cpu, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
                                   options.seed, options.scheduler)
     path = options.output / 'flights.json'
-    with whole_file(path) as file:
-        file.write((json.dumps(results, indent=2) + '\n').encode())
+    write_summary(results, path)
     print(table(results))
     print(COLUMN_NOTES)
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
@@ -209,7 +204,7 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
              for controller in of_scenario(scenario) for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
-    flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
+    flown = mapped(scheduler, _fly, tasks) if scheduler else pooled(jobs, _fly, tasks)
     with Progress(len(scenarios)) as progress:
         for name, group in groupby(tasks, lambda task: task.scenario.name):
             progress.start(name)
@@ -243,28 +238,6 @@ def table(results: Results,
 def shorten(name: str) -> str:
     """Return a name that leaves the table within 100 columns."""
     return name if len(name) <= LONGEST_NAME else f'{name[:LONGEST_NAME - 1]}…'
-
-
-def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
-    if jobs == 1:
-        yield from map(_fly, tasks)
-        return
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
-    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        flown = pool.map(_fly, tasks)
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        yield from flown
-    except BaseException:
-        # A task runs for up to a minute: its result is no longer needed.
-        for worker in multiprocessing.active_children():
-            worker.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _fly(task: Task) -> Flown:

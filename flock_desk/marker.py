@@ -40,7 +40,7 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 import numpy as np
 
-from flock_desk.runs.console import guarded, parsed
+from flock_desk.runs.console import guarded, Options, parsed
 from flock_follower.files import whole_file
 from flock_follower.perception.markers import (
     dictionary_size,
@@ -83,7 +83,7 @@ _PANEL_ENTRY = """\
         side_length: {side_length:g}  # m; measure the print
         position: [{forward:.4f}, {left:.4f}, {up:.4f}]
         rpy: [1.5707963, 0.0, -1.5707963]"""
-_OPTIONS = {
+_OPTIONS: Options = {
     '--id': {'type': int, 'nargs': '+', 'metavar': 'N',
              'help': 'of the marker; several make several pages'},
     '--panel': {'action': 'store_true',

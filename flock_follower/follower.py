@@ -39,7 +39,6 @@ from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
@@ -187,10 +186,10 @@ class Follower:
         self.advance(time)
         self.planner.engage(requested)
 
-    def permit(self, time: int, event: Event) -> None:
-        """Take a request to the bridge, or its result; see ``permission``."""
+    def permit(self, time: int, since: float) -> None:
+        """Take a request for offboard, which HEARTBEATs after the time ``since``, s, answer."""
         self.advance(time)
-        self._control.permit(event)
+        self._control.permit(self._control.permission.requested(since))
         self._announce_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:

@@ -51,6 +51,7 @@ _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
 _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
+_SKIN = 0.05  # m that agents may move before near pairs are searched again
 
 
 @dataclass(frozen=True)
@@ -116,21 +117,13 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :raises RuntimeError: if no finite solution goes on.
     """
     params = FlockingParams() if params is None else params
-    for name, choice, known in (('model', model, Model), ('neighbors', neighbors, Neighbors),
-                                ('coupling', coupling, Coupling),
-                                ('integrator', integrator, Integrator)):
-        laws.check_choice(name, choice, known)
-    if neighbors != 'all' and model != 'flocking':
-        raise ValueError(f"neighbors = {neighbors!r}: must be 'all' where model = {model!r}")
+    _check_choices(model, neighbors, coupling, integrator)
     discrete = model in ('vicsek', 'vicsek_mean_velocity')
     dt = (0.1 if discrete else 0.01) if dt is None else dt
     for name, value in (('duration', duration), ('sample_period', sample_period), ('dt', dt),
                         ('radius', radius)):
         _POSITIVE.check(name, value)
-    x, v = _checked_start(positions, velocities)
-    if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
-        raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '
-                         f'must be {x[0].shape}, as the positions are')
+    x, v = _checked_start(positions, velocities, leader)
     growing = None
     if discrete:
         every = max(1, round(sample_period / dt))
@@ -141,10 +134,8 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
         growing = _GrowingGraph(x, params, coupling) if neighbors == 'graph' else None
         _check_band(x, params, model, neighbors, growing)
         acceleration = _acceleration(params, model, growing or neighbors, coupling, method, leader)
-        if integrator == 'adaptive':
-            solve = partial(adaptive, acceleration,
-                            breaks=() if leader is None else leader.breaks)
-        else:
+        solve = partial(adaptive, acceleration, breaks=leader.breaks if leader else ())
+        if integrator == 'semi_implicit':
             solve = partial(semi_implicit, acceleration, dt=dt,
                             acceptable=growing.step_is_small if growing else None)
         states = growing.followed(solve, (x, v), time) if growing else solve((x, v), time)
@@ -156,6 +147,16 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     x, v = map(np.array, zip(*run))
     return Simulation(time, x, v, params, model, *(
         () if growing is None else (growing.graph, np.array(growing.joined))))
+
+
+def _check_choices(model: Model, neighbors: Neighbors, coupling: Coupling,
+                   integrator: Integrator) -> None:
+    for name, choice, known in (('model', model, Model), ('neighbors', neighbors, Neighbors),
+                                ('coupling', coupling, Coupling),
+                                ('integrator', integrator, Integrator)):
+        laws.check_choice(name, choice, known)
+    if neighbors != 'all' and model != 'flocking':
+        raise ValueError(f"neighbors = {neighbors!r}: must be 'all' where model = {model!r}")
 
 
 class _GrowingGraph:
@@ -189,10 +190,13 @@ class _GrowingGraph:
             yield state
 
     def _nearby(self, x: Array) -> Pairs:
-        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
-        if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
-            self._near = (x, laws.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else laws.pairs_within(x, np.sqrt(self._params.d1)))
+        """Return at least the pairs with r^2 < d1; all, if they are few."""
+        few = len(x) <= _NEAR_BY_ALL
+        if self._near is None or not (few or np.abs(x - self._near[0]).max() <= _SKIN):
+            # Each of two agents may move by _SKIN along each of at most 3 axes.
+            distance = np.sqrt(self._params.d1) + 2.0 * np.sqrt(3.0) * _SKIN
+            self._near = (x, laws.complete_graph(len(x)).edges if few
+                          else laws.pairs_within(x, distance))
         return self._near[1]
 
 
@@ -300,7 +304,8 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
         yield x, v
 
 
-def _checked_start(positions: ArrayLike, velocities: ArrayLike) -> State:
+def _checked_start(positions: ArrayLike, velocities: ArrayLike,
+                   leader: Leader | None) -> State:
     x, v = flocking.checked(positions, velocities)
     if not len(x):
         raise ValueError('positions has no agents: give at least one')
@@ -308,6 +313,9 @@ def _checked_start(positions: ArrayLike, velocities: ArrayLike) -> State:
         i, j = same[0]
         raise ValueError(f'positions[{i}] and positions[{j}] are both {x[i].tolist()}: '
                          'agents must start apart')
+    if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
+        raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '
+                         f'must be {x[0].shape}, as the positions are')
     return x, v
 
 

@@ -45,7 +45,6 @@ from typing import Any, get_args, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flock_follower import flocking
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
     alignment,
@@ -55,6 +54,7 @@ from flock_follower.flocking import (
     FlockingParams,
     Model,
     separation,
+    sum_over_neighbors,
 )
 from flock_follower.geometry import Array
 
@@ -90,19 +90,12 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     """
     x, v = checked(positions, velocities)
     check_choice('method', method, Method)
-    check_choice('model', model, Model)
-    if method == 'whole' or (method == 'auto' and len(x) <= _FEW):
-        return flocking.accelerations(x, v, params, model)
+    whole = method == 'whole' or (method == 'auto' and len(x) <= _FEW)
+    count = len(x) if whole else max(1, _ENTRIES // len(x))
     scale, u = disagreement(v), np.empty_like(x)
-    count = max(1, _ENTRIES // len(x))
-    for rows in (slice(first, first + count) for first in range(0, len(x), count)):
-        offset, difference = x - x[rows, None], v - v[rows, None]
-        r2 = np.sum(offset ** 2, axis=-1, keepdims=True)
-        u[rows] = np.sum(alignment(r2, params) * difference, axis=1)
-        if model != 'cucker_smale':
-            u[rows] -= scale * np.sum(separation(r2, params) * offset, axis=1)
-        if model == 'flocking':
-            u[rows] += scale * np.sum(cohesion(r2, params) * offset, axis=1)
+    for first in range(0, len(x), count):
+        rows = slice(first, first + count)
+        u[rows] = sum_over_neighbors(x - x[rows, None], v - v[rows, None], scale, params, model)
     return u
 
 
@@ -256,7 +249,10 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
 
 def squared_distances(positions: Array, pairs: Pairs) -> Array:
     """Return r^2 (m,), m^2, of the pairs (m, 2) among the positions (k, n)."""
-    return np.sum((positions[pairs[:, 1]] - positions[pairs[:, 0]]) ** 2, axis=1)
+    ends = positions.take(pairs, 0)
+    offset = ends[:, 1] - ends[:, 0]
+    squares: Array = np.einsum('ij,ij->i', offset, offset)
+    return squares
 
 
 def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,

@@ -32,7 +32,7 @@ LEADER_SWITCH = 1.25
 _MARGIN = 0.1  # share of the band that every pair of a random start keeps from its edges
 _TRIES = 10_000  # for one agent
 _COUNTS = Range(1, whole=True)
-_SPEEDS = Range(0.0, unit='m/s')
+_SPEED = 0.5  # m/s, standard deviation of the velocities along each axis
 
 
 class InitialMotion(NamedTuple):
@@ -66,8 +66,8 @@ def leader_input(t: float) -> Array:
     return sign * np.array([np.sin(angle), np.cos(angle)])
 
 
-def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
-                 speed: float = 0.5) -> InitialMotion:
+def random_start(count: int, dimension: int, params: FlockingParams,
+                 seed: int) -> InitialMotion:
     """
     Return a flock grown agent by agent, each inside the band of one that is there already.
 
@@ -75,14 +75,12 @@ def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
 
     :param dimension: 2 or 3.
     :param seed: of the random numbers; the same gives the same flock.
-    :param speed: standard deviation of the velocities along each axis, m/s.
-    :raises ValueError: for a count below 1, another dimension, a negative speed, or a band too
-        narrow to find room in.
+    :raises ValueError: for a count below 1, another dimension, or a band too narrow to
+        find room in.
     """
     _COUNTS.check('count', count)
     if dimension not in (2, 3):
         raise ValueError(f'dimension = {dimension!r}: must be 2 or 3')
-    _SPEEDS.check('speed', speed)
     rng = np.random.default_rng(seed)
     margin = _MARGIN * (params.d1 - params.d0)
     positions = np.zeros((count, dimension))
@@ -98,4 +96,4 @@ def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
         else:
             raise ValueError(f'no room for agent {n} of {count}: raise d1 = {params.d1:g} m^2')
     return InitialMotion(positions - positions.mean(axis=0),
-                         speed * rng.normal(size=positions.shape))
+                         _SPEED * rng.normal(size=positions.shape))

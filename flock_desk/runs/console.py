@@ -27,11 +27,11 @@ from flock_follower.bags.live_line import LOG_PERIOD, TERMINAL_PERIOD
 from flock_follower.ranges import Range
 
 WIDTH = 100  # characters of a bar
+Options = Mapping[str, Mapping[str, Any]]
 
 
 def parsed(parser: argparse.ArgumentParser, args: Sequence[str] | None,
-           options: Mapping[str, Mapping[str, Any]],
-           groups: Mapping[str, Mapping[str, Mapping[str, Any]]] | None = None,
+           options: Options, groups: Mapping[str, Options] | None = None,
            valid: Mapping[str, Range] | None = None) -> argparse.Namespace:
     """
     Return the values of a command's options; a wrong one ends the program with exit code 2.
@@ -40,7 +40,7 @@ def parsed(parser: argparse.ArgumentParser, args: Sequence[str] | None,
     :param groups: likewise more options, by the title of their group in the help.
     :param valid: the values of a number, by the name of the option without dashes.
     """
-    sections: list[tuple[Any, Mapping[str, Mapping[str, Any]]]] = [
+    sections: list[tuple[Any, Options]] = [
         (parser, options),
         *((parser.add_argument_group(title), rows) for title, rows in (groups or {}).items())]
     for section, rows in sections:

@@ -56,7 +56,6 @@ from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
@@ -191,7 +190,7 @@ class RecordedFlight:
         if not self._began:
             self._began = True
             self.follower.engage(time, True)
-            self.follower.permit(time, OffboardRequested(-math.inf))
+            self.follower.permit(time, -math.inf)
             self.follower.vehicle(time, FLYING)
         if name == 'camera_info':
             calibration = data[_AFTER_STAMP:]
@@ -232,11 +231,11 @@ class Evaluation(Listener):
     """
     The record of a run: a few numbers for each image, tick and setpoint.
 
-    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s
-    since the first message, ``frame_cpu`` perception's CPU time for it, s. ``tick_rows``: time,
-    index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
-    ``reasons`` has the time and the reason of every tick in HOLD.
-    ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
+    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s since the first
+    message, ``frame_cpu`` perception's CPU time for it, s. ``tick_rows``: time, index of the state
+    in STATES, norm of the commanded acceleration (NaN: none), own speed. ``reasons`` has the time
+    and the reason of every tick in HOLD. ``setpoint_rows``: time, the acceleration sent (NaN:
+    none), 1 for a command.
     """
 
     bag: str
@@ -347,8 +346,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
     :param values: the parameters of every node, see ``parameters.files.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
-    :param namespace: of the topics in the bag.
-    :param remaps: names of topics in the bag, by ours, if they differ.
+    :param namespace: of the topics in the bag; ``remaps``: their names, by ours, if they differ.
     :param checked: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: if the result cannot be written.

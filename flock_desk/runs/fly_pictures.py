@@ -14,14 +14,16 @@
 
 
 """
-The pictures of a flight of ``fly``: those of its report, its portrait, and the moving one.
+The pictures of ``fly``: those of its reports, its portrait, and the moving one.
 
 The moving picture shows the camera's image, both tracks from above, and the distance.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import io
+from itertools import cycle
 
 import cv2
 from matplotlib.axes import Axes
@@ -31,12 +33,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER
+from flock_desk.camera.renderer import SIDE_LENGTH, T_BODY_MARKER
 from flock_desk.closed_loop.real_time_flight import real_time_camera, T_BODY_OPTICAL
 from flock_desk.runs.plots import (
+    add_key,
     chapters,
+    COLOURS,
     draw_above,
     draw_distance,
+    draw_map,
     encoded,
     equal_scales,
     FOLLOWER,
@@ -47,7 +52,8 @@ from flock_desk.runs.plots import (
 )
 from flock_desk.runs.record import LiveRecord
 from flock_desk.runs.report import Chapter, Illustration
-from flock_follower.geometry import Transform
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array, Transform
 
 RATE, LONGEST = 8.0, 15.0  # pictures per s; s, the part of the flight that is shown
 _CORNERS = 0.5 * SIDE_LENGTH * np.array(
@@ -82,6 +88,28 @@ def portrait(flight: LiveRecord) -> bytes:
     draw_distance(axes['distance'], flight, with_gaps(flight.table))
     axes['distance'].set(xlim=(0.0, flight.duration), xlabel=TIME)
     return encoded(figure, 'jpg')
+
+
+def column_chapters(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
+                    law: FlockingParams) -> list[Chapter]:
+    """
+    Return the page of a column: a picture of the tracks, and the distances of all pairs.
+
+    :param times: (n,), s; ``tracks`` (n, 3), m, by vehicle; ``distances`` (n,), m, by pair.
+    """
+    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
+    above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
+    draw_map(above, tracks, 'from above (● start, ■ end)')
+    apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=LEADER, alpha=0.08, lw=0)
+    for (name, distance), colour in zip(distances.items(), cycle(COLOURS)):
+        apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
+    apart.set(xlabel=TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])),
+              ylim=(0.0, None), title='distances; shaded: the band')
+    add_key(apart)
+    return [Chapter(
+        'The column', 'In the frame of the first follower. Each has a page of its own: '
+        + ', '.join(f'{name}/report.html' for name in tracks if name != 'leader') + '.',
+        [Illustration(encoded(figure), 'tracks from above and distances of all pairs')])]
 
 
 def moving_picture(record: LiveRecord) -> bytes:

@@ -182,9 +182,10 @@ class FrameErrors:
         position, _, rotation = _relative(true, true_own)
         visible = np.zeros(len(position), dtype=bool)
         for name, model in self.models.items():
-            for marker in neighbor.markers if model else ():
-                visible |= (cameras == name) & _marker_visible(
-                    marker, model, self._T_camera_body[name], position, rotation)
+            if model is not None:
+                for marker in neighbor.markers:
+                    visible |= (cameras == name) & _marker_visible(
+                        marker, model, self._T_camera_body[name], position, rotation)
         return np.where(np.isfinite(position[:, 0]), visible, np.nan)
 
 
@@ -276,3 +277,8 @@ def _nees(errors: Array, covariances: Array) -> Array:
     solved = np.linalg.solve(covariances[known], errors[known][:, :, None])[:, :, 0]
     nees[known] = np.einsum('ni,ni->n', errors[known], solved)
     return nees
+
+
+def by_axis(table: Table, kind: str) -> Array:
+    """Return the columns (n, 3) of a kind along x, y and z."""
+    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)

@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation
-from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.frame_errors import by_axis, STAGES, Table
 from flock_desk.runs.record import Flight, REPLAYED
 from flock_desk.runs.report import Chapter, Illustration
 from flock_desk.runs.summary import consistency, sight_figures
@@ -104,15 +104,14 @@ def flight_picture(flight: Flight, title: str = '') -> bytes:
     for label, (times, speeds) in flight.speeds.items():
         axes['speed'].plot(times, speeds, linewidth=1.1, label=label,
                            color=_SPEED_COLOURS.get(label, FOLLOWER))
-    axes['speed'].set(ylabel='speed [m/s]')
-    axes['speed'].set_ylim(bottom=0.0)
+    axes['speed'].set(ylabel='speed [m/s]', ylim=(0.0, None))
     add_key(axes['speed'])
     _draw_states(axes['state'], flight)
     if truth:
         figures = sight_figures([flight.table], params.max_velocity_std)
         for kind, unit in (('position', 'cm'), ('velocity', 'cm/s')):
             rms = figures['position_rms_m' if kind == 'position' else 'velocity_rms_m_s']
-            errors = 100.0 * _norms(_by_axis(table, kind))
+            errors = 100.0 * _norms(by_axis(table, kind))
             axes[kind].plot(table['time'], errors, color=FOLLOWER, linewidth=0.9)
             axes[kind].set(ylabel=f'{kind} error [{unit}]',
                            ylim=(0.0, 1.2 * _usually(errors, 99.5)))
@@ -136,7 +135,7 @@ def error_picture(flight: Flight) -> bytes:
     axes = figure.subplots(3, 2, sharex=True)
     for column, (kind, unit) in enumerate((('position', 'cm'), ('velocity', 'cm/s'))):
         # One scale for the three axes, which makes them comparable.
-        errors, sigmas = 100.0 * _by_axis(table, kind), 100.0 * _by_axis(table, f'{kind}_sigma')
+        errors, sigmas = 100.0 * by_axis(table, kind), 100.0 * by_axis(table, f'{kind}_sigma')
         limit = 1.15 * max(_usually(np.abs(errors), 99.0), _usually(2.0 * sigmas, 90.0))
         for row, axis in enumerate(('x, forward', 'y, left', 'z, up')):
             plot: Axes = axes[row, column]
@@ -169,8 +168,8 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
                         markersize=13, markeredgewidth=1.2)
-    stages.set_title('stage that measured the neighbour in each image, and CPU time of perception')
-    stages.set(ylabel='stage', ylim=(-0.6, 3.6))
+    stages.set(ylabel='stage', ylim=(-0.6, 3.6), title='stage that measured the neighbour in '
+               'each image, and CPU time of perception')
     stages.set_yticks(range(len(STAGES)), STAGES)
     cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
     cpu.set(ylabel='CPU time [ms]', xlabel=TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
@@ -207,9 +206,9 @@ def draw_distance(axis: Axes, flight: Flight, table: Table) -> None:
                   linestyle=(0, (5, 3)), label='true')
     shown = np.concatenate([table['distance'], table['true_distance']])
     shown = shown[np.isfinite(shown)]
-    axis.set(ylabel='distance [m]', ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
-                                          max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
-    axis.set_title(f'distance to {flight.name}')
+    axis.set(ylabel='distance [m]', title=f'distance to {flight.name}',
+             ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
+                   max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
     _shade(axis, flight.blind, 'leader not visible')
     add_key(axis)
 
@@ -286,11 +285,6 @@ def add_key(axis: Axes) -> None:
 
 def _has_truth(table: Table) -> bool:
     return bool(np.any(np.isfinite(table['true_distance'])))
-
-
-def _by_axis(table: Table, kind: str) -> Array:
-    """Return the columns (n, 3) of a kind."""
-    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
 
 
 def _norms(vectors: Array) -> Array:

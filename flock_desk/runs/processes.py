@@ -22,9 +22,11 @@ its workers need this package in the same version, and the same files where task
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
+import multiprocessing
 import os
 from pathlib import Path
 import random
@@ -310,6 +312,30 @@ class Processes:
         self.stop_all()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
+
+
+def pooled(jobs: int, function: Callable[[Given], Result],
+           tasks: Iterable[Given]) -> Iterator[Result]:
+    """Yield what a function makes of each task, in their order, computed by ``jobs`` processes."""
+    if jobs == 1:
+        yield from map(function, tasks)
+        return
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
+    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        results = pool.map(function, tasks)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield from results
+    except BaseException:
+        # A task runs for up to a minute: its result is no longer needed.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def mapped(address: str, function: Callable[[Given], Result],

@@ -29,7 +29,7 @@ import json
 import math
 from pathlib import Path
 import shutil
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +57,6 @@ PICTURE = 'picture.jpg'
 REPLAYED = 'vehicle that flew the commands'
 _RECORD = 'record'
 _FILES = ('flight.npz', 'report.html', PICTURE, 'summary.json')
-
-
-class Received(NamedTuple):
-    """A recorded message and when it was received, s on the monotonic clock."""
-
-    time: float
-    message: Any
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,7 +116,7 @@ class LiveRecord(FlightRecord):
     A flight of a scenario, in the odom frame without drift.
 
     An image of the table counts as one with the leader in view if the simulator says that the
-    leader can be seen and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the
+    leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
 
@@ -236,9 +229,9 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord
     record = read_record(out / _RECORD)
     if str(log['pose_source']):
         commands = record.get('/command/trajectory', [])
-        log['setpoint_time'] = np.array([command.time for command in commands])
+        log['setpoint_time'] = np.array([time for time, _ in commands])
         log['setpoint_acceleration'] = np.reshape(
-            [from_trajectory(command.message, 'odom').acceleration for command in commands],
+            [from_trajectory(message, 'odom').acceleration for _, message in commands],
             (-1, 3))
     sent = flown(log['setpoint_time'])
     table = compared(
@@ -282,21 +275,21 @@ def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryStat
                 log[f'{name}_{what}'] for what in ('position', 'quaternion', 'velocity')))]
 
 
-def read_record(path: Path) -> dict[str, list[Received]]:
+def read_record(path: Path) -> dict[str, list[tuple[float, Any]]]:
     """
-    Return what the recorder wrote, by topic.
+    Return the messages that the recorder wrote, by topic, each with its monotonic time, s.
 
     :raises BagError: if it cannot be read.
     """
-    record: dict[str, list[Received]] = {}
+    record: dict[str, list[tuple[float, Any]]] = {}
     with open_bag(path) as bag:
         for m in bag.messages():
             record.setdefault(m.topic, []).append(
-                Received(m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
+                (m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
     return record
 
 
-def estimates(messages: Sequence[Received]) -> dict[int, dict[str, Estimate]]:
+def estimates(messages: Sequence[tuple[float, Any]]) -> dict[int, dict[str, Estimate]]:
     """
     Return the estimates that messages of ``neighbors`` hold, by stamp, ns, and name.
 

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation, STATES
-from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.frame_errors import by_axis, STAGES, Table
 from flock_desk.runs.record import FlightRecord, LiveRecord
 from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
@@ -64,7 +64,8 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])
     in_view = rows['visible'] == 1.0
     position, velocity = _errors(rows, 'position'), _errors(rows, 'velocity')
-    usable = _usable(rows, max_velocity_std)
+    sigmas = by_axis(rows, 'velocity_sigma')[np.isfinite(by_axis(rows, 'velocity')).all(axis=1)]
+    usable = np.sum(sigmas ** 2, axis=1) <= max_velocity_std ** 2
     distance_error = (rows['distance'] - rows['true_distance'])[found & known]
     return {
         'frames_in_view': int(np.count_nonzero(in_view)) if np.any(known) else None,
@@ -367,15 +368,8 @@ def rate(times: Array) -> float:
 
 def _errors(rows: Table, kind: str) -> Array:
     """Return the errors (n, 3) of the images where they are known."""
-    errors = np.stack([rows[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
+    errors = by_axis(rows, kind)
     return errors[np.isfinite(errors).all(axis=1)]
-
-
-def _usable(rows: Table, max_velocity_std: float) -> Any:
-    """Return which of the images with known errors have a velocity the planner would use."""
-    known = np.isfinite(rows['velocity_x'])
-    variance = sum(rows[f'velocity_sigma_{axis}'][known] ** 2 for axis in 'xyz')
-    return variance <= max_velocity_std ** 2
 
 
 def _finite(values: Array) -> Array:

@@ -173,39 +173,36 @@ def _wander(motion: LeaderMotion, speed: float, times: Array,
     return speed * waves / fastest * begin[:, None]
 
 
-def random_walk(motion: LeaderMotion, speed: float, rng: np.random.Generator) -> Iterator[Stretch]:
+def random_walk(climb: float, level: float, height: _Height,
+                rng: np.random.Generator) -> Iterator[Stretch]:
     """Yield velocities of any direction, each kept for 1 to 4 s."""
-    height = _Height(motion)
-    level = _level(motion, speed)
     while True:
         duration, heading = rng.uniform(1.0, 4.0), rng.uniform(-math.pi, math.pi)
         forward = level * rng.uniform(0.3, 1.0)
-        up = height.after(duration, motion.climb * rng.uniform(-1.0, 1.0))
+        up = height.after(duration, climb * rng.uniform(-1.0, 1.0))
         yield duration, forward * math.cos(heading), forward * math.sin(heading), up
 
 
-def stairs(motion: LeaderMotion, speed: float, rng: np.random.Generator) -> Iterator[Stretch]:
+def stairs(climb: float, level: float, height: _Height,
+           rng: np.random.Generator) -> Iterator[Stretch]:
     """Yield level stretches of 2 to 5 s, and between them climbs or descents on the way."""
-    height, heading = _Height(motion), 0.0
-    level = _level(motion, speed)
+    heading = 0.0
     while True:
         heading += rng.uniform(-0.8, 0.8)
         for climbing in (0.0, 1.0):
             duration = rng.uniform(2.0, 5.0)
-            up = climbing * motion.climb * rng.choice([-1.0, 1.0])
-            up = height.after(duration, up)
+            up = height.after(duration, climbing * climb * rng.choice([-1.0, 1.0]))
             forward = level * rng.uniform(0.4, 1.0)
             yield duration, forward * math.cos(heading), forward * math.sin(heading), up
 
 
-def approach(motion: LeaderMotion, speed: float, rng: np.random.Generator) -> Iterator[Stretch]:
+def approach(climb: float, level: float, height: _Height,
+             rng: np.random.Generator) -> Iterator[Stretch]:
     """Yield a flight away for 2 to 6 s and back the way it came, faster, up or down meanwhile."""
-    height = _Height(motion)
-    level = _level(motion, speed)
     while True:
         duration, heading = rng.uniform(2.0, 6.0), rng.uniform(-0.6, 0.6)
         for share, turned in ((rng.uniform(0.4, 0.8), 0.0), (1.0, math.pi)):
-            up = height.after(duration, motion.climb * rng.uniform(-1.0, 1.0))
+            up = height.after(duration, climb * rng.uniform(-1.0, 1.0))
             yield (duration, share * level * math.cos(heading + turned),
                    share * level * math.sin(heading + turned), up)
 
@@ -277,11 +274,6 @@ def _walk(steps: Array, most: float) -> Array:
     return np.array(reached)
 
 
-def _level(motion: LeaderMotion, speed: float) -> float:
-    """Return the largest horizontal speed, m/s, that leaves room for the climb."""
-    return math.sqrt(speed ** 2 - motion.climb ** 2)
-
-
 def _ramped(durations: Array, wanted: Array, rate: float, times: Array) -> Array:
     """Return values (n, m) at times (n,), from zero, each wanted one approached at a rate."""
     value, begin = np.zeros(wanted.shape[1]), 0.0
@@ -310,8 +302,9 @@ def _spline_derivatives(points: Array, at: Array) -> tuple[Array, Array]:
 
 def _random(stretches: Callable[..., Iterator[Stretch]], motion: LeaderMotion,
             speed: float, times: Array, rng: np.random.Generator) -> Array:
-    return _averaged(flown(stretches(motion, speed, rng), motion, times),
-                     motion.acceleration / motion.jerk)
+    level = math.sqrt(speed ** 2 - motion.climb ** 2)  # leaves room for the climb
+    drawn = stretches(motion.climb, level, _Height(motion), rng)
+    return _averaged(flown(drawn, motion, times), motion.acceleration / motion.jerk)
 
 
 #: By name: of a motion, its speed and times (n,), s, the velocities (n, 3) from rest.

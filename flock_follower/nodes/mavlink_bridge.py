@@ -62,7 +62,7 @@ from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.permission import Phase, SecondCommander
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.mavlink.velocity_check import ODOM
@@ -239,7 +239,8 @@ class MavlinkBridge(FlockNode):
         if self._sources.another(number, now - waited) and self._flying():
             topic = self.resolve_topic_name('command/trajectory')
             who = f'{listed(publishers(self, topic))} on {topic}'
-            self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
+            gate = self._bridge.gate
+            self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""

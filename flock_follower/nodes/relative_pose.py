@@ -266,9 +266,9 @@ class RelativePose(FlockNode):
             values[_key('attitude_noise_rad', name)] = f'{noise.attitude:.5f}'
             values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
         for name, bias in self._tracker.ranging.biases.items():
-            self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value[0]:.3f}'
+            self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value:.3f}'
             self.diagnostics.values[f'range_outliers_{name}_percent'] = (
-                f'{100.0 * bias.outliers[0]:.1f}')
+                f'{100.0 * bias.gate.outliers:.1f}')
         return None
 
     def _sight_problem(self, now: float) -> Problem | None:

@@ -20,8 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.closed_loop.flown_vehicle import ExternalVehicle
+from flock_desk.closed_loop.flown import ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     LATEST_NS,
     real_time_camera,

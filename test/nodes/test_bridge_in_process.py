@@ -34,7 +34,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
@@ -112,7 +111,7 @@ class Bench(Driven):
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
         self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
         gate = self.bridge.gate
-        self.node._stream.submit(lambda: gate.permit(OffboardRequested(time.monotonic())))
+        self.node._stream.submit(lambda: gate.permit(gate.permission.requested(time.monotonic())))
         self.wait(lambda: gate.permission.streams)
         self.beat()
         self.wait(self.node._flying)

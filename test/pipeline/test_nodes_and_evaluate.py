@@ -37,7 +37,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge
@@ -156,7 +156,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
             mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
         node._bridge.receive(seconds())
-    node._bridge.gate.permit(OffboardRequested(-math.inf))
+    node._bridge.gate.permit(Permission().requested(-math.inf))
     beat()
 
     expected = published(result, '/setpoint')

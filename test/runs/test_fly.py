@@ -16,15 +16,12 @@
 """`make fly`: figures and bounds of a flight, requests to the nodes, refusals before it begins."""
 
 from pathlib import Path
-import socket
 from types import SimpleNamespace
 
-from full_disk import disk_of
 import numpy as np
 import pytest
 
-from flock_desk.fly import cautions, main
-from flock_desk.runs.column import column_figures, spacing
+from flock_desk.fly import cautions, column_figures, main, nearest, scenario_bounds
 from flock_desk.runs.flight import (
     ended_by_bridge,
     External,
@@ -33,10 +30,11 @@ from flock_desk.runs.flight import (
     namespaces,
     own,
     parameters_of_nodes,
+    spacing,
 )
 from flock_desk.runs.frame_errors import COLUMNS
-from flock_desk.runs.judge import flat, judge, nearest, scenario_bounds
-from flock_desk.runs.processes import free_udp_port, Processes
+from flock_desk.runs.judge import flat, judge
+from flock_desk.runs.processes import Processes
 from flock_desk.runs.record import LiveRecord, read_flown
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import Outage, Scenario
@@ -74,8 +72,8 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
                 'leader': (TIMES, np.broadcast_to(leader_speed, COUNT))},
         distance=np.full(COUNT, distance), setpoint_times=TIMES, setpoints=0.1 * along,
         states=list(states), diagnostics=[(1.0, status)], scenario=scenario, log={
-            'skipped_images': 0, 'pose_source': '', 'pose_source_of_leader': '', 'duration': 10.0, 'ended_early': '',
-            **elsewhere, **(external or {})})
+            'skipped_images': 0, 'pose_source': '', 'pose_source_of_leader': '',
+            'duration': 10.0, 'ended_early': '', **elsewhere, **(external or {})})
 
 
 def judged(flight, cores={'planner': 0.1}):  # noqa: B006
@@ -357,14 +355,6 @@ def test_a_flight_that_cannot_be_is_refused_before_anything_starts(
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_port_that_another_program_has_is_named(tmp_path, capsys):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('127.0.0.1', free_udp_port()))
-        url = f'udpin:127.0.0.1:{other.getsockname()[1]}'
-        assert main(['--autopilot', url, '--output', str(tmp_path / 'out')]) == 1
-    assert f'{url!r}: cannot listen there: Address already in use' in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--seed', '-1'], '--seed = -1: must be an integer in [0, 2147483647]'),
     (['--duration', '-3'], '--duration = -3.0: must be a number in [0, 3600] s'),
@@ -394,20 +384,6 @@ def test_a_scenario_shorter_than_the_requested_duration_is_flown_to_its_end(
     assert flown == [60.0, 20.0]
     assert capsys.readouterr().out.count(
         'indoor lasts 60 s: it is flown for so long, not for --duration = 120 s\n') == 1
-
-
-def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr('flock_desk.fly.fly', lambda *_: ({}, {}))
-    monkeypatch.setattr('flock_desk.fly.read_flown', lambda *_: None)
-    monkeypatch.setattr('flock_desk.fly.scenario_figures', lambda *_: {
-        'x': 'x' * 5_000_000, 'skipped_images': 0, 'frames': 1, 'external': None})
-    monkeypatch.setattr('flock_desk.fly.scenario_bounds', lambda *_: [])
-    with disk_of(100_000):
-        assert main(['--scenario', 'hover', '--output', str(tmp_path)]) == 1
-    summary = tmp_path / 'summary.json'
-    assert capsys.readouterr().err == (
-        f'error: {summary}: File too large; the logs of every process are in {tmp_path}\n')
-    assert [path.name for path in tmp_path.iterdir()] == ['.lock']
 
 
 def test_a_flight_that_never_began_is_an_error(tmp_path):

@@ -23,8 +23,8 @@ import pytest
 pytest.importorskip('matplotlib')
 from PIL import Image
 
-from flock_desk.runs.frame_errors import COLUMNS
 from flock_desk.runs.fly_pictures import moving_picture
+from flock_desk.runs.frame_errors import COLUMNS
 
 
 def test_it_has_eight_pictures_each_second_also_without_an_estimate():

@@ -53,6 +53,22 @@ def test_the_complete_graph_is_the_papers_law() -> None:
     assert u == pytest.approx(flocking.accelerations(x, v, PARAMS), rel=1e-12)
 
 
+@pytest.mark.parametrize('model', ['flocking', 'cucker_dong', 'cucker_smale'])
+def test_blocks_give_the_sums_of_the_plain_law(model: Any) -> None:
+    rng = np.random.default_rng(0)
+    x, v = 30.0 * rng.random((600, 2)), rng.normal(size=(600, 2))  # three blocks
+    for params in (FLIGHT_PARAMS, flocking.FlockingParams(beta=0.0, theta=1.5, d0=0.0)):
+        np.testing.assert_array_equal(laws.accelerations(x, v, params, model, 'blocked'),
+                                      flocking.accelerations(x, v, params, model))
+
+
+def test_the_nearest_are_found_without_oneself() -> None:
+    x = np.random.default_rng(2).random((40, 3))
+    distances = np.linalg.norm(x - x[:, None], axis=2) + np.diag(np.full(40, np.inf))
+    np.testing.assert_array_equal(np.sort(nearest(x, 7)), np.sort(np.argsort(distances)[:, :7]))
+    assert nearest(x[:3], 7).shape == (3, 2) and nearest(x[:1], 7).shape == (1, 0)
+
+
 def test_for_two_agents_each_pairs_own_disagreement_is_the_papers() -> None:
     x, v = LEADER_FOLLOWER.positions, LEADER_FOLLOWER.velocities
     u = laws.graph_accelerations(x, v, PARAMS, complete_graph(2), 'pair')
@@ -81,12 +97,12 @@ def test_edges_begin_at_once_below_d1_and_later_below_four_fifths_of_the_band() 
         return np.array([[0.0, 0.0], [np.sqrt(r2), 0.0]])
 
     assert len(initial_graph(at(7.99), FLIGHT_PARAMS).edges) == 1
-    alone = initial_graph(at(8.01), FLIGHT_PARAMS)
+    alone, pair = initial_graph(at(8.01), FLIGHT_PARAMS), edges((0, 1))
     assert len(alone.edges) == 0
-    assert grown(alone, at(6.61), FLIGHT_PARAMS, edges((0, 1))) is alone  # d0 + 0.8 (d1 - d0) = 6.6
-    joined = grown(alone, at(6.59), FLIGHT_PARAMS, edges((0, 1)))
+    assert grown(alone, at(6.61), FLIGHT_PARAMS, pair) is alone  # d0 + 0.8 (d1 - d0) = 6.6
+    joined = grown(alone, at(6.59), FLIGHT_PARAMS, pair)
     assert joined.edges.tolist() == [[0, 1]]
-    assert grown(joined, at(7.9), FLIGHT_PARAMS, edges((0, 1))) is joined  # never dropped, nor joined twice
+    assert grown(joined, at(7.9), FLIGHT_PARAMS, pair) is joined  # never dropped, nor joined twice
 
 
 @pytest.mark.parametrize(('count', 'pairs', 'connected'), [
