@@ -45,7 +45,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure
+from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate

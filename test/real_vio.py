@@ -36,7 +36,7 @@ from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanosec
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import View
-from flock_follower.perception.edge_fit import CornerFit, ippe, marker_corners, refine
+from flock_follower.perception.edge_fit import ippe, marker_corners, refine
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.time_offset import TimeOffset
 from flock_follower.perception.tracker import camera_mounting
@@ -166,8 +166,9 @@ def seen_tags(recording: Recording, read: Read,
                                 expected and (T_odom_camera.inverse() @ expected.pose).rotation)
         if fitted is None:
             continue
-        T_odom_tag = T_odom_camera @ fitted.pose
-        covariance = np.linalg.inv(fitted.jacobian.T @ fitted.jacobian) * CORNER**2
+        pose, jacobian = fitted
+        T_odom_tag = T_odom_camera @ pose
+        covariance = np.linalg.inv(jacobian.T @ jacobian) * CORNER**2
         turn = np.kron(np.eye(2), T_odom_camera.rotation)
         # As in Tracker: an error of one's own attitude moves and tilts what is seen.
         leverage = np.concatenate([-skew(T_odom_tag.translation - own.travel), np.eye(3)])
@@ -175,7 +176,7 @@ def seen_tags(recording: Recording, read: Read,
         outcome = track.update(time, T_odom_tag, np.zeros(3), covariance)
         if outcome is UpdateOutcome.STARTED:
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
-        if change := offset.take(str(tag.number), time, fitted.pose.translation, T_base_camera,
+        if change := offset.take(str(tag.number), time, pose.translation, T_base_camera,
                                  buffer):
             view = View.of(own, T_base_camera, 0.0)
             for other in filters.values():
@@ -195,14 +196,19 @@ def _corrected(last: OdometryState, state: OdometryState) -> bool:
 
 
 def fitted_corners(camera: CameraModel, side_length: float, corners: Array,
-                   expected: Array | None) -> CornerFit | None:
-    """Return the pose that four corners show: of two alike, the nearer to an attitude (3, 3)."""
+                   expected: Array | None) -> tuple[Transform, Array] | None:
+    """
+    Return the pose that four corners show, and its Jacobian.
+
+    Of two alike, it is the nearer to an attitude (3, 3).
+    """
     points = marker_corners(side_length)
     fits = [fitted for pose in ippe(corners, camera, side_length)
             if (fitted := refine(corners, camera, points, np.zeros(3), pose)) is not None]
     if expected is None:
-        return min(fits, key=lambda f: f.squares, default=None)
-    return max(fits, key=lambda f: float(np.sum(f.pose.rotation * expected)), default=None)
+        return min(fits, key=lambda f: float(np.sum(
+            (camera.project(f[0].apply(points)) - corners)**2)), default=None)
+    return max(fits, key=lambda f: float(np.sum(f[0].rotation * expected)), default=None)
 
 
 def velocity_rms(seen: list[Seen]) -> float:

@@ -148,17 +148,18 @@ def approach_speed(distance: float, deceleration: float) -> float:
 
 
 def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offset: float,
-                   horizon: float) -> tuple[float, float]:
+                   horizon: float, a_max: float) -> tuple[float, float]:
     """
     Return the least and the greatest vertical acceleration, m/s^2, by the heights.
 
     :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
     :param offset: upward acceleration, m/s^2, by which setpoints offset an error of the thrust.
     :param horizon: time in which the speed is to be reached, s.
+    :param a_max: largest magnitude of the acceleration, m/s^2.
     """
     if place.height is None:
         return -math.inf, math.inf
-    braking = BRAKING_SHARE * limits.a_max
+    braking = BRAKING_SHARE * a_max
     falling = approach_speed(place.height - limits.height_min, braking)
     rising = approach_speed(limits.height_max - place.height, braking)
     lowest, highest = sorted((climb_rate, place.climb_rate))

@@ -175,6 +175,8 @@ class DisturbanceObserver:
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'
+#: Without odometry only a slow barometer shows the climb: heights are kept from so far inside, m.
+HEIGHT_MARGIN: Final[float] = 0.5
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
@@ -307,15 +309,26 @@ def _relative(full: GateLimits, command: Command, against: Array, place: Locatio
     """
     Return the setpoint of a command that rests on the marker alone.
 
-    Heights go first, then the limit of the whole acceleration; the speed is not known.
+    Heights go first, then the limit of the acceleration; the speed is not known. The offset of an
+    error of the thrust does not count for RELATIVE_MAX: it moves nothing.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
-    least, most = envelope.vertical_range(
-        full, place, place.climb_rate, _bounded(offset), full.speed_horizon)
+    a_max = full.a_max * SENT_INSIDE
     strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
+    own, bias = _bounded(offset), _bounded(command.thrust_bias)
+    margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
+    height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
+    assert height is not None  # else it is refused
+    # Of two offsets that differ the one counts that leads away from the bound.
+    least, _ = envelope.vertical_range(
+        full, Location(height - margin, climb), climb, max(own, bias), horizon, strongest)
+    _, most = envelope.vertical_range(
+        full, Location(height + margin, climb), climb, min(own, bias), horizon, strongest)
     within = min(max(float(wanted[2]), least), most)
-    up = min(max(within, -strongest), strongest)
-    level = limit_norm(wanted[:2], math.sqrt(strongest ** 2 - up ** 2))
+    lowest, highest = min(bias, 0.0) - strongest, max(bias, 0.0) + strongest
+    up = min(max(within, lowest, -a_max), highest, a_max)
+    rest = min(strongest ** 2 - (up - bias) ** 2, a_max ** 2 - up ** 2)
+    level = limit_norm(wanted[:2], math.sqrt(max(rest, 0.0)))
     limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
     if within != wanted[2]:
         limits.append(ENVELOPE)
@@ -350,7 +363,8 @@ def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Veloc
                               axis)
         safe = total._replace(reason=safe.reason or total.reason)
     a = safe.acceleration
-    least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
+    least, most = envelope.vertical_range(
+        limits, place, float(v[2]), _bounded(offset), horizon, limits.a_max)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
     bounds = [] if inward is None else [inward]

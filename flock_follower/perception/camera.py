@@ -195,13 +195,8 @@ class CameraModel:
 
     def linear_map(self, x: float, y: float) -> Array:
         """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
-        p1, p2 = self._tangential
-        r2 = x * x + y * y
-        g, dg = (float(value) for value in self._scale(r2))
-        aside = 2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y)
-        mapped: Array = self.matrix[:2, :2].dot(np.array([
-            [g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x, aside],
-            [aside, g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x]]))
+        over_x, over_xy, over_y = map(float, self._slopes(x, y))
+        mapped: Array = self.matrix[:2, :2].dot(np.array([[over_x, over_xy], [over_xy, over_y]]))
         return mapped
 
     def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
@@ -212,41 +207,35 @@ class CameraModel:
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         xy, depth = self._normalized(p)
-        distorted, by_xy = self._distort(xy)
-        scale = self.matrix[:2, :2]
-        # Written out: stacks of 2 x 2 matrices multiply slowly.
+        over_x, over_xy, over_y = self._slopes(xy[:, 0], xy[:, 1])
         by_point = np.empty((len(p), 2, 3))
-        over_x, over_xy, over_y = by_xy[:, 0, 0], by_xy[:, 0, 1], by_xy[:, 1, 1]  # symmetric
-        by_point[:, 0, 0] = scale[0, 0] * over_x + scale[0, 1] * over_xy
-        by_point[:, 0, 1] = scale[0, 0] * over_xy + scale[0, 1] * over_y
-        by_point[:, 1, 0] = scale[1, 0] * over_x + scale[1, 1] * over_xy
-        by_point[:, 1, 1] = scale[1, 0] * over_xy + scale[1, 1] * over_y
-        by_point[:, :, 2] = -(by_point[:, :, 0] * xy[:, :1] + by_point[:, :, 1] * xy[:, 1:])
+        by_xy = np.moveaxis(np.array([[over_x, over_xy], [over_xy, over_y]]), 2, 0)
+        by_point[:, :, :2] = self.matrix[:2, :2] @ by_xy
+        by_point[:, :, 2] = -(by_point[:, :, :2] * xy[:, None]).sum(axis=2)
         by_point /= depth[:, :, None]
-        return distorted @ scale.T + self.matrix[:2, 2], by_point
+        return self.distort(xy), by_point
 
     def undistort(self, pixels: ArrayLike) -> Array:
         """
         Return the normalised coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
 
-        Newton's method on the exact distortion, to 1e-12; NaN if no point projects there.
+        Newton's method on the exact distortion, to 1e-10; NaN if no point projects there.
         """
-        offset = np.asarray(pixels, dtype=float).reshape(-1, 2) - self.matrix[:2, 2]
-        target = offset @ np.linalg.inv(self.matrix[:2, :2]).T
-        xy = target.copy()
+        pixels = np.asarray(pixels, dtype=float).reshape(-1, 2)
+        inverse = np.linalg.inv(self.matrix[:2, :2]).T
+        xy = (pixels - self._middle) @ inverse
         for _ in range(50):
-            distorted, jacobian = self._distort(xy)
-            error = target - distorted
+            # Out of the one-to-one region Newton would wander: hold it at the edge.
+            length = np.linalg.norm(xy, axis=1, keepdims=True)
+            xy *= np.minimum(1.0, (1.0 - 1e-12) * self.radius / np.maximum(length, 1e-12))
+            error = (pixels - self.distort(xy)) @ inverse
             if not np.any(np.abs(error) > 1e-13):
                 break
-            a, b, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1]  # symmetric
+            a, b, d = self._slopes(xy[:, 0], xy[:, 1])
             determinant = a * d - b * b
             determinant = np.where(determinant > 1e-12, determinant, np.inf)
             xy += np.stack([d * error[:, 0] - b * error[:, 1],
                             a * error[:, 1] - b * error[:, 0]], axis=1) / determinant[:, None]
-            # Out of the one-to-one region Newton would wander: hold it at the edge.
-            length = np.linalg.norm(xy, axis=1, keepdims=True)
-            xy *= np.minimum(1.0, self.radius / np.maximum(length, 1e-12))
         xy[~(np.max(np.abs(error), axis=1, initial=0.0) < 1e-10)] = np.nan
         return xy
 
@@ -302,20 +291,13 @@ class CameraModel:
             dg = (dg - g * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / m
         return g, dg
 
-    def _distort(self, xy: Array) -> tuple[Array, Array]:
-        """Return distorted coordinates (N, 2) and their Jacobian (N, 2, 2) at (x, y)."""
+    def _slopes(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Return d x' / dx, d x' / dy = d y' / dx, and d y' / dy at (x, y)."""
         p1, p2 = self._tangential
-        x, y = xy[:, 0], xy[:, 1]
-        xx, yy, xy2 = x * x, y * y, 2.0 * x * y
-        r2 = xx + yy
-        g, dg = self._scale(r2)
-        distorted = np.stack([x * g + p1 * xy2 + p2 * (r2 + 2.0 * xx),
-                              y * g + p1 * (r2 + 2.0 * yy) + p2 * xy2], axis=1)
-        jacobian = np.empty((len(xy), 2, 2))
-        jacobian[:, 0, 0] = g + 2.0 * xx * dg + 2.0 * p1 * y + 6.0 * p2 * x
-        jacobian[:, 0, 1] = jacobian[:, 1, 0] = xy2 * dg + 2.0 * (p1 * x + p2 * y)
-        jacobian[:, 1, 1] = g + 2.0 * yy * dg + 6.0 * p1 * y + 2.0 * p2 * x
-        return distorted, jacobian
+        g, dg = self._scale(x * x + y * y)
+        return (g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x,
+                2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y),
+                g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x)
 
 
 def _reshaped(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:

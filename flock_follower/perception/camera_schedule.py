@@ -19,12 +19,6 @@ With one camera, every neighbour is looked for in every image. With several, a n
 camera has just seen is looked for in another camera's image only if it is expected inside, and
 without a search. A neighbour that no camera sees is searched for in one camera after the other, so
 that more cameras cost no more.
-
-``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
-shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour
-counts as seen when the row of its markers' middle was exposed. The rows above and below see it
-earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
-where they were with the middle row, by the relative motion, which comes mostly from the own rates.
 """
 
 from __future__ import annotations
@@ -33,105 +27,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, Transform
-from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.geometry import Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners, refine
+from flock_follower.perception.look import Sought
 from flock_follower.perception.markers import MarkedNeighbor
-from flock_follower.perception.measurement import PosePrior
-from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.time_offset import MountedCamera
-
-
-class View(NamedTuple):
-    """
-    The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
-
-    ``delay`` is how long after the image's stamp that was by the camera's clock, s.
-    """
-
-    own: OdometrySample
-    rotation: Array
-    """Rotation of the body, to odom, (3, 3)."""
-    T_smooth_camera: Transform
-    delay: float = 0.0
-
-    @classmethod
-    def of(cls, own: OdometrySample, T_body_camera: Transform, delay: float) -> View:
-        """Return the view of a camera mounted at ``T_body_camera``."""
-        body = own.smooth_pose
-        return cls(own, body.rotation, body @ T_body_camera, delay)
-
-    @property
-    def turning(self) -> Array:
-        """Return the own angular velocity (3,), rad/s, in odom."""
-        turning: Array = self.rotation.dot(self.own.angular_velocity)
-        return turning
-
-    def prior(self, estimate: Estimate | None) -> PosePrior:
-        """Return the expected pose of a neighbour, given its estimate or None."""
-        pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
-        return PosePrior(pose, self.T_smooth_camera.rotation[2])
-
-    def moving(self, sight: Array) -> Array:
-        """Return the change of the measured state, (15,), per s of offset, for a sight (3,), m."""
-        (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
-        a, b, c = self.own.velocity.tolist()
-        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
-        return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
-                         u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-    def passing(self, T_camera_body: Transform, reference: Array,
-                estimate: Estimate | None) -> tuple[Array, Array]:
-        """
-        Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
-
-        :param reference: the point (3,) on the body; :param estimate: its state, if known: else
-            it is taken to fly along.
-        """
-        to_camera = self.T_smooth_camera.rotation.T
-        own_rates = to_camera.dot(self.turning)
-        lever = self.T_smooth_camera.translation - self.own.travel
-        velocity = -np.cross(own_rates, T_camera_body.apply(reference))
-        if estimate is not None:
-            camera = self.own.velocity + np.cross(self.turning, lever)
-            velocity = velocity + to_camera.dot(estimate.velocity - camera)
-        return velocity, -own_rates
-
-
-def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeighbor,
-                 T_camera_body: Transform, reference: Array, velocity: Array,
-                 rates: Array) -> Transform:
-    """
-    Return the pose of a neighbour at the time of one row, from the pose fitted to all of them.
-
-    :param reference: the point (3,) on its body whose row that is, m.
-    :param velocity: of that point seen from the camera, m/s, and :param rates: rad/s, at which the
-        body turns there: (3,) along the camera's axes.
-    """
-    points = np.concatenate([
-        marker.T_body_marker.apply(marker_corners(marker.side_length))
-        for marker in neighbor.markers
-        if _faces(T_camera_body @ marker.T_body_marker)] or [np.zeros((0, 3))])
-    if not len(points):
-        return T_camera_body
-    seen = T_camera_body.apply(points)
-    middle = T_camera_body.apply(reference)
-    rows = camera.project(np.concatenate([seen, middle[None]]))[:, 1]
-    later = readout_time / camera.height * (rows[:-1] - rows[-1])
-    moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
-    found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
-    return T_camera_body if found is None else found.pose
-
-
-def _faces(T_camera_marker: Transform) -> bool:
-    normal = T_camera_marker.rotation[:, 2]
-    return float(normal.dot(T_camera_marker.translation)) < 0.0
-
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
@@ -147,27 +50,6 @@ STEP = 1e-9
 NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
 SILENT = 0.5
-
-
-class Sought(NamedTuple):
-    """Names: who may be ``near`` the expected place, and ``anywhere`` in the image."""
-
-    near: Sequence[str]
-    anywhere: Sequence[str]
-    number: int
-    """Number of neighbours to search for."""
-
-
-class Look(NamedTuple):
-    """An image of a camera before detection: the expected neighbours, and those to search for."""
-
-    stamp: float
-    camera: MountedCamera
-    model: CameraModel
-    views: dict[float, View]
-    """Delay of the exposure after the stamp, s."""
-    expected: dict[str, PosePrior]
-    sought: Sought
 
 
 class CameraSchedule:

@@ -42,7 +42,7 @@ from flock_follower.perception.edges import Found, Lines, normal_covariance, sol
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import EdgeModel, median
 
-#: An edge is in place where the fit explains it to within this, px.
+#: An edge is in place if the fit explains it to within this, px, or three times the RMS.
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
 _FLOOR = 0.03  # px: least standard deviation of an edge's place
@@ -181,10 +181,10 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
         return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
     weights = last.weights / last.variance[lines.model.axis]
-    in_place = np.count_nonzero(found.found & (last.squares < INLIER**2))
+    square = float(last.weights.dot(last.squares)) / degrees
+    in_place = np.count_nonzero(found.found & (last.squares < max(INLIER**2, 9.0 * square)))
     return EdgeFit(
-        pose, lines.center, covariance[:6, :6],
-        math.sqrt(float(last.weights.dot(last.squares)) / degrees),
+        pose, lines.center, covariance[:6, :6], math.sqrt(square),
         float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
         spacing, smear, lines, last.residual, weights)
 
@@ -278,35 +278,25 @@ def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transf
             if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
 
 
-class CornerFit(NamedTuple):
-    """A pose at the least reprojection error: sum of squares, px^2, and Jacobian (8, 6)."""
-
-    pose: Transform
-    squares: float
-    jacobian: Array
-
-
 def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
-           pose: Transform) -> CornerFit | None:
+           pose: Transform) -> tuple[Transform, Array] | None:
     """
     Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
 
-    Of ``points`` (4, 3) on a body, m, ``corners`` (4, 2) are seen, px; a step turns the body about
-    ``center`` (3,), m.
+    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
+    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
     """
     for _ in range(20):
         seen = pose.apply(points)
         pixels, by_point = camera.linearize(seen)
         residual = (corners - pixels).ravel()
-        if not np.all(np.isfinite(residual)):
-            return None
         middle = pose.apply(center[None])[0]
         turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
         jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
         step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
-        if step is None:
+        if step is None or not np.all(np.isfinite(step)):
             return None
         if np.max(np.abs(step)) < 1e-7:
             break
         pose = moved(pose, middle, step)
-    return CornerFit(pose, float(residual @ residual), jacobian)
+    return pose, jacobian

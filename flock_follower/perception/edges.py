@@ -81,6 +81,9 @@ _KERNEL_SIGMA = 2.0  # samples
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
 _LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
 _MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
+#: Fainter edges, as a share of the median slope, are ignored. Those in a shadow have 0.2 of it;
+#: those of cells narrower than _NARROW, px, are faint because they run into one another.
+_FAINT, _FAINT_NARROW, _NARROW = 0.15, 0.3, 4.0
 _MIN_SHARE = 0.5  # of the edges must be found
 _WIDE = 0.5  # px between samples, for sharp images of large markers
 _FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
@@ -247,7 +250,8 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
     before, top, after = values[index - 1], values[index], values[index + 1]
     bend = np.minimum(before - 2.0 * top + after, -1e-3)
     typical = median(top)
-    found = (peak == within) & (top > 0.3 * typical)
+    faint = _FAINT if min(lines.narrowest) > _NARROW else _FAINT_NARROW
+    found = (peak == within) & (top > faint * typical)
     if (typical < _MIN_SLOPE * max(spacing)
             or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
         return None

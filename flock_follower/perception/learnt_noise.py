@@ -24,7 +24,8 @@ identification of variances and adaptive Kalman filtering", IEEE Trans. Automati
 ``LearntNoise``: across the line of sight, the noise is the error of the own attitude, which moves
 a neighbour sideways: errors of the odometry, of its interpolation and of the camera's stamps.
 Along the line of sight, the noise is anything that changes the marker's apparent size: a rolling
-shutter, a bent print, motion blur.
+shutter, a bent print, motion blur. The covariances of measured poses are widened, because the
+errors of neighbouring edges may be alike: the innovations show how much of that is needed.
 
 ``LearntMotion``: factors of the process noise of ``FilterParams``, along each axis of odom. They
 follow the motion of a neighbour and the errors of the own velocity.
@@ -38,6 +39,7 @@ from typing import Final
 import numpy as np
 
 from flock_follower.geometry import Array, skew
+from flock_follower.perception.measurement import WIDENING
 
 #: Number of innovations over which the noise is learnt; initial count of innovations.
 LEARNT = 120
@@ -48,12 +50,18 @@ LIMIT = 16.0
 MOST = 0.05
 #: Lower limit of the variance of the attitude, as share of the initial one.
 LEAST = 0.04
+#: Lower limits of the shares of a measured position's and attitude's variance: of the position
+#: that of independent edges; the attitude of a marker seen from the front errs now and then by
+#: more, and alike for some images, which changes do not show.
+LEAST_SHARES = (WIDENING**-2, WIDENING**-1)
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
 class LearntNoise:
     """
     The noise of the own attitude, rad, about each axis, and of the distance, as a share of it.
+
+    ``shares``: of the variances of a measured position and attitude, the shares that are noise.
 
     :param initial: initial value for the attitude, rad; the distance starts at 0.
     """
@@ -65,6 +73,7 @@ class LearntNoise:
     def restart(self) -> None:
         """Reset the estimates."""
         self._across, self._along = self._initial, 0.0
+        self.shares = [1.0, 1.0]
         self._count = FIRST
 
     @property
@@ -77,26 +86,32 @@ class LearntNoise:
         """Return the noise of the distance, one standard deviation, a share of it."""
         return math.sqrt(self._along)
 
-    def covariance(self, sight: Array) -> Array:
-        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
+    def covariance(self, measured: Array, sight: Array) -> Array:
+        """
+        Return the covariance (6, 6) of a pose, with the noise of the own attitude.
+
+        :param measured: the covariance (6, 6) by the image alone, :param sight: (3,), m.
+        """
         # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
         # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()
         leverage[:3] = skew(-sight)
-        covariance: Array = leverage.dot(self._across * leverage.T)
+        scale = np.sqrt(self.shares).repeat(3)
+        covariance: Array = leverage.dot(self._across * leverage.T) + measured * (
+            scale[:, None] * scale)
         if self._along:
             covariance[:3, :3] += self._along * sight[:, None] * sight
         return covariance
 
     def take(self, change: Array, expected: Array, sight: Array) -> None:
         """
-        Take the change of a position's innovation: the fields of ``neighbor_filter.Change``.
+        Take the change of an innovation: the fields of ``neighbor_filter.Change``.
 
         :param sight: from the own vehicle to the neighbour (3,), m.
         """
         # In plain numbers: for every image, and so small.
-        (x, y, z), (u, v, w) = sight.tolist(), change.tolist()
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = expected.tolist()
+        (x, y, z), (u, v, w, *turn) = sight.tolist(), change.tolist()
+        (xx, xy, xz, *_), (_, yy, yz, *_), (_, _, zz, *_) = expected.tolist()[:3]
         squared = x * x + y * y + z * z
         along = (x * u + y * v + z * w)**2 / squared
         variance = (x * x * xx + y * y * yy + z * z * zz
@@ -108,6 +123,14 @@ class LearntNoise:
         for_distance = _excess(along, variance) / (2.0 * squared * self._count)
         self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
         self._along = min(max(self._along + for_distance, 0.0), MOST**2)
+        self._share(0, along, variance)
+        if turn:
+            self._share(1, sum(a * a for a in turn), float(expected.diagonal()[3:].sum()))
+
+    def _share(self, which: int, squared: float, expected: float) -> None:
+        """Learn one of the shares from the square of a change and its expected value."""
+        share = self.shares[which] * (1.0 + (squared / expected - 1.0) / self._count)
+        self.shares[which] = min(max(share, LEAST_SHARES[which]), 1.0)
 
 
 def _excess(squared: float, expected: float) -> float:
@@ -121,7 +144,7 @@ NOISE_TIME: Final = 2.0
 MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
-FACTORS: Final = (0.2, 16.0)
+FACTORS: Final = (0.05, 16.0)
 #: After a longer gap, s, the mean restarts, and the factor is at least 1: ``FilterParams`` holds.
 GAP: Final = 0.3
 

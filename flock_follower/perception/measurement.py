@@ -17,7 +17,7 @@ The measurement of one neighbour in one image, and the choice between its possib
 
 A square looks almost the same mirrored about the line of sight, and its edges do not always
 decide. ``choose`` adds two priors: the expected attitude, and that a neighbour flies about
-upright. ``from_corners`` measures a pose by the four corners of a marker, if no edges can be used.
+upright.
 """
 
 from __future__ import annotations
@@ -29,10 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import CornerFit, marker_corners, moved, refine
-from flock_follower.perception.edges import normal_covariance
-from flock_follower.perception.markers import Marker, outwards
+from flock_follower.perception.edge_fit import moved
 
 #: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
 SIGMA_HISTORY = 0.1
@@ -114,8 +111,8 @@ class Measurement(NamedTuple):
 
     ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
     position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
-    R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges, or corners,
-    are from their projections, px; of a smeared marker the difference of its image from the
+    R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges are
+    from their projections, px; of a smeared marker the difference of its image from the
     rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
     ``spacing``, px, of the brightness profiles, None without profiles.
     ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
@@ -157,48 +154,3 @@ def likeliest(several: Sequence[Measurement], expected: Transform | None) -> Mea
     # A print on the wall behind is farther away.
     place = np.zeros(3) if expected is None else expected.translation
     return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))
-
-
-#: Deviation of a detected corner's coordinate, px, and how far the pose may miss the corners, px
-#: RMS.
-SIGMA_CORNER = 0.6
-MAX_CORNER_RMS = 1.5
-#: Deviation of all four from the middle together, px: the darker a blurred
-#: outline must be to count, the further inside it is, by up to 1 px at a blur of 2.5 px.
-SIGMA_OUTLINE = 0.8
-
-
-def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
-                 starts: list[Transform], expected: PosePrior) -> Measurement | None:
-    """
-    Return the neighbour ``name`` by four corners of its marker, or None if no pose suits them.
-
-    :param corners: (4, 2), px, from top-left on, clockwise.
-    :param starts: poses ``T_camera_body`` to start from, at least one.
-    """
-    points = marker.T_body_marker.apply(marker_corners(marker.side_length))
-    center = marker.T_body_marker.translation
-    fits = [refined for start in starts
-            if (refined := refine(corners, camera, points, center, start)) is not None]
-    if not fits:
-        return None
-    best = choose([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2, f) for f in fits], expected)
-    chosen: CornerFit = best.chosen.fit
-    rms = math.sqrt(chosen.squares / 4.0)
-    if rms > MAX_CORNER_RMS:
-        return None
-    covariance = _covariance(corners, chosen.jacobian)
-    if covariance is None:
-        return None
-    return widened(Measurement(name, chosen.pose, center, covariance, rms, None), best)
-
-
-def _covariance(corners: Array, jacobian: Array) -> Array | None:
-    """Return the covariance (6, 6) of least squares of corners (4, 2), px, by their Jacobian."""
-    alone = normal_covariance(jacobian.T @ jacobian)
-    if alone is None:
-        return None
-    swollen = outwards(corners[None], SIGMA_OUTLINE)[0] - corners
-    together = alone @ (jacobian.T @ swollen.ravel())
-    covariance: Array = WIDENING**2 * SIGMA_CORNER**2 * alone + np.outer(together, together)
-    return covariance

@@ -90,9 +90,9 @@ class UpdateOutcome(Enum):
 
 class Change(NamedTuple):
     """
-    The difference of two successive innovations of the position.
+    The difference of two successive innovations of the position, and of the attitude if used.
 
-    ``covariance`` (3, 3) is that of ``difference`` (3,), m, if innovations are white.
+    ``covariance`` (n, n) is that of ``difference`` (n,), m, rad, if innovations are white.
     """
 
     difference: Array
@@ -215,8 +215,8 @@ class NeighborFilter:
         across = jacobian.dot(prior)
         spread = across.dot(jacobian.T) + noise
 
-        nominal = spread[:3, :3]
-        doubt = _distance(innovation[:3], nominal) / GATE
+        nominal = spread
+        doubt = _distance(innovation[:3], nominal[:3, :3]) / GATE
         solved, gain = False, np.zeros(0)
         reached = doubt <= 1.0 or math.dist(T_odom_body.translation, now.position) <= reach
         if reached and doubt <= WILD:  # NaN is not
@@ -233,7 +233,7 @@ class NeighborFilter:
         self._turned = 0 if plausible else self._turned + 1
         if self._turned >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
-        self._learn(stamp - now.stamp, innovation[:3], nominal)
+        self._learn(stamp - now.stamp, innovation, nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
@@ -244,11 +244,13 @@ class NeighborFilter:
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
 
     def _learn(self, dt: float, innovation: Array, covariance: Array) -> None:
-        """Learn from the innovation of a position (3,), dt, s, after the one before."""
-        self._motion.take(dt, innovation, covariance)
+        """Learn from an innovation (6,), or (3,) of the position only, dt, s, after another."""
+        self._motion.take(dt, innovation[:3], covariance[:3, :3])
         before, self._before = self._before, (innovation, covariance)
         if before is not None and dt <= GAP:
-            self.change = Change(innovation - before[0], covariance + before[1])
+            n = min(len(innovation), len(before[0]))
+            self.change = Change(innovation[:n] - before[0][:n],
+                                 covariance[:n, :n] + before[1][:n, :n])
 
     def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
                   covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
@@ -304,20 +306,19 @@ class NeighborFilter:
         if not length > NEAREST:
             return UpdateOutcome.OUTLIER
         along, innovation = sight / length, distance - length
-        prior = turned_along(expected.covariance[None], self._line[None], along[None])[0]
+        prior = turned_along(expected.covariance, self._line, along)
         # However uncertain the attitude, the point is no farther from the body than its lever.
         swing = np.cross(lever, along)
         noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
                                float(lever.dot(lever)))
         spread = float(along.dot(prior[POSITION, POSITION]).dot(along)) + noise
-        used, widened, careful = self._range_gate.judge(np.array([innovation]), np.array([spread]))
-        if not used[0]:
+        verdict = self._range_gate.judge(innovation, spread)
+        if not verdict.used:
             return UpdateOutcome.OUTLIER
-        if widened[0] != 1.0:
-            prior = _widened(prior, _MOVING, float(widened[0]))
+        prior = _widened(prior, _MOVING, verdict.prior)
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
-        whole = float(careful[0]) * (expected_spread + noise)
+        whole = verdict.spread * (expected_spread + noise)
         gain = np.zeros(SIZE)
         for part in (POSITION, VELOCITY, ACCELERATION):
             gain[part] = float(along.dot(across[part])) / whole * along
@@ -325,12 +326,11 @@ class NeighborFilter:
         remain[:, POSITION] -= np.outer(gain, along)
         covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
             gain, gain)
-        covariance = bounded_across(covariance[None], along[None], np.array([length]),
-                                    self.params.initial_speed)[0]
         self.change, self._predicted, self._line = None, None, along
-        self.newest = expected.corrected(innovation * gain, covariance)
-        surprising = widened[0] != 1.0 or careful[0] != 1.0
-        return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED
+        self.newest = expected.corrected(innovation * gain, bounded_across(
+            covariance, along, length, self.params.initial_speed))
+        return (UpdateOutcome.USED if verdict.prior == verdict.spread == 1.0
+                else UpdateOutcome.SURPRISING)
 
     def _again(self, what: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""
@@ -343,7 +343,9 @@ class NeighborFilter:
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
+        learnt = self._motion
         self.reset()
+        self._motion = learnt
         to_body = POSE.T @ _to_body(body.rotation @ reference)
         full = to_body @ covariance @ to_body.T
         velocity: Array = np.zeros(3)

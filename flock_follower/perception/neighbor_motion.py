@@ -221,40 +221,33 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     return linear, whole, noise
 
 
-def turned_along(covariances: Array, before: Array, now: Array) -> Array:
+def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     """
-    Return covariances (n, k, k), of position, velocity and more, turned from one line to another.
+    Return a covariance (15, 15) turned from one line to another.
 
     A neighbour of which only the distance is known may be anywhere on a sphere. If the line to its
-    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), the covariance turns
-    with it. ``before`` of zeros turns nothing.
+    likeliest place turns, from ``before`` to ``now``, unit vectors (3,), the covariance turns with
+    it. ``before`` of zeros turns nothing.
     """
-    w = np.cross(before, now)
-    cross = np.zeros((len(w), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = w
-    cross[:, [1, 2, 0], [2, 0, 1]] = -w
-    cosine = np.einsum('ni,ni->n', before, now)
-    turn = _EYE + cross + cross @ cross / np.maximum(1.0 + cosine, 0.1)[:, None, None]
-    whole = np.tile(np.eye(covariances.shape[-1]), (len(w), 1, 1))
-    for part in (POSITION, VELOCITY):
-        whole[:, part, part] = turn
-    whole[:, -3:, -3:] = turn  # the acceleration
-    return whole @ covariances @ whole.transpose(0, 2, 1)
+    cross = skew(np.cross(before, now))
+    turn = _EYE + cross + cross @ cross / max(1.0 + float(before.dot(now)), 0.1)
+    whole = np.eye(SIZE)
+    for part in (POSITION, VELOCITY, ACCELERATION):
+        whole[part, part] = turn
+    return whole @ covariance @ whole.T
 
 
-def bounded_across(covariances: Array, along: Array, distance: Array, speed: float) -> Array:
+def bounded_across(covariance: Array, along: Array, distance: float, speed: float) -> Array:
     """
-    Return covariances (n, k, k), of position, velocity and more, with bounded deviations.
+    Return a covariance (15, 15) with bounded deviations across a line ``along`` (3,).
 
-    Across the line (n, 3) along which the distances (n,), m, were measured, the deviation of the
-    position is at most the distance, and that of the velocity at most ``speed``, m/s. Larger ones
-    would make the distance uncertain after a small turn of the line.
+    Across the line along which the distance, m, was measured, the deviation of the position is at
+    most the distance, and that of the velocity at most ``speed``, m/s. Larger ones would make the
+    distance uncertain after a small turn of the line.
     """
-    scale = np.tile(np.eye(covariances.shape[-1]), (len(covariances), 1, 1))
-    line = along[:, :, None] * along[:, None, :]
-    for part, most in ((POSITION, distance), (VELOCITY, np.full(len(along), speed))):
-        block = covariances[:, part, part]
-        across = np.einsum('nii->n', block) - np.einsum('nij,nij->n', line, block)
-        share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
-        scale[:, part, part] = line + share * (_EYE - line)
-    return scale @ covariances @ scale.transpose(0, 2, 1)
+    scale, line = np.eye(SIZE), np.outer(along, along)
+    for part, most in ((POSITION, distance), (VELOCITY, speed)):
+        across = float(((_EYE - line) * covariance[part, part]).sum())
+        share = min(most / math.sqrt(max(0.5 * across, 1e-12)), 1.0)
+        scale[part, part] = line + share * (_EYE - line)
+    return scale @ covariance @ scale.T

@@ -197,9 +197,11 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        image = self._due(now)
-        if image is None:
+        due = next((k for k, each in enumerate(self._pending) if self._ready(each, now)), None)
+        if due is None:
             return None
+        image = self._pending.pop(due)
+        image = image._replace(model=self._cameras[image.camera].model)
         sighting, pixels = Sighting(), None
         start = decoded = clock()
         try:
@@ -215,21 +217,19 @@ class Perceiver:
             sighting.rejections.append((INVALID_IMAGE, str(error)))
         return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
 
-    def _due(self, now: float) -> PendingImage | None:
-        """Return the next image to process now, and forget it; None if it has to wait."""
-        for k, image in enumerate(self._pending):
-            camera = self._cameras[image.camera]
-            awaited = camera.model is None or self.tracker.missing(
-                image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
-            waited = now - image.received
-            if awaited and waited < self._wait(image.camera):
-                continue
-            if awaited:
-                camera.waits.clear()  # it may be later from now on: wait longer
-            else:
-                camera.waits.append(waited)
-            return self._pending.pop(k)._replace(model=camera.model)
-        return None
+    def _ready(self, image: PendingImage, now: float) -> bool:
+        """Return whether to process an image now; if so, its camera's waits are updated."""
+        camera = self._cameras[image.camera]
+        awaited = camera.model is None or self.tracker.missing(
+            image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
+        waited = now - image.received
+        if not awaited:
+            camera.waits.append(waited)
+        elif waited >= self._wait(image.camera):
+            camera.waits.clear()  # it may be later from now on: wait longer
+        else:
+            return False
+        return True
 
     def take_range(self, measured: RangeState) -> Rejection | None:
         """Take a range, or return why not; it is used by ``tracker.ranged``."""

@@ -17,7 +17,7 @@ From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
 and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
-is fitted as it is smeared, and where that fails, four corners have to do.
+is fitted as it is smeared.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, ippe, moved, refit
-from flock_follower.perception.edges import facing, project
+from flock_follower.perception.edges import facing
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.measurement import (
     angle,
     Choice,
     choose,
-    from_corners,
     Hypothesis,
     Measurement,
     PosePrior,
@@ -45,8 +44,14 @@ from flock_follower.perception.measurement import (
     widened,
     WIDENING,
 )
-from flock_follower.perception.print_model import edge_model, EdgeModel, shift_to_code, shows_code
-from flock_follower.perception.smear_fit import fit_smeared, smear_model, SmearFit, SmearModel
+from flock_follower.perception.print_model import edge_model, EdgeModel, shows_code
+from flock_follower.perception.smear_fit import (
+    fit_smeared,
+    seek,
+    smear_model,
+    SmearFit,
+    SmearModel,
+)
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
@@ -57,6 +62,8 @@ NARROW = 0.01
 #: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
 MIN_INLIERS = 0.5
 MAX_RMS = 0.4
+#: Of a marker that is not tracked yet, more than this share of the edges must agree.
+FOUND_INLIERS = 0.8
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
 #: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
 SMEARED = 0.26
@@ -133,13 +140,12 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior, edges_only: bool = False) -> Measurement | None:
+           expected: PosePrior) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
-    :param edges_only: whether no pose is accepted that edges do not confirm.
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
@@ -147,10 +153,9 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     fits = [one for start in starts
             if (one := _good_fit(image, camera, alone, start)) is not None
-            and _shown(image, one).all()]
+            and one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
-        return None if edges_only else _without_edges(
-            image, camera, sought, index, corners, starts, expected)
+        return _without_edges(image, camera, sought, index, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
@@ -162,24 +167,16 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
 
 
 def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-                   corners: Array, starts: list[Transform],
-                   expected: PosePrior) -> Measurement | None:
-    """Return a neighbour by the whole print of a detected marker, smeared, or by its corners."""
-    marker, model = sought.neighbor.markers[index], sought.model
+                   starts: list[Transform], expected: PosePrior) -> Measurement | None:
+    """Return a neighbour by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    if fits:
-        least = min(f.rms for f in fits)
-        best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
-                      expected)
-        return widened(_of_smear(sought, index, best.chosen.fit), best)
-    by_corners = from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
-    if by_corners is None:
+    if not fits:
         return None
-    alone = model.only(np.arange(len(model.codes)) == index)
-    lines = project(camera, alone, by_corners.T_camera_body)
-    shown = lines is not None and shows_code(image, lines.cells, model.codes[index])
-    return by_corners if shown else None
+    least = min(f.rms for f in fits)
+    best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
+                  expected)
+    return widened(_of_smear(sought, index, best.chosen.fit), best)
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -190,7 +187,7 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
         return None
     seen = model.only(turned)
     found = _good_fit(image, camera, seen, start, spacing)
-    shown = None if found is None else _shown(image, found)
+    shown = None if found is None else _shown(image, found, True)
     if shown is not None and shown.all():
         return found
     if len(seen.codes) == 1:
@@ -198,26 +195,20 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if shown is None:  # one that is covered spoils them all
         alone = [_good_fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
                            spacing) for k in range(len(seen.codes))]
-        shown = np.array([f is not None and bool(_shown(image, f)[0]) for f in alone])
+        shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return None
     found = _good_fit(image, camera, seen.only(shown), start, spacing)
-    return found if found is not None and _shown(image, found).all() else None
+    return found if found is not None and _shown(image, found, True).all() else None
 
 
 def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
              pose: Transform) -> Transform | None:
-    """Return a pose moved to where the cells of one of its markers resemble the image, if any."""
+    """Return a pose moved to where the print of one of its markers resembles the image, if any."""
     for k in np.flatnonzero(facing(sought.model, pose)).tolist():
-        lines = project(camera, sought.model.only(np.arange(len(sought.model.codes)) == k), pose)
-        shift = None if lines is None else shift_to_code(image, lines.cells,
-                                                         sought.model.codes[k])
-        if shift is not None:
-            marker = sought.neighbor.markers[k]
-            cell = marker.side_length / (sought.model.codes[k].bits.size**0.5 + 2.0)
-            # Right and down in the marker are along +x and -y of its frame.
-            step = marker.T_body_marker.rotation @ np.array([shift[0], -shift[1], 0.0]) * cell
-            return Transform(pose.rotation, pose.translation + pose.rotation @ step)
+        begin = seek(image, camera, sought.smears[k], pose)
+        if begin is not None:
+            return begin[0]
     return None
 
 
@@ -246,12 +237,10 @@ def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Tr
     return found if good else None
 
 
-def _shown(image: GrayImage, found: EdgeFit) -> Any:
+def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines = found.lines
-    if len(lines.model.codes) == 1:
-        return np.array([shows_code(image, lines.cells, lines.model.codes[0])])
-    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code)
+    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
                      for k, code in enumerate(lines.model.codes)])
 
 

@@ -123,11 +123,6 @@ def read(brightness: Array, seen: Windows) -> Array:
 
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
-#: A marker is looked for this far from its place, cells, in steps of half a cell;
-_RANGE = 2.5
-_SHIFTS = np.arange(-_RANGE, _RANGE + 0.1, 0.5)
-#: it is there where its correlation with the pattern is above this.
-_LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Where else a cell is looked at, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
@@ -183,13 +178,15 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
         np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
 
 
-def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
+def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = False) -> bool:
     """
     Return whether an image shows a marker's code, its cells' middles being at ``pixels`` (c, 2).
 
-    Its border must be black, the quiet zone around white, at most ``code.errors`` of its
-    cells the wrong way, and no other word of the dictionary nearer. Where one threshold for all
-    cells does not show that, a shadow may lie across: then each is compared with those around.
+    Its border must be black, the quiet zone around white, and no other word of the dictionary
+    nearer. Of a marker that is ``tracked``, up to ``code.errors`` cells may be covered; of any
+    other, half as many may be wrong: a mirrored print differs in few cells. Where one threshold
+    for all cells does not show that, a shadow may lie across: then each is compared with those
+    around.
     """
     brightness = grey_levels(image, pixels)
     inner = code.bits.size
@@ -200,17 +197,33 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
     cells = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
     if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
-            and np.count_nonzero(cells * code.bits <= 0.0) <= code.errors
+            and _few_wrong(cells * code.bits, brightness, code, tracked)
             and _is_word(cells, code)):
         return True
-    if _shows_in_uneven_light(brightness[None], code):
+    if _shows_in_uneven_light(brightness[None], code, tracked):
         return True
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
-    return _shows_in_uneven_light(grey_levels(image, beside).reshape(len(_BESIDE), -1), code)
+    return _shows_in_uneven_light(grey_levels(image, beside).reshape(len(_BESIDE), -1), code,
+                                  tracked)
 
 
-def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
+def _few_wrong(agreeing: Array, brightness: Array, code: CellCode, tracked: bool) -> bool:
+    """Return whether inner cells agree well enough, (b,), -1 to 1, with a marker's."""
+    correctable = np.count_nonzero(agreeing <= 0.0) <= code.errors
+    if tracked:
+        return correctable
+    if correctable and (brightness[:code.bits.size + code.border] >= _SATURATED).any():
+        agreeing = agreeing[code.bits > 0.0]  # a reflex turns no white cell black
+    return _wrong(agreeing) < max(0.5 * code.errors, 1.0)
+
+
+def _wrong(agreeing: Array) -> float:
+    """Return how many cells, of agreement (n,), are wrong; doubtful ones count in part."""
+    return float(np.clip(0.5 - agreeing, 0.0, 1.0).sum())
+
+
+def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> bool:
     """Return whether cells of brightness (n, c), n places in each, are those of a marker."""
     colours = read(brightness, code.windows).mean(axis=0)
     saturated: Any = (brightness >= _SATURATED).any(axis=0)
@@ -222,10 +235,10 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
     count = np.count_nonzero(hidden)
     bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
-    wrong = float(np.clip(0.5 - bits * code.bits, 0.0, 1.0)[~hidden].sum())
+    wrong = _wrong((bits * code.bits)[~hidden])
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
-    return (wrong < (0.5 if count else max(0.5 * code.errors, 1.0))
-            and count <= min(2 * code.errors, _MOST_HIDDEN * len(hidden))
+    return (wrong < (0.5 if count and not tracked else max(0.5 * code.errors, 1.0))
+            and count <= _MOST_HIDDEN * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
             and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
             and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))
@@ -234,29 +247,6 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode) -> bool:
 def _is_word(read: Array, code: CellCode) -> bool:
     """Return whether inner cells (b,), black -1 to white 1, resemble no other word as much."""
     return bool(code.bits.dot(read) > code.others.dot(read).max())
-
-
-def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:
-    """
-    Return by how many cells, to the right and down, a marker is off where it is expected.
-
-    Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
-    None if nothing resembles it.
-    """
-    pattern = np.concatenate([code.bits, -np.ones(code.border),
-                              np.ones(len(pixels) - code.bits.size - code.border)])
-    pattern -= pattern.mean()
-    axes = code.by_cell @ pixels
-    shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
-    at = pixels[None] + (shifts @ axes)[:, None]
-    brightness = grey_levels(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
-    spread = brightness.std(axis=1) * len(pixels)**0.5 * np.linalg.norm(pattern)
-    likeness = brightness @ pattern / np.maximum(spread, 1e-6)
-    best = int(np.argmax(likeness))
-    if likeness[best] < _LIKENESS:
-        return None
-    right, down = shifts[best].tolist()
-    return right, down
 
 
 def grey_levels(image: GrayImage, pixels: Array) -> Any:

@@ -13,22 +13,21 @@
 # limitations under the License.
 
 """
-Decides whether to use a measured distance.
+Decides whether to use a measured distance, and estimates the constant error of a series of them.
 
 Noise has two signs, but a detour of radio waves only lengthens. A distance outside the gate that
 is too short gets the weight that puts it on the gate; if the next one is too short, too, the
 prediction is wrong, and its variance is raised. A distance that is too long is refused, until
-``most`` in a row were: then the prediction is wrong. Arrays are (n,): distances to n neighbours,
-or of n runs of a simulation.
+``most`` in a row were: then the prediction is wrong.
+
+``RangeBias`` learns the constant error (mostly antenna delays), a slow random walk, while the
+marker gives the true distance.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
-import numpy as np
-
-from flock_follower.geometry import Array
+import math
+from typing import NamedTuple
 
 #: chi^2 with 1 degree of freedom at a probability of 0.99: detours are frequent, ranges too.
 RANGE_GATE = 6.63
@@ -36,57 +35,81 @@ RANGE_GATE = 6.63
 RANGE_WILD = 10.0
 #: Number of distances over which the refused share is reported.
 COUNTED = 200
+#: Before anything was learnt, m: a standard deviation.
+UNKNOWN_BIAS = 0.5
+#: Random walk of the bias, m/sqrt(s).
+WALK = 0.01
 
 
 class Verdict(NamedTuple):
-    """The treatment of measured distances, (n,) each."""
+    """The treatment of a measured distance."""
 
-    used: Any
-    """Whether to use it."""
-    prior: Array
-    """Factor on the predicted variances."""
-    spread: Array
+    used: bool
+    prior: float = 1.0
+    """Factor on the predicted variance."""
+    spread: float = 1.0
     """Factor on the variance of the innovation after that: the noise is larger."""
 
 
 class RangeGate:
     """
-    The gate of n series of distances.
+    The gate of a series of distances.
 
     :param most: at most one less than this number is refused in a row.
     """
 
-    def __init__(self, count: int = 1, most: int = 6) -> None:
+    def __init__(self, most: int = 6) -> None:
         self._most = most
-        self._refused: Any = np.zeros(count, dtype=int)
-        self._before: Array = np.zeros(count)  # sign of the last one used, where it surprised
-        self._judged: Any = np.zeros(count, dtype=int)
-        self.outliers: Array = np.zeros(count)
+        self._refused = self._judged = 0
+        self._before = 0.0  # sign of the last one used, if it was outside
+        self.outliers = 0.0
         """Share of recent distances that was refused."""
 
-    def restart(self, which: Any) -> None:
-        """Forget what surprised of some (n,) bool, but not how many are refused."""
-        self._refused[which] = 0
-        self._before[which] = 0.0
-
-    def judge(self, innovation: Array, spread: Array, given: Any = True) -> Verdict:
-        """
-        Judge distances by their innovations, m, of variances ``spread``, m^2.
-
-        :param given: which there are; of the others nothing changes, and none is used.
-        """
-        doubt = innovation ** 2 / (spread * RANGE_GATE)
+    def judge(self, innovation: float, spread: float) -> Verdict:
+        """Judge a distance by its innovation, m, of variance ``spread``, m^2."""
+        doubt = innovation * innovation / (spread * RANGE_GATE)
         inside = doubt <= 1.0  # NaN is not
-        refused = ~inside & (self._refused < self._most - 1) & (
-            (innovation > 0.0) | ~(doubt <= RANGE_WILD))
-        used = given & ~refused & np.isfinite(doubt)
-        side = np.where(inside, 0.0, np.sign(innovation))
-        again = used & ~inside & ((side == self._before) | (self._refused >= self._most - 1))
-        self._refused = np.where(given & refused, self._refused + 1,
-                                 np.where(used & inside, 0, self._refused))
-        self._before = np.where(used, side, self._before)
-        self._judged = np.minimum(self._judged + given, COUNTED)
-        self.outliers = np.where(given, self.outliers + (refused - self.outliers) / np.maximum(
-            self._judged, 1), self.outliers)
-        return Verdict(used, np.where(again, doubt, 1.0),
-                       np.where(used & ~inside & ~again, doubt, 1.0))
+        enough = self._refused >= self._most - 1
+        refused = not (inside or enough) and (innovation > 0.0 or not doubt <= RANGE_WILD)
+        self._judged = min(self._judged + 1, COUNTED)
+        self.outliers += (refused - self.outliers) / self._judged
+        if refused or not math.isfinite(doubt):
+            self._refused += refused
+            return Verdict(False)
+        side = 0.0 if inside else math.copysign(1.0, innovation)
+        again, self._before = side == self._before, side
+        if inside:
+            self._refused = 0
+            return Verdict(True)
+        return Verdict(True, prior=doubt) if again or enough else Verdict(True, spread=doubt)
+
+
+class RangeBias:
+    """The bias of a series of distances."""
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        """m."""
+        self.gate = RangeGate()
+        self._variance, self._stamp = UNKNOWN_BIAS**2, math.inf
+
+    def variance(self, stamp: float) -> float:
+        """Return the variance of the bias at a stamp, s, m^2."""
+        return min(self._variance + WALK**2 * abs(stamp - self._stamp), UNKNOWN_BIAS**2)
+
+    def learn(self, stamp: float, excess: float, noise: float) -> None:
+        """
+        Learn from a distance measured at a stamp, s, of a neighbour in sight.
+
+        :param excess: measured distance less that to the marker, m.
+        :param noise: variance of their difference but for the bias, m^2.
+        """
+        prior, innovation = self.variance(stamp), excess - self.value
+        verdict = self.gate.judge(innovation, prior + noise)
+        if not verdict.used:
+            return
+        prior *= verdict.prior
+        gain = prior / (verdict.spread * (prior + noise))
+        # A larger assumed noise means a smaller gain: the bias is learnt more slowly.
+        self.value += gain * innovation
+        self._variance, self._stamp = (1.0 - gain) * prior, stamp

@@ -20,9 +20,6 @@ is learnt. Out of sight, a second filter continues from the state of the first. 
 is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
 line of sight. Across it, the uncertainty grows with the neighbour's possible motion; once it
 exceeds the distance, the direction is unknown.
-
-``RangeBias`` learns the constant error of ranges (mostly antenna delays), a slow random walk,
-while the marker gives the true distance. Its arrays are (n,).
 """
 
 from __future__ import annotations
@@ -32,7 +29,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,52 +39,8 @@ from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySamp
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
-from flock_follower.perception.range_gate import RangeGate
+from flock_follower.perception.range_gate import RangeBias
 from flock_follower.ranges import Checked, parameter, Range
-
-#: Before anything was learnt, m: a standard deviation.
-UNKNOWN_BIAS = 0.5
-#: How the bias wanders, m/sqrt(s).
-WALK = 0.01
-
-
-class RangeBias:
-    """The biases of n series of distances."""
-
-    def __init__(self, count: int = 1) -> None:
-        self.value: Array = np.zeros(count)
-        """m."""
-        self._variance: Array = np.full(count, UNKNOWN_BIAS ** 2)
-        self._stamp: Array = np.full(count, np.nan)
-        self._gate = RangeGate(count)
-
-    @property
-    def outliers(self) -> Array:
-        """Return which share of the distances fitted the marker's so badly that it was refused."""
-        return self._gate.outliers
-
-    def variance(self, stamp: float) -> Array:
-        """Return how sure the biases are at a stamp, s: variances, m^2."""
-        since = np.nan_to_num(np.abs(stamp - self._stamp))
-        return np.minimum(self._variance + WALK ** 2 * since, UNKNOWN_BIAS ** 2)
-
-    def learn(self, stamp: float, excess: Array, noise: Array, given: Any = True) -> None:
-        """
-        Learn from distances measured at a stamp, s, of neighbours in sight.
-
-        :param excess: measured distance less that to the marker, m.
-        :param noise: variances of their difference but for the bias, m^2.
-        """
-        prior = self.variance(stamp)
-        innovation = excess - self.value
-        used, widened, careful = self._gate.judge(innovation, prior + noise, given)
-        prior = prior * widened
-        gain = prior / (careful * (prior + noise))
-        # A larger assumed noise means a smaller gain: the bias is learnt more slowly.
-        self.value = np.where(used, self.value + gain * innovation, self.value)
-        self._variance = np.where(used, (1.0 - gain) * prior, self._variance)
-        self._stamp = np.where(used, stamp, self._stamp)
-
 
 #: If a neighbour is unseen for this long, s, its state is estimated from its ranges ...
 UNSEEN = 0.5
@@ -261,7 +214,10 @@ class RangeSeries:
             self._apart, self._since = self._seen.continued(LONGEST), seen.stamp
         outcome = UpdateOutcome.LOST
         while self._unused:
-            outcome = self._go_on(self._apart, self._unused.popleft())
+            each = self._unused.popleft()
+            outcome = self._apart.update_range(
+                each.stamp, each.distance - self.bias.value, each.antenna,
+                each.variance + self.bias.variance(each.stamp), self._tag)
         now = self._apart.newest
         if now is None or outcome not in (UpdateOutcome.USED, UpdateOutcome.SURPRISING):
             return None
@@ -275,19 +231,13 @@ class RangeSeries:
         distance = math.hypot(*sight.tolist())
         along = sight / max(distance, 1e-6)
         spread = float(along.dot(then.covariance[POSITION, POSITION]).dot(along))
-        self.bias.learn(measured.stamp, np.array([measured.distance - distance]),
-                        np.array([measured.variance + spread]))
-
-    def _go_on(self, apart: NeighborFilter, measured: PlacedRange) -> UpdateOutcome:
-        return apart.update_range(
-            measured.stamp, measured.distance - float(self.bias.value[0]), measured.antenna,
-            measured.variance + float(self.bias.variance(measured.stamp)[0]), self._tag)
+        self.bias.learn(measured.stamp, measured.distance - distance, measured.variance + spread)
 
     def _reported(self, now: Estimate, own: OdometrySample) -> Estimate:
         """Return a state in odom; the variance of the bias adds to that of the distance."""
         sight = now.position - own.travel
         along = sight / max(math.hypot(*sight.tolist()), 1e-6)
         covariance = now.covariance.copy()
-        covariance[POSITION, POSITION] += self.bias.variance(now.stamp)[0] * np.outer(along, along)
+        covariance[POSITION, POSITION] += self.bias.variance(now.stamp) * np.outer(along, along)
         return now._replace(stamp=own.stamp, position=now.position + own.correction,
                             covariance=covariance)

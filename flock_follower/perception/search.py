@@ -56,7 +56,7 @@ _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astyp
 #: Side of the window for the mean, px, and of the brush that removes what is narrower. A narrow
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
-_WINDOWS = ((7, 1), (15, 1), (11, 3))
+_WINDOWS = ((7, 1), (31, 1), (11, 3))
 _DARKER = 7  # by so much of the logarithm than the mean of the window is what is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16

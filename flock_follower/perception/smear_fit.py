@@ -44,13 +44,8 @@ from flock_follower.perception.edges import (
     within_reason,
 )
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import (
-    correctable_cells,
-    dictionary_words,
-    Marker,
-    marker_code,
-)
-from flock_follower.perception.print_model import median
+from flock_follower.perception.markers import Marker, marker_code
+from flock_follower.perception.print_model import cell_code, median
 
 #: Samples per cell, each way; beyond the black border; and away from where a marker is expected
 #: up to which it is looked for.
@@ -82,7 +77,8 @@ class SmearModel:
     for each of :data:`LENSES`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
     ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
-    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread.
+    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread: half of
+    those that can be corrected.
     ``cells``: number of cells along a side, with the black border.
     """
 
@@ -111,9 +107,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
     printed = np.array([_with_slopes(cv2.GaussianBlur(
         level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
-    words = dictionary_words(dictionary)
-    turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
-    order = [marker.marker_id, *(k for k in range(len(words)) if k != marker.marker_id)]
+    cells = cell_code(marker, dictionary)
     angles = np.arange(4) * np.pi / 4
     smears = np.array([[0.0, 0.0], *(length * np.array([np.cos(a), np.sin(a)])
                                      for length in _LENGTHS for a in angles),
@@ -125,8 +119,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     return SmearModel(
         origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + REACH),
         printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
-        turned[order].reshape(4 * len(words), -1).astype(float),
-        max(correctable_cells(dictionary), 1), n)
+        0.5 + 0.5 * np.vstack([cells.bits, cells.others]), max(cells.errors // 2, 1), n)
 
 
 def _with_slopes(level: Array) -> Any:
@@ -191,14 +184,19 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
 
     ``start`` may be off by two cells and a half, and a little in all else.
     """
-    begin = _begin(image, camera, model, start) if within_reason(start) else None
+    begin = seek(image, camera, model, start)
     return None if begin is None else _descend(image, camera, model, *begin)
 
 
-def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
-           start: Transform) -> tuple[Transform, Array, int] | None:
-    """Return the pose, shifted, smear and blur with which the print is likest to the image."""
-    seen = _look(image, camera, start.apply(model.origin + model.around @ model.axes))
+def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
+         start: Transform) -> tuple[Transform, Array, int] | None:
+    """
+    Return the pose, shifted, smear and blur with which the print is likest to the image.
+
+    ``start`` may be off by two cells and a half. None if the image resembles the print nowhere.
+    """
+    seen = _look(image, camera, start.apply(
+        model.origin + model.around @ model.axes)) if within_reason(start) else None
     if seen is None:
         return None
     brightness, _ = seen

@@ -28,15 +28,12 @@ Once a second the whole image is searched even if no neighbour is missing: see `
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-import math
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import (
-    Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
     R_FLU_OPTICAL,
@@ -45,15 +42,11 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.camera_schedule import (
-    CameraSchedule,
-    Look,
-    straightened,
-    View,
-)
+from flock_follower.perception.camera_schedule import CameraSchedule
 from flock_follower.perception.hypotheses import Hypotheses
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Detections, Marker, NeighborConfig
+from flock_follower.perception.look import Look, reported, Sighting, straightened, View
+from flock_follower.perception.markers import Detections, NeighborConfig
 from flock_follower.perception.measurement import likeliest, Measurement
 from flock_follower.perception.neighbor_filter import (
     Estimate,
@@ -61,16 +54,14 @@ from flock_follower.perception.neighbor_filter import (
     NeighborFilter,
     UpdateOutcome,
 )
-from flock_follower.perception.neighbor_motion import ODOMETRY_WALK, POSITION, VELOCITY
+from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
-MARGIN = 100.0
 #: and otherwise in one of so many.
-MIRRORED_EVERY = 30
-_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
+MARGIN, MIRRORED_EVERY = 100.0, 30
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -83,32 +74,6 @@ def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
     roll, pitch, yaw = np.asarray(rpy, dtype=float)
     link = quaternion_to_matrix(quaternion_from_rpy(roll, pitch, yaw))
     return Transform(link @ R_FLU_OPTICAL, np.asarray(position, dtype=float))
-
-
-@dataclass
-class Sighting:
-    """
-    The result of one image.
-
-    ``estimates`` and ``measurements`` by neighbour's name, of the neighbours measured in this
-    image; ``stage`` is the costliest stage of detection that was used, 'none' if the image could
-    not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
-    for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
-    by names made of the neighbours', are the states of candidates measured in this image that
-    carry a neighbour's marker and are not its primary track.
-    """
-
-    estimates: dict[str, Estimate] = field(default_factory=dict)
-    measurements: dict[str, Measurement] = field(default_factory=dict)
-    stage: str = 'none'
-    rejections: list[tuple[str, str]] = field(default_factory=list)
-    other_ids: list[int] = field(default_factory=list)
-    duplicates: dict[str, Estimate] = field(default_factory=dict)
-
-    @property
-    def stages(self) -> dict[str, str]:
-        """Return how each neighbour measured was found: 'track', 'roi' or 'full'."""
-        return {name: measured.stage for name, measured in self.measurements.items()}
 
 
 class Tracker:
@@ -136,6 +101,7 @@ class Tracker:
         self.cameras = dict(cameras)
         self._odometry = OdometryBuffer()
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
+        self._side = {n.name: max(m.side_length for m in n.markers) for n in config.neighbors}
         self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
@@ -207,23 +173,21 @@ class Tracker:
             look = self._plan(stamp, model, camera)
         if isinstance(look, Missing):
             return Sighting(rejections=[(look.value, '')])
-        sighting = Sighting()
         model.check_image(image.shape[1], image.shape[0])
-        measured, others = self._track(image, look)
-        sighting.stage = 'track'
-        if len(measured) < look.sought.number:
-            self._detect(image, look, measured, others, sighting)
+        self._track(image, look)
+        look.sighting.stage = 'track'
+        if len(look.measured) < look.sought.number:
+            self._detect(image, look)
         if self._schedule.sweep_due(look.camera, stamp):
-            found = search.everywhere(image, self.config.dictionary)
-            self._locate(found, 'full', image, look, measured, others, sighting)
+            self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
-        sighting.other_ids = sorted(set(sighting.other_ids))
-        for name, measurement in measured.items():
+        look.sighting.other_ids = sorted(set(look.sighting.other_ids))
+        for name, measurement in look.measured.items():
             look.camera.spacings[name] = measurement.spacing
-            self._update(look, measurement, sighting)
-        for measurement in others:
-            self._update(look, measurement, sighting, other=True)
-        return sighting
+            self._update(look, measurement)
+        for measurement in look.others:
+            self._update(look, measurement, other=True)
+        return look.sighting
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
         """Return the expected content of an image, or why nothing is known."""
@@ -237,7 +201,7 @@ class Tracker:
             sought = self._schedule.sought(
                 camera, stamp, model, times,
                 lambda name: self._place(name, times[name], stamp, camera))
-        look = Look(stamp, camera, model, {}, {}, sought)
+        look = Look(stamp, camera, model, sought)
         for name, delay in camera.delays.items():
             if name in sought.near or name in sought.anywhere:
                 view = self._view(look, delay)
@@ -275,22 +239,10 @@ class Tracker:
         own = self._odometry.at(stamp) if exposed else view.own
         if isinstance(own, Missing):
             own = view.own
-        # White noise of the own attitude and velocity at the stamp: the filter averages over it.
-        attitude, velocity = self._odometry.white_noise
-        x, y, z = (estimate.position - own.travel).tolist()
-        covariance = estimate.covariance.copy()
-        covariance[POSITION, POSITION] += attitude * np.array(
-            [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
-             [-x * z, -y * z, x * x + y * y]])
-        covariance[_VELOCITIES, _VELOCITIES] += velocity
-        return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
-                                 covariance=covariance)
+        return reported(estimate, stamp, own, *self._odometry.white_noise)
 
-    def _track(self, image: GrayImage,
-               look: Look) -> tuple[dict[str, Measurement], list[Measurement]]:
-        """Return the neighbours found by their edges, and the other candidates."""
-        found: dict[str, Measurement] = {}
-        others: list[Measurement] = []
+    def _track(self, image: GrayImage, look: Look) -> None:
+        """Measure the neighbours, and the other candidates, by their edges."""
         camera = look.camera
         for name in look.sought.near:
             check = camera.unchecked[name] == 0
@@ -299,9 +251,9 @@ class Tracker:
             if measurement is None:
                 continue
             if self._of_candidate(look, measurement):
-                others.append(measurement)
+                look.others.append(measurement)
                 continue
-            found[name] = measurement
+            look.measured[name] = measurement
             if not check:
                 camera.unchecked[name] -= 1
             elif measurement.margin is not None and measurement.margin > MARGIN:
@@ -317,9 +269,8 @@ class Tracker:
                 if self._schedule.in_view(name, look.model, expected.pose):
                     measurement = track(image, look.model, self._targets[name], expected, None,
                                         True)
-                    if measurement is not None and not self._known(measurement, found, others):
-                        others.append(measurement)
-        return found, others
+                    if measurement is not None and not look.known(measurement, self._side[name]):
+                        look.others.append(measurement)
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate, not of the primary track."""
@@ -331,40 +282,22 @@ class Tracker:
             self._schedule.time(name, camera, look.stamp + camera.delays[name]),
             place.translation) is not None
 
-    def _known(self, measurement: Measurement, measured: Mapping[str, Measurement],
-               others: Iterable[Measurement]) -> bool:
-        """Return whether a body was measured before, at the same place in the same image."""
-        name, place = measurement.name, measurement.T_camera_body.translation
-        side = max(m.side_length for m in self._targets[name].neighbor.markers)
-        return any(math.dist(each.T_camera_body.translation, place) < side
-                   for each in _of(name, measured, others))
-
-    def _shown(self, corners: Array, name: str, marker: Marker, look: Look,
-               measured: Mapping[str, Measurement], others: Iterable[Measurement]) -> bool:
-        """Return whether corners (4, 2), px, are of a marker that was measured in this image."""
-        size = 0.5 * float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)))
-        middles = [look.model.project((each.T_camera_body @ marker.T_body_marker)
-                                      .translation[None])[0]
-                   for each in _of(name, measured, others)]
-        return any(math.dist(middle, corners.mean(axis=0)) < size for middle in middles)
-
-    def _detect(self, image: GrayImage, look: Look, measured: dict[str, Measurement],
-                others: list[Measurement], sighting: Sighting) -> None:
-        """Look for the neighbours that are missing in ``measured``, and add them."""
+    def _detect(self, image: GrayImage, look: Look) -> None:
+        """Look for the neighbours that are not measured yet."""
         (near, anywhere, _), camera = look.sought, look.camera
 
         def missing() -> list[str]:
-            return [name for name in anywhere if name not in measured]
+            return [name for name in anywhere if name not in look.measured]
 
         for thorough in (False, True):
-            for name in [n for n in near if n not in measured and (
+            for name in [n for n in near if n not in look.measured and (
                     not thorough or n in anywhere)]:
                 pose = look.expected[name].pose
                 if pose is not None:
                     found = search.near(image, look.model, self.config.dictionary,
                                         self._targets[name].neighbor, pose, thorough)
-                    sighting.stage = 'roi'
-                    self._locate(found, 'roi', image, look, measured, others, sighting)
+                    look.sighting.stage = 'roi'
+                    self._locate(found, 'roi', image, look)
         if missing() and self._schedule.search_due(camera, look.stamp):
             # The first time both ways: quickly, and if need be thoroughly; then they take turns.
             ways = (False, True) if camera.searched is None else (camera.thorough,)
@@ -373,53 +306,48 @@ class Tracker:
                     found = search.everywhere(image, self.config.dictionary, [
                         m for name in missing() for m in self._targets[name].neighbor.markers
                     ] if thorough else None)
-                    self._locate(found, 'full', image, look, measured, others, sighting,
-                                 thorough)
+                    self._locate(found, 'full', image, look)
                     camera.thorough = not thorough
-            sighting.stage, camera.searched = 'full', look.stamp
-        camera.vain.update((name, look.stamp) for name in near if name not in measured)
+            look.sighting.stage, camera.searched = 'full', look.stamp
+        camera.vain.update((name, look.stamp) for name in near if name not in look.measured)
 
-    def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look,
-                measured: dict[str, Measurement], others: list[Measurement],
-                sighting: Sighting, edges_only: bool = False) -> None:
+    def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look) -> None:
         """Turn detections that are not measured yet into measurements."""
         candidates: dict[str, list[Measurement]] = {}
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
             if marker_id not in self._by_marker:
-                sighting.other_ids.append(marker_id)
+                look.sighting.other_ids.append(marker_id)
                 continue
             neighbor, marker = self._by_marker[marker_id]
             name = neighbor.name
-            if name not in look.expected or self._shown(corners, name, marker, look, measured,
-                                                        others):
+            if name not in look.expected or look.shown(corners, name, marker):
                 continue
             measurement = locate(image, look.model, self._targets[name],
-                                 neighbor.markers.index(marker), corners, look.expected[name],
-                                 edges_only)
+                                 neighbor.markers.index(marker), corners, look.expected[name])
             if measurement is None:
-                sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
-            elif not self._known(measurement, measured, others):
+                look.sighting.rejections.append(
+                    ('no pose suits the marker', f'{name}, {marker_id}'))
+            elif not look.known(measurement, self._side[name]):
                 measurement = measurement._replace(stage=stage)
                 if self._of_candidate(look, measurement):
-                    others.append(measurement)
+                    look.others.append(measurement)
                 else:
                     candidates.setdefault(name, []).append(measurement)
         for name, several in candidates.items():
-            if name not in measured:
-                measured[name] = likeliest(several, look.expected[name].pose)
+            if name not in look.measured:
+                look.measured[name] = likeliest(several, look.expected[name].pose)
                 look.camera.unchecked[name] = 0
             for each in several:
-                if not self._known(each, measured, others):
-                    others.append(each)
+                if not look.known(each, self._side[name]):
+                    look.others.append(each)
 
-    def _update(self, look: Look, measurement: Measurement, sighting: Sighting,
-                other: bool = False) -> None:
+    def _update(self, look: Look, measurement: Measurement, other: bool = False) -> None:
         """
         Update a neighbour's track with a measurement, and add the estimate to the sighting.
 
         :param other: whether it is of a candidate, not of the primary track.
         """
-        name, camera = measurement.name, look.camera
+        name, camera, sighting = measurement.name, look.camera, look.sighting
         delay = camera.exposed(look.model, measurement)
         view = self._view(look, delay)
         if isinstance(view, Missing):
@@ -434,8 +362,9 @@ class Tracker:
         T_smooth_body = view.T_smooth_camera @ T_camera_body
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
-        covariance = turn.dot(measurement.covariance).dot(turn.T)
-        covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
+        covariance = camera.noise.covariance(
+            turn.dot(measurement.covariance).dot(turn.T),
+            T_smooth_body.apply(reference) - view.own.travel)
         outcome, candidate = self._hypotheses[name].take(
             time, T_smooth_body, reference, covariance, other and name in sighting.estimates)
         refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)
@@ -469,9 +398,3 @@ class Tracker:
                     if each.newest is not None:
                         each.shift(shift * view.moving(each.newest.position - view.own.travel))
         self._schedule.changed(camera)
-
-
-def _of(name: str, measured: Mapping[str, Measurement],
-        others: Iterable[Measurement]) -> list[Measurement]:
-    """Return the measurements of a neighbour and of its candidates in this image."""
-    return [each for each in (measured.get(name), *others) if each and each.name == name]

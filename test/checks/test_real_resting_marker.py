@@ -67,9 +67,10 @@ def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:
             side = recording.side_length(tag.number) or 0.0
             seen = fitted_corners(recording.camera, size * side, tag.corners, None)
             if known and seen is not None:
-                spread = CORNER**2 * np.linalg.inv(seen.jacobian.T @ seen.jacobian)
-                rows.append((time, quaternion_to_matrix(q), R @ seen.pose.translation,
-                             np.sqrt(np.trace(spread[:3, :3])), R @ seen.pose.rotation))
+                pose, jacobian = seen
+                spread = CORNER**2 * np.linalg.inv(jacobian.T @ jacobian)
+                rows.append((time, quaternion_to_matrix(q), R @ pose.translation,
+                             np.sqrt(np.trace(spread[:3, :3])), R @ pose.rotation))
         if not rows:
             return None
         times, own_R, arms, deviations, attitudes = map(np.array, zip(*rows))

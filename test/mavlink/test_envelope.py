@@ -159,7 +159,7 @@ def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleratio
 def test_the_bounds_are_those_of_the_approach_speeds():
     limits, place = GateLimits(), Location(1.0, -0.2, np.array([0.0, 40.0]))
     braking = 0.4 * limits.a_max
-    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5)
+    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5, limits.a_max)
     assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5 + 0.3)
     assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5 + 0.3)
     normal, bound = inward(limits, place, np.array([0.0, 0.5, 0.0]), 0.5)

@@ -356,6 +356,6 @@ def test_limits_of_the_planner_that_differ_are_a_warning(make_bench):
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
             ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
             ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than')):
-        bench.node._report.planner_changed(values)
+        bench.node._report.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)

@@ -53,25 +53,6 @@ def test_corners_are_good_enough_for_the_edges_to_be_found_from_them(
         assert np.abs(found.corners[0] - true_corners(camera, pose)).max() < 2.0
 
 
-def test_pixel_zero_is_the_centre_of_the_first_pixel() -> None:
-    image = np.full((200, 240), 210, dtype=np.uint8)
-    image[50:122, 80:152] = np.where(aruco.draw_marker(DICTIONARY, 7, 72) > 127, 210, 25)
-    found = aruco.detect(image, DICTIONARY)
-    # The outline goes through the centres of the outermost black pixels.
-    np.testing.assert_allclose(
-        found.corners, [[[80, 50], [151, 50], [151, 121], [80, 121]]], atol=0.5)
-
-
-@pytest.mark.parametrize('turns', range(4))
-def test_corners_come_in_the_markers_own_order(turns: int) -> None:
-    image = np.full((200, 200), 210, dtype=np.uint8)
-    marker = np.where(aruco.draw_marker(DICTIONARY, 0, 72) > 127, 210, 25)
-    image[60:132, 60:132] = np.rot90(marker, -turns)  # clockwise
-    found = aruco.detect(image, DICTIONARY)
-    upright = np.array([[60.0, 60.0], [131.0, 60.0], [131.0, 131.0], [60.0, 131.0]])
-    np.testing.assert_allclose(found.corners[0], np.roll(upright, -turns, axis=0), atol=0.5)
-
-
 @pytest.mark.parametrize('dictionary', [
     'DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_100', 'DICT_ARUCO_ORIGINAL'])
 def test_what_is_drawn_is_detected(dictionary: str) -> None:

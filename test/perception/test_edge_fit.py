@@ -20,8 +20,6 @@ import math
 from typing import Any
 import warnings
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
 import numpy as np
 import pytest
@@ -75,6 +73,17 @@ def fitted(image: GrayImage, start: Transform, camera: CameraModel = CAMERA,
 
 
 @pytest.mark.slow
+def test_edges_in_a_shadow_count() -> None:
+    # Without them the attitude would rest on the lit half alone.
+    pose = facing((0.0, 0.0, 1.2), (0.02, 0.03, 0.0))
+    image = render(CAMERA, {3: pose}, black=10.0)
+    x = CAMERA.project(pose.translation[None])[0, 0]
+    shaded = np.where(np.arange(image.shape[1]) < x, image, 0.2 * image).astype(np.uint8)
+    found = fitted(shaded, pose)
+    assert found.inliers > 0.85
+    assert np.linalg.norm(error(found, pose)[3:]) < 0.05
+
+
 @pytest.mark.parametrize(('camera', 'conditions'), [
     (CAMERA, {}), (FISHEYE, {}), (make_camera('rational_polynomial', 240, 180), {}),
     (CAMERA, {'gamma': 2.2, 'black': 8.0}), (CAMERA, {'black': 60.0, 'white': 330.0, 'blur': 0.8}),
@@ -172,24 +181,6 @@ def test_poses_out_of_sight_are_none(place: tuple[float, float, float]) -> None:
         assert fit(SHOWN, CAMERA, MODEL, Transform(HERE.rotation, np.array(place))) is None
 
 
-numbers = st.floats(width=32)
-anywhere = st.tuples(numbers, numbers, numbers)
-ahead = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.01, 6.0))
-turns = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
-spacings: Any = st.none() | st.tuples(*[st.floats(0.3, 1.2)] * 2)
-
-
-@settings(max_examples=300)
-@given(anywhere | ahead, turns, spacings)
-def test_no_start_raises_or_warns(place: tuple[float, float, float],
-                                  turn: tuple[float, float, float], spacing: Any) -> None:
-    start = Transform(rotation_vector_to_matrix(turn) @ HERE.rotation, np.array(place))
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        found = fit(SHOWN, CAMERA, MODEL, start, spacing)
-    if found is not None:
-        assert np.isfinite(found.pose.translation).all()
-        assert np.isfinite(found.covariance).all()
 
 
 def seen_in_part(monkeypatch: pytest.MonkeyPatch, seen: Any) -> None:
@@ -217,22 +208,3 @@ def test_a_fit_that_rests_on_edges_of_one_axis_is_none(monkeypatch: pytest.Monke
         with monkeypatch.context() as patch:
             seen_in_part(patch, few)
             assert fit(image, CAMERA, MODEL, truth) is None
-
-
-def test_whatever_edges_are_seen_a_covariance_is_definite(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(21)
-    refused = 0
-    for _ in range(150):
-        with monkeypatch.context() as patch:
-            if rng.random() < 0.5:  # one patch of the marker, of any size
-                middle, width = rng.uniform(-0.5, 0.5, 2) * SIDE, rng.uniform(0.1, 0.9) * SIDE
-                seen = (np.abs(MODEL.places[:len(MODEL), :2] - middle) < width).all(axis=1)
-            else:
-                seen = rng.random(len(MODEL)) < rng.uniform(0.02, 0.6)
-            seen_in_part(patch, seen)
-            found = fit(SHOWN, CAMERA, MODEL, HERE)
-        refused += found is None
-        if found is not None:
-            np.linalg.cholesky(found.covariance)
-            assert np.linalg.norm(error(found, HERE)[:3]) < 0.2
-    assert 10 < refused < 140

@@ -12,85 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Projected edges against differences, and found ones against analytic profiles."""
+"""Edges that are found, against analytic profiles."""
 
 from __future__ import annotations
 
 import math
 
-from marker_images import DICTIONARY, facing, make_camera, SIDE
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array
 from flock_follower.perception import edges
-from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
-from flock_follower.perception.edge_fit import moved
 from flock_follower.perception.edges import Found, Lines, SPACING
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker
-from flock_follower.perception.print_model import edge_model, EdgeModel
-
-PINHOLE = CameraModel(np.array([[610.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]),
-                      np.zeros(5), 'plumb_bob', 640, 480)
-LEADER = MarkedNeighbor('leader', (
-    Marker(0, SIDE, Transform()),
-    Marker(1, SIDE / 2, Transform(rotation_vector_to_matrix([0.2, 0.5, 0.0]),
-                                  np.array([0.16, 0.05, 0.02])))))
-MODEL = edge_model(LEADER, DICTIONARY)
-POSE = facing((0.25, -0.15, 1.2), (0.3, -0.4, 0.6))  # T_camera_body
-CAMERAS = {'pinhole': PINHOLE, **{model: make_camera(model) for model in DISTORTION_MODELS}}
-
-
-def projected(camera: CameraModel, pose: Transform = POSE, model: EdgeModel = MODEL) -> Lines:
-    lines = edges.project(camera, model, pose)
-    assert lines is not None
-    return lines
-
-
-def rows_dot(a: Array, b: Array) -> Array:
-    products: Array = (a * b).sum(axis=1)
-    return products
-
-
-@pytest.mark.parametrize('lens', CAMERAS)
-def test_the_design_is_what_steps_and_turns_about_the_middle_do(lens: str) -> None:
-    camera, lines = CAMERAS[lens], projected(CAMERAS[lens])
-    for column in range(6):
-        step = np.zeros(6)
-        step[column] = 1e-5
-        ahead, behind = (camera.project(moved(POSE, lines.center, sign * step).apply(
-            MODEL.places[:len(MODEL)])) for sign in (1.0, -1.0))
-        numeric = rows_dot(lines.normals, ahead - behind) / 2e-5
-        exact = lens == 'pinhole'
-        scale = np.abs(numeric).max()
-        np.testing.assert_allclose(lines.design[:, column], numeric,
-                                   atol=(1e-5 if exact else 0.05) * scale)
-
-
-@pytest.mark.parametrize('place', [
-    (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (np.nan, 0.0, 1.0),
-    (0.0, 0.0, np.inf), (1e300, 0.0, 1.0)])
-def test_what_no_lens_sees_is_none(place: tuple[float, float, float]) -> None:
-    pose = Transform(POSE.rotation, np.array(place))
-    with np.errstate(all='raise'):
-        assert edges.project(make_camera(), MODEL, pose) is None
-        edges.facing(MODEL, pose)
-
-
-def test_markers_turned_away_are_not_facing() -> None:
-    quarter = rotation_vector_to_matrix([0.0, np.pi / 2, 0.0])
-    neighbor = MarkedNeighbor('leader', (Marker(0, SIDE, Transform()),
-                                   Marker(1, SIDE, Transform(quarter, np.zeros(3))),
-                                   Marker(2, SIDE, Transform(quarter @ quarter, np.zeros(3)))))
-    model = edge_model(neighbor, DICTIONARY)
-    for degrees, expected in ((0.0, [1, 0, 0]), (45.0, [1, 0, 0]), (-45.0, [1, 1, 0]),
-                              (-78.0, [1, 1, 0]), (-83.0, [0, 1, 0]), (180.0, [0, 0, 1])):
-        pose = facing((0.0, 0.0, 2.0), (0.0, -math.radians(degrees), 0.0))
-        shown = [normal @ [0.0, 0.0, -1.0] > math.cos(math.radians(80.0))
-                 for normal in (pose.rotation @ model.facings.T).T]
-        assert edges.facing(model, pose).tolist() == shown == [bool(k) for k in expected]
-
+from flock_follower.perception.print_model import EdgeModel
 
 # Profiles known exactly: stripes whose brightness changes in one direction only.
 
@@ -145,15 +80,6 @@ def test_an_edge_is_found_to_hundredths_of_a_pixel(sigma: float, rms: float) -> 
         assert abs(np.mean(errors)) < 0.002
         total = math.hypot(sigma, 2.0 * spacing)  # of the kernel, 2 samples
         assert np.sqrt(np.median(found.variance)) == pytest.approx(total, rel=0.2)
-
-
-def test_an_edge_out_of_reach_or_of_the_wrong_direction_is_none() -> None:
-    image = stripes(0.0, [0.0], 0.8)
-    near, far = (line_across(0.0, np.full(20, offset), (99.0, 99.0)) for offset in (1.1, 3.0))
-    assert edges.find(image, near, (0.4, 0.4)) is not None
-    assert edges.find(image, far, (0.4, 0.4)) is None
-    assert edges.find(image, far, (1.2, 1.2)) is not None
-    assert edges.find(255 - image, near, (0.4, 0.4)) is None
 
 
 @pytest.mark.parametrize('sigma', [0.8, 1.2])

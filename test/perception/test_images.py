@@ -160,22 +160,6 @@ def test_whatever_a_message_claims_is_an_image_of_that_size_or_a_value_error(
         assert gray.shape == (height, width) and gray.dtype == np.uint8
 
 
-@pytest.mark.parametrize('missing', [2, 300, 0.5])
-def test_a_jpeg_cut_short_is_refused_whole(missing: float) -> None:
-    # Not given back with its last rows as some image before left them in memory.
-    smooth = cv2.GaussianBlur(np.kron(GRAY, np.ones((16, 16), dtype=np.uint8)), (0, 0), 4.0)
-    payload = cv2.imencode('.jpg', smooth)[1].tobytes()
-    cut = round(missing if missing > 1 else missing * len(payload))
-    # A thumbnail in the header ends as the image would.
-    thumbnail = cv2.imencode('.jpg', smooth[::16, ::16])[1].tobytes()
-    tagged = (payload[:2] + b'\xff\xe1' + (len(thumbnail) + 2).to_bytes(2, 'big') + thumbnail
-              + payload[2:])
-    for whole in (payload, tagged):
-        assert decode_compressed(whole + b'\0\0').shape == smooth.shape  # cameras may pad
-        with pytest.raises(ValueError, match='a JPEG without its end'):
-            decode_compressed(whole[:-cut])
-
-
 def test_hot_pixels_do_not_darken_a_twelve_bit_image() -> None:
     pixels = np.full((60, 80), 4000, dtype='<u2')
     pixels[3, 4] = 65535

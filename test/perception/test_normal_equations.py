@@ -16,8 +16,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 
@@ -64,17 +62,3 @@ def test_what_is_nearly_dependent_is_refused_before_its_variances_are_rounding()
             np.linalg.cholesky(inverse)
 
 
-INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
-
-
-@pytest.mark.parametrize('matrix', [
-    np.zeros((6, 6)), INDEFINITE, -np.eye(6), np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]),
-    np.full((6, 6), np.nan), np.diag([1.0, 1.0, np.inf, 1.0, 1.0, 1.0]), np.ones((6, 6)),
-    np.eye(6) + 2.0 * (np.eye(6)[[1, 0, 2, 3, 4, 5]] - np.eye(6))],
-    ids=['zeros', 'indefinite', 'negative', 'one open', 'nan', 'inf', 'ones', 'saddle'])
-def test_equations_that_are_not_definite_are_refused(matrix: Array) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        assert normal_covariance(matrix) is None
-    if np.isfinite(matrix).all():
-        assert solve_normal(matrix, np.ones(6)) is None

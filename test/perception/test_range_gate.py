@@ -19,32 +19,35 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_follower.perception.range_gate import RANGE_GATE, RANGE_WILD, RangeGate
-from flock_follower.perception.range_tracking import RangeBias, UNKNOWN_BIAS
-
-ONE = np.ones(1)
+from flock_follower.perception.range_gate import (
+    RANGE_GATE,
+    RANGE_WILD,
+    RangeBias,
+    RangeGate,
+    UNKNOWN_BIAS,
+)
 
 
 def judged(gate: RangeGate, *deviations: float) -> list[bool]:
-    return [bool(gate.judge(d * ONE, ONE).used[0]) for d in deviations]
+    return [gate.judge(d, 1.0).used for d in deviations]
 
 
 def test_one_too_long_is_refused_until_several_in_a_row_are() -> None:
     gate = RangeGate(most=4)
     assert judged(gate, 5.0, 5.0, 0.0, 5.0, 5.0, 5.0) == [False, False, True, False, False, False]
-    verdict = gate.judge(5.0 * ONE, ONE)
-    assert verdict.used[0]
-    assert verdict.prior[0] == pytest.approx(25.0 / RANGE_GATE)  # the prediction was wrong
-    assert verdict.spread[0] == 1.0
+    verdict = gate.judge(5.0, 1.0)
+    assert verdict.used
+    assert verdict.prior == pytest.approx(25.0 / RANGE_GATE)  # the prediction was wrong
+    assert verdict.spread == 1.0
     assert judged(gate, 5.0, 0.0, 5.0) == [True, True, False]
 
 
 def test_one_too_short_is_used_with_care_and_the_next_is_believed() -> None:
     gate = RangeGate()
-    first, second = gate.judge(-5.0 * ONE, ONE), gate.judge(-5.0 * ONE, ONE)
-    assert first.used[0] and second.used[0]
-    assert first.prior[0] == second.spread[0] == 1.0
-    assert first.spread[0] == second.prior[0] == pytest.approx(25.0 / RANGE_GATE)
+    first, second = gate.judge(-5.0, 1.0), gate.judge(-5.0, 1.0)
+    assert first.used and second.used
+    assert first.prior == second.spread == 1.0
+    assert first.spread == second.prior == pytest.approx(25.0 / RANGE_GATE)
 
 
 def test_what_is_wildly_too_short_is_refused_at_first() -> None:
@@ -64,16 +67,16 @@ def learnt(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05
     bias, rng = RangeBias(), np.random.default_rng(seed)
     for k in range(round(20 * seconds)):
         detour = rng.uniform(0.0, 1.0) if rng.random() < outliers else 0.0
-        bias.learn(k / 20, np.array([true + rng.normal(0.0, 0.1) + detour]), np.array([0.01]))
+        bias.learn(k / 20, true + rng.normal(0.0, 0.1) + detour, 0.01)
     return bias
 
 
 @pytest.mark.parametrize('true', [-0.3, 0.1])
 def test_the_bias_is_found_through_noise_and_detours(true: float) -> None:
-    errors = np.array([float(learnt(seed, true).value[0]) - true for seed in range(20)])
+    errors = np.array([learnt(seed, true).value - true for seed in range(20)])
     assert np.abs(errors).max() < 0.05
     assert abs(errors.mean()) < 0.02  # detours do not pull it along
-    deviation = float(np.sqrt(learnt(0, true).variance(20.0)[0]))
+    deviation = float(np.sqrt(learnt(0, true).variance(20.0)))
     assert 0.005 < deviation < 0.03
     assert np.sqrt(np.mean(errors ** 2)) < 1.7 * deviation
 
@@ -81,13 +84,13 @@ def test_the_bias_is_found_through_noise_and_detours(true: float) -> None:
 def test_a_bias_that_jumps_is_followed() -> None:
     bias, rng = learnt(3, 0.0), np.random.default_rng(4)
     for k in range(200):
-        bias.learn(20.0 + k / 20, np.array([0.6 + rng.normal(0.0, 0.1)]), np.array([0.01]))
-    assert bias.value[0] == pytest.approx(0.6, abs=0.05)
+        bias.learn(20.0 + k / 20, 0.6 + rng.normal(0.0, 0.1), 0.01)
+    assert bias.value == pytest.approx(0.6, abs=0.05)
 
 
 def test_the_bias_becomes_uncertain_where_nothing_is_learnt_and_never_more_than_unknown() -> None:
     bias = learnt(5, 0.1)
-    variances = [float(bias.variance(20.0 + t)[0]) for t in (0.0, 5.0, 60.0, 1e6)]
+    variances = [bias.variance(20.0 + t) for t in (0.0, 5.0, 60.0, 1e6)]
     assert variances == sorted(variances)
     assert variances[-1] == UNKNOWN_BIAS ** 2
-    assert float(RangeBias().variance(3.0)[0]) == UNKNOWN_BIAS ** 2
+    assert RangeBias().variance(3.0) == UNKNOWN_BIAS ** 2

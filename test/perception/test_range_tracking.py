@@ -94,7 +94,7 @@ def test_in_sight_nothing_is_told_the_bias_is_learnt_and_the_filter_untouched() 
     rng = np.random.default_rng(0)
     assert with_ranges.found == []
     bias = with_ranges.ranging.biases['leader']
-    assert bias.value[0] == pytest.approx(0.25, abs=0.06)
+    assert bias.value == pytest.approx(0.25, abs=0.06)
     assert without.newest is None and rng is not None
 
 

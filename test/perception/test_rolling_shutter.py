@@ -31,8 +31,8 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception.camera_schedule import straightened
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.look import straightened
 from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import target, track

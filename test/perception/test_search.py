@@ -57,7 +57,7 @@ def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,
     pixel = max(610.0 * SIDE / distance / search.SIDE, 1.0)  # of the image that was searched
     assert np.abs(errors).max() < (1.5 * pixel if thorough else pixel)
     # A half pixel lost in scaling would be half of those, less half a pixel.
-    assert np.abs(errors.mean(axis=0)).max() < 0.15 + 0.2 * pixel
+    assert np.abs(errors.mean(axis=0)).max() < 0.15 + (0.3 if thorough else 0.2) * pixel
 
 
 @pytest.mark.parametrize('thorough', [False, True])
@@ -96,7 +96,7 @@ def test_at_the_rim_of_the_image_what_is_left_of_the_region_is_searched(
                      (0.0, 0.1, 0.0))
     found = search.near(render(CAMERA, {3: inside}), CAMERA, DICTIONARY, LEADER, outside, True)
     assert found.ids.tolist() == [3]
-    assert np.abs(found.corners[0] - corners_of(CAMERA, inside)).max() < 1.5
+    assert np.abs(found.corners[0] - corners_of(CAMERA, inside)).max() < 2.0
 
 
 #: Where the middle of the light is: as far from the marker's, in side lengths.

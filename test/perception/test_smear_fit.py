@@ -19,8 +19,6 @@ from __future__ import annotations
 import math
 import warnings
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
 import numpy as np
 import pytest
@@ -123,20 +121,3 @@ def test_where_it_is_not_there_is_no_pose(image: GrayImage) -> None:
         assert fit_smeared(image, CAMERA, MODEL, body(HERE)) is None
 
 
-NUMBERS = st.floats(width=32)
-SHOWN = smeared(HERE, 1.0, 0.3)
-
-
-@settings(max_examples=150, deadline=None)
-@given(st.tuples(NUMBERS, NUMBERS, NUMBERS) | st.tuples(
-    st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.01, 6.0)),
-    st.tuples(*[st.floats(-4.0, 4.0)] * 3))
-def test_no_start_raises_or_warns(place: tuple[float, float, float],
-                                  turn: tuple[float, float, float]) -> None:
-    start = Transform(rotation_vector_to_matrix(turn) @ HERE.rotation, np.array(place))
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        found = fit_smeared(SHOWN, CAMERA, MODEL, start)
-    if found is not None:
-        np.linalg.cholesky(found.covariance)
-        assert np.linalg.norm(error(found, HERE)[:3]) < 0.1

@@ -23,7 +23,7 @@ from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, r
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import parse
@@ -253,43 +253,3 @@ def test_clutter_where_the_marker_was_a_moment_ago_is_never_taken_for_it(
             false_locks.append((k, kind, sighting.stage))
     assert false_locks == []
     assert seen == count  # so each time it was expected there
-
-
-@pytest.fixture
-def expecting(marker_image: GrayImage) -> Follower:
-    """Return a follower that has tracked the marker for a while."""
-    follower = Follower()
-    for _ in range(5):
-        assert 'leader' in follower.see(marker_image).estimates
-    return follower
-
-
-def test_any_other_marker_of_the_dictionary_in_its_place_is_not_taken_for_it(
-        expecting: Follower, marker_image: GrayImage) -> None:
-    false_locks = []
-    for marker_id in range(1, 50, 3):
-        other = render(CAMERA, {marker_id: HERE}, rays=3, seed=marker_id)
-        false_locks += [marker_id for _ in range(2) if expecting.see(other).estimates]
-        assert 'leader' in expecting.see(marker_image).estimates
-    assert false_locks == []
-
-
-def test_its_mirror_image_in_its_place_is_not_taken_for_it(expecting: Follower) -> None:
-    for code in (marker_code(0)[:, ::-1], marker_code(0)[::-1], marker_code(0).T):
-        mirrored = render(CAMERA, {0: HERE}, codes={0: code})
-        for _ in range(3):
-            assert expecting.see(mirrored).estimates == {}
-
-
-@pytest.mark.parametrize('quarters', [1, 2])
-def test_the_marker_itself_turned_by_quarters_is_never_measured_as_upright(
-        expecting: Follower, quarters: int) -> None:
-    turned = render(CAMERA, {0: HERE}, codes={0: np.rot90(marker_code(0), quarters)})
-    roll = Transform(np.linalg.matrix_power(np.array(
-        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters))
-    true_rotation = (HERE @ roll @ T_BODY_MARKER.inverse()).rotation
-    for _ in range(3):
-        for measurement in expecting.see(turned).measurements.values():
-            off = matrix_to_rotation_vector(
-                measurement.T_camera_body.rotation @ true_rotation.T)
-            assert np.linalg.norm(off) < 0.3

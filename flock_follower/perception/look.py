@@ -1,0 +1,219 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One image on its way through perception: what is expected in it, and what was found.
+
+``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
+shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour
+counts as seen when the row of its markers' middle was exposed. The rows above and below see it
+earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
+where they were with the middle row, by the relative motion, which comes mostly from the own rates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import marker_corners, refine
+from flock_follower.perception.markers import MarkedNeighbor, Marker
+from flock_follower.perception.measurement import Measurement, PosePrior
+from flock_follower.perception.neighbor_motion import Estimate, POSITION, VELOCITY
+from flock_follower.perception.time_offset import MountedCamera
+
+_VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
+
+
+class View(NamedTuple):
+    """
+    The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
+
+    ``delay`` is how long after the image's stamp that was by the camera's clock, s.
+    """
+
+    own: OdometrySample
+    rotation: Array
+    """Rotation of the body, to odom, (3, 3)."""
+    T_smooth_camera: Transform
+    delay: float = 0.0
+
+    @classmethod
+    def of(cls, own: OdometrySample, T_body_camera: Transform, delay: float) -> View:
+        """Return the view of a camera mounted at ``T_body_camera``."""
+        body = own.smooth_pose
+        return cls(own, body.rotation, body @ T_body_camera, delay)
+
+    @property
+    def turning(self) -> Array:
+        """Return the own angular velocity (3,), rad/s, in odom."""
+        turning: Array = self.rotation.dot(self.own.angular_velocity)
+        return turning
+
+    def prior(self, estimate: Estimate | None) -> PosePrior:
+        """Return the expected pose of a neighbour, given its estimate or None."""
+        pose = None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
+        return PosePrior(pose, self.T_smooth_camera.rotation[2])
+
+    def moving(self, sight: Array) -> Array:
+        """Return the change of the measured state, (15,), per s of offset, for a sight (3,), m."""
+        (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
+        a, b, c = self.own.velocity.tolist()
+        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
+        return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
+                         u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def passing(self, T_camera_body: Transform, reference: Array,
+                estimate: Estimate | None) -> tuple[Array, Array]:
+        """
+        Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
+
+        :param reference: the point (3,) on the body; :param estimate: its state, if known: else
+            it is taken to fly along.
+        """
+        to_camera = self.T_smooth_camera.rotation.T
+        own_rates = to_camera.dot(self.turning)
+        lever = self.T_smooth_camera.translation - self.own.travel
+        velocity = -np.cross(own_rates, T_camera_body.apply(reference))
+        if estimate is not None:
+            camera = self.own.velocity + np.cross(self.turning, lever)
+            velocity = velocity + to_camera.dot(estimate.velocity - camera)
+        return velocity, -own_rates
+
+
+def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: float,
+             velocity: float) -> Estimate:
+    """
+    Return a state of the filter at a stamp, s, in odom, with the noise of the own state.
+
+    :param attitude: variance of the white noise of the own attitude, rad^2, and
+        :param velocity: of the own velocity, (m/s)^2, per axis: the filter averages over both.
+    """
+    x, y, z = (estimate.position - own.travel).tolist()
+    covariance = estimate.covariance.copy()
+    covariance[POSITION, POSITION] += attitude * np.array(
+        [[y * y + z * z, -x * y, -x * z], [-x * y, x * x + z * z, -y * z],
+         [-x * z, -y * z, x * x + y * y]])
+    covariance[_VELOCITIES, _VELOCITIES] += velocity
+    return estimate._replace(stamp=stamp, position=estimate.position + own.correction,
+                             covariance=covariance)
+
+
+def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeighbor,
+                 T_camera_body: Transform, reference: Array, velocity: Array,
+                 rates: Array) -> Transform:
+    """
+    Return the pose of a neighbour at the time of one row, from the pose fitted to all of them.
+
+    :param reference: the point (3,) on its body whose row that is, m.
+    :param velocity: of that point seen from the camera, m/s, and :param rates: rad/s, at which the
+        body turns there: (3,) along the camera's axes.
+    """
+    points = np.concatenate([
+        marker.T_body_marker.apply(marker_corners(marker.side_length))
+        for marker in neighbor.markers
+        if _faces(T_camera_body @ marker.T_body_marker)] or [np.zeros((0, 3))])
+    if not len(points):
+        return T_camera_body
+    seen = T_camera_body.apply(points)
+    middle = T_camera_body.apply(reference)
+    rows = camera.project(np.concatenate([seen, middle[None]]))[:, 1]
+    later = readout_time / camera.height * (rows[:-1] - rows[-1])
+    moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
+    found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
+    return T_camera_body if found is None else found[0]
+
+
+def _faces(T_camera_marker: Transform) -> bool:
+    normal = T_camera_marker.rotation[:, 2]
+    return float(normal.dot(T_camera_marker.translation)) < 0.0
+
+
+class Sought(NamedTuple):
+    """Names: who may be ``near`` the expected place, and ``anywhere`` in the image."""
+
+    near: Sequence[str]
+    anywhere: Sequence[str]
+    number: int
+    """Number of neighbours to search for."""
+
+
+@dataclass
+class Sighting:
+    """
+    The result of one image.
+
+    ``estimates`` and ``measurements`` by neighbour's name, of the neighbours measured in this
+    image; ``stage`` is the costliest stage of detection that was used, 'none' if the image could
+    not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
+    for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
+    by names made of the neighbours', are the states of candidates measured in this image that
+    carry a neighbour's marker and are not its primary track.
+    """
+
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    measurements: dict[str, Measurement] = field(default_factory=dict)
+    stage: str = 'none'
+    rejections: list[tuple[str, str]] = field(default_factory=list)
+    other_ids: list[int] = field(default_factory=list)
+    duplicates: dict[str, Estimate] = field(default_factory=dict)
+
+    @property
+    def stages(self) -> dict[str, str]:
+        """Return how each neighbour measured was found: 'track', 'roi' or 'full'."""
+        return {name: measured.stage for name, measured in self.measurements.items()}
+
+
+@dataclass
+class Look:
+    """
+    An image of a camera: the neighbours expected, those to search for, and those measured.
+
+    ``views`` by the delay of the exposure after the stamp, s; ``expected`` and ``measured`` by
+    neighbour; ``others`` are measurements of candidates, not of the primary track.
+    """
+
+    stamp: float
+    camera: MountedCamera
+    model: CameraModel
+    sought: Sought
+    views: dict[float, View] = field(default_factory=dict)
+    expected: dict[str, PosePrior] = field(default_factory=dict)
+    measured: dict[str, Measurement] = field(default_factory=dict)
+    others: list[Measurement] = field(default_factory=list)
+    sighting: Sighting = field(default_factory=Sighting)
+
+    def known(self, measurement: Measurement, side: float) -> bool:
+        """Return whether a body was measured before at the same place, to within ``side``, m."""
+        place = measurement.T_camera_body.translation
+        return any(math.dist(each.T_camera_body.translation, place) < side
+                   for each in self._of(measurement.name))
+
+    def shown(self, corners: Array, name: str, marker: Marker) -> bool:
+        """Return whether corners (4, 2), px, are of a marker that was measured before."""
+        size = 0.5 * float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)))
+        middles = [self.model.project((each.T_camera_body @ marker.T_body_marker)
+                                      .translation[None])[0] for each in self._of(name)]
+        return any(math.dist(middle, corners.mean(axis=0)) < size for middle in middles)
+
+    def _of(self, name: str) -> list[Measurement]:
+        """Return the measurements of a neighbour and of its candidates."""
+        return [each for each in (*self.measured.values(), *self.others) if each.name == name]
