@@ -42,8 +42,8 @@ from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
-from flock_desk.flocks.starts import random_start
-from flock_desk.runs.console import aligned, guarded, Progress
+from flock_desk.flocks.paper import random_start
+from flock_desk.runs.console import aligned, guarded, parsed, Progress
 from flock_desk.runs.record import last_flight, read_flown
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.bag import BagError, failures
@@ -63,9 +63,34 @@ FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 
 
+_OPTIONS = {
+    '--out': {'type': Path, 'default': Path('build/figures'), 'help': '%(default)s'},
+    '--flights': {'type': Path, 'default': Path('build/fly'), 'metavar': 'FOLDER',
+                  'help': 'folder of the flights of fly; %(default)s'},
+    '--campaign': {'type': Path, 'default': Path('build/flights/flights.json'), 'metavar': 'FILE',
+                   'help': 'results of flights; %(default)s'}}
+_FLOCK = {
+    '--agents': {'type': int, 'metavar': 'N', 'help': 'how many, instead of the paper'},
+    '--dim': {'type': int, 'choices': (2, 3), 'default': 2, 'help': '%(default)s'},
+    '--seed': {'type': int, 'default': 1, 'help': 'of the start; %(default)s'},
+    '--model': {'choices': tuple(MODELS), 'default': 'flocking', 'help': '%(default)s'},
+    '--band': {'choices': ('paper', 'flight'), 'default': 'flight',
+               'help': '1 to 2.25 or 1 to 8 m^2; %(default)s'},
+    '--neighbors': {'choices': ('all', 'graph', 'nearest'),
+                    'help': 'graph for the flocking law, all for the other models'},
+    '--coupling': {'choices': ('flock', 'pair'), 'default': 'flock',
+                   'help': 'whose disagreement scales the forces; %(default)s'},
+    '--duration': {'type': float, 'default': 20.0, 'help': 's; %(default)s'},
+    '--dt': {'type': float, 'default': 0.005, 'help': 's; %(default)s'},
+    '--method': {'choices': ('auto', 'whole', 'blocked'), 'default': 'auto',
+                 'help': 'of the sum over all pairs; %(default)s'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Draw the figures and return the exit code."""
-    return guarded(partial(_draw, _parser().parse_args(args)))
+    parser = argparse.ArgumentParser(
+        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
+    return guarded(partial(_draw, parsed(parser, args, _OPTIONS, {'one larger flock': _FLOCK})))
 
 
 def _draw(options: argparse.Namespace) -> int:
@@ -238,32 +263,6 @@ def _text(value: float, digits: int) -> str:
     """Return a number as text; empty for NaN, and never a negative zero."""
     zero = '0.' + '0' * digits
     return '' if np.isnan(value) else f'{value:.{digits}f}'.replace(f'-{zero}', zero)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
-    parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
-    parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
-                        help='folder of the flights of fly; %(default)s')
-    parser.add_argument('--campaign', type=Path, default=Path('build/flights/flights.json'),
-                        metavar='FILE', help='results of flights; %(default)s')
-    flock = parser.add_argument_group('one larger flock')
-    flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
-    flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')
-    flock.add_argument('--seed', type=int, default=1, help='of the start; %(default)s')
-    flock.add_argument('--model', choices=tuple(MODELS), default='flocking', help='%(default)s')
-    flock.add_argument('--band', choices=('paper', 'flight'), default='flight',
-                       help='1 to 2.25 or 1 to 8 m^2; %(default)s')
-    flock.add_argument('--neighbors', choices=('all', 'graph', 'nearest'),
-                       help='graph for the flocking law, all for the other models')
-    flock.add_argument('--coupling', choices=('flock', 'pair'), default='flock',
-                       help='whose disagreement scales the forces; %(default)s')
-    flock.add_argument('--duration', type=float, default=20.0, help='s; %(default)s')
-    flock.add_argument('--dt', type=float, default=0.005, help='s; %(default)s')
-    flock.add_argument('--method', choices=('auto', 'whole', 'blocked'), default='auto',
-                       help='of the sum over all pairs; %(default)s')
-    return parser
 
 
 if __name__ == '__main__':

@@ -48,19 +48,19 @@ from flock_desk.closed_loop.flight_metrics import (
     of_runs,
     summary,
 )
-from flock_desk.runs.cluster import mapped
-from flock_desk.runs.console import aligned, guarded, Progress
-from flock_desk.scenarios.key_tables import markdown
+from flock_desk.runs.console import aligned, guarded, parsed, Progress
+from flock_desk.runs.processes import mapped
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
+    key_tables,
     load,
     names,
     ScenarioError,
     with_flock,
 )
+from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
@@ -109,17 +109,37 @@ class Flown(NamedTuple):
     """Which runs left the band, when and why, one line each."""
 
 
+_OPTIONS = {
+    '--scenario': {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
+                   'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is '
+                   'the default'},
+    '--controllers': {'nargs': '+', 'choices': CONTROLLERS, 'default': list(CONTROLLERS),
+                      'metavar': 'NAME', 'help': f'{", ".join(CONTROLLERS)}; a flock flies '
+                      f'{" and ".join(IN_FLOCKS)} only (all)'},
+    '--keys': {'action': 'store_true',
+               'help': 'print every key of a scenario file with its default and range'},
+    '--flock': {'nargs': '+', 'default': [], 'metavar': 'KEY=VALUE',
+                'help': "other values for the scenarios' flock: followers=12 words=false "
+                "'fails={follower: 2, at: 20}'"},
+    '--runs': {'type': int, 'default': 200, 'help': 'of each (%(default)s)'},
+    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
+               'help': 'processes (one per processor)'},
+    '--scheduler': {'default': '', 'metavar': 'ADDRESS',
+                    'help': 'of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead of '
+                    '--jobs processes here; it has the same results'},
+    '--seed': {'type': int, 'default': 0, 'help': '%(default)s'},
+    '--output': {'type': Path, 'default': Path('build/flights'), 'metavar': 'FOLDER',
+                 'help': '%(default)s'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
-    parser = _parser()
-    options = parser.parse_args(args)
-    try:
-        for name, valid in (('runs', _COUNTS), ('jobs', _COUNTS), ('seed', _SEEDS)):
-            valid.check(f'--{name}', getattr(options, name))
-    except ValueError as error:
-        parser.error(str(error))
+    parser = argparse.ArgumentParser(
+        prog='flights', description='Fly scenarios many times, with several controllers.')
+    options = parsed(parser, args, _OPTIONS,
+                     valid={'runs': _COUNTS, 'jobs': _COUNTS, 'seed': _SEEDS})
     if options.keys:
-        print(markdown())
+        print(key_tables())
         return 0
     return guarded(partial(_campaign, options))
 
@@ -258,33 +278,6 @@ def _fly(task: Task) -> Flown:
         which = f'follower {follower + 1} ' if many > 1 else ''
         exits.append(f'run {task.runs[run]}: {which}{left}')
     return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), cpu, exits)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='flights', description='Fly scenarios many times, with several controllers.')
-    parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
-                        help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
-                        'the default')
-    parser.add_argument('--controllers', nargs='+', choices=CONTROLLERS,
-                        default=list(CONTROLLERS), metavar='NAME',
-                        help=f'{", ".join(CONTROLLERS)}; a flock flies {" and ".join(IN_FLOCKS)} '
-                        'only (all)')
-    parser.add_argument('--keys', action='store_true',
-                        help='print every key of a scenario file with its default and range')
-    parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
-                        help="other values for the scenarios' flock: followers=12 words=false "
-                        "'fails={follower: 2, at: 20}'")
-    parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
-                        help='processes (one per processor)')
-    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
-                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead '
-                        'of --jobs processes here; it has the same results')
-    parser.add_argument('--seed', type=int, default=0, help='%(default)s')
-    parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
-                        help='%(default)s')
-    return parser
 
 
 if __name__ == '__main__':

@@ -38,71 +38,66 @@ import sys
 from typing import Any
 
 from flock_desk.runs.column import column_chapters, column_figures
-from flock_desk.runs.console import guarded
+from flock_desk.runs.console import guarded, parsed
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH
-from flock_desk.runs.judge import FigureBound, Judgement, nearest, scenario_bounds
+from flock_desk.runs.judge import FigureBound, nearest, scenario_bounds
 from flock_desk.runs.record import clear, LiveRecord, locked, PICTURE, read_flown, set_aside
 from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
+from flock_follower.files import whole_file
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 BUSY = 0.02  # of the images, not rendered in time: the machine was too slow
 
 
-def _options(args: Sequence[str] | None) -> argparse.Namespace:
-    """Return the checked options of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='fly', description='Fly a scenario on the desk, through the real nodes.',
-        epilog=f'scenarios: {", ".join(names())}')
-    parser.add_argument('--scenario', default='indoor', metavar='NAME',
-                        help='a name in config/scenarios, or the path of a file (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
-    parser.add_argument('--duration', type=float, default=0.0, metavar='S',
-                        help='fly no longer than this, s; never longer than the scenario (as '
-                        'long as it)')
-    parser.add_argument('--followers', type=int, default=1, metavar='N',
-                        help='in a column, each behind the one before it (%(default)s); every one '
-                        'takes about one core')
-    group = parser.add_argument_group('an autopilot that runs already, see docs/desk.md')
-    group.add_argument('--autopilot', default='', metavar='URL',
-                       help='where the bridge finds it: udp:HOST:PORT where it sends to, '
-                       'tcp:HOST:PORT where it listens')
-    group.add_argument('--truth', default='', metavar='URL',
-                       help='another link, on which it sends the true place '
-                       f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
-    group.add_argument('--leader-truth', default='', metavar='URL',
-                       help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
-                       "the leader (the scenario's own leader)")
-    group.add_argument('--forward-odometry', action='store_true',
-                       help='send it the odometry, for flight without GPS')
-    parser.add_argument('--output', type=Path, default=Path('build/fly'),
-                        help='folder for report and logs (%(default)s)')
-    parser.add_argument('--moving', type=Path, metavar='FILE',
-                        help='also write a moving picture of the flight, an animated WebP')
-    options = parser.parse_args(args)
-    try:
-        SEEDS.check('--seed', options.seed)
-        DURATIONS.check('--duration', options.duration)
-        FOLLOWERS.check('--followers', options.followers)
-    except ValueError as error:
-        parser.error(str(error))
-    if not options.autopilot and (
-            options.truth or options.leader_truth or options.forward_odometry):
-        parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
-    if options.autopilot and options.followers > 1:
-        parser.error('--followers: not with --autopilot')
-    if options.moving and options.followers > 1:
-        parser.error('--moving: not with --followers')
-    return options
+_OPTIONS = {
+    '--scenario': {'default': 'indoor', 'metavar': 'NAME',
+                   'help': 'a name in config/scenarios, or the path of a file (%(default)s)'},
+    '--seed': {'type': int, 'default': 0, 'help': 'of everything that chance decides'},
+    '--duration': {'type': float, 'default': 0.0, 'metavar': 'S',
+                   'help': 'fly no longer than this, s; never longer than the scenario (as '
+                   'long as it)'},
+    '--followers': {'type': int, 'default': 1, 'metavar': 'N',
+                    'help': 'in a column, each behind the one before it (%(default)s); every one '
+                    'takes about one core'},
+    '--output': {'type': Path, 'default': Path('build/fly'),
+                 'help': 'folder for report and logs (%(default)s)'},
+    '--moving': {'type': Path, 'metavar': 'FILE',
+                 'help': 'also write a moving picture of the flight, an animated WebP'}}
+_EXTERNAL = {
+    '--autopilot': {'default': '', 'metavar': 'URL',
+                    'help': 'where the bridge finds it: udp:HOST:PORT where it sends to, '
+                    'tcp:HOST:PORT where it listens'},
+    '--truth': {'default': '', 'metavar': 'URL',
+                'help': 'another link, on which it sends the true place '
+                f'(udp: {SIH_TRUTH}; tcp: its port + 2)'},
+    '--leader-truth': {'default': '', 'metavar': 'URL',
+                       'help': "likewise of a second autopilot, MAVLink system 2, whose vehicle "
+                       "is the leader (the scenario's own leader)"},
+    '--forward-odometry': {'action': 'store_true',
+                           'help': 'send it the odometry, for flight without GPS'}}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, and return the exit code."""
-    options = _options(args)
+    parser = argparse.ArgumentParser(
+        prog='fly', description='Fly a scenario on the desk, through the real nodes.',
+        epilog=f'scenarios: {", ".join(names())}')
+    options = parsed(
+        parser, args, _OPTIONS, {'an autopilot that runs already, see docs/desk.md': _EXTERNAL},
+        {'seed': SEEDS, 'duration': DURATIONS, 'followers': FOLLOWERS})
+    column = options.followers > 1
+    for wrong, fault in (
+            (not options.autopilot and (
+                options.truth or options.leader_truth or options.forward_odometry),
+             '--truth, --leader-truth and --forward-odometry: only with --autopilot'),
+            (options.autopilot and column, '--followers: not with --autopilot'),
+            (options.moving and column, '--moving: not with --followers')):
+        if wrong:
+            parser.error(fault)
     return guarded(partial(_fly, options),
                    hint=f'; the logs of every process are in {options.output}')
 
@@ -123,7 +118,7 @@ def _fly(options: argparse.Namespace) -> int:
                                 options.output, external, options.followers)
         code = conclude(scenario, options.output, options.followers, cores, exit_codes)
         if options.moving:
-            from flock_desk.runs.moving import moving_picture
+            from flock_desk.runs.fly_pictures import moving_picture
             with whole_file(options.moving) as file:
                 file.write(moving_picture(read_flown(scenario, options.output)))
         return code
@@ -135,34 +130,35 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
     flights: dict[str, LiveRecord] = {}
     summaries: dict[str, dict[str, Any]] = {}
     limits: list[FigureBound] = []
-    judgements: list[Judgement] = []
+    title = f'flock_follower on the desk: {scenario.name}'
     for namespace in namespaces(followers):
-        folder, title = out / namespace, ' '.join(filter(None, [scenario.name, namespace]))
+        folder = out / namespace
         flight = flights[namespace] = read_flown(scenario, folder, namespace)
         summary = summaries[namespace] = scenario_figures(
             flight, own(cores, namespace), own(exit_codes, namespace))
         bounds = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in bounds]
         judgements = report(
-            folder, f'flock_follower on the desk: {title}', scenario.summary, summary, bounds,
+            folder, f'{title} {namespace}'.rstrip(), scenario.summary, summary, bounds,
             partial(_pictures, folder, flight), warnings=cautions(summary))
-    print()
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         judgements = report(
-            out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
-            scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
+            out, f'{title}, a column of {followers}', scenario.summary, summary,
+            [nearest(scenario, 'nearest_m'), *limits],
             partial(column_chapters, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
+    print()
     code = announce(summary, judgements, pages, out)
-    for warning in (warning for each in summaries.values() for warning in cautions(each)):
-        print(f'warning: {warning}', file=sys.stderr)
+    for each in summaries.values():
+        for warning in cautions(each):
+            print(f'warning: {warning}', file=sys.stderr)
     return code
 
 
 def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import portrait, scenario_chapters
+    from flock_desk.runs.fly_pictures import portrait, scenario_chapters
     with whole_file(folder / PICTURE) as file:
         file.write(portrait(flight))
     return scenario_chapters(flight)

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.runs.console import guarded, Progress
+from flock_desk.runs.console import guarded, parsed, Progress
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
@@ -51,6 +51,7 @@ from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import odometry as odometry_message
+from flock_follower.ranges import Range
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
@@ -272,23 +273,24 @@ def _seconds(stamp_ns: int) -> float:
     return (stamp_ns - START_NS) * 1e-9
 
 
+_OPTIONS = {
+    '--variant': {'nargs': '+', 'choices': [*VARIANTS, 'all'], 'default': ['sample'],
+                  'metavar': 'NAME', 'help': f'which: {", ".join(VARIANTS)} or all '
+                  '(default: sample)'},
+    '--out': {'type': Path, 'help': 'folder that will hold the bags (default: bags '
+              'for sample, build/bags for the others)'},
+    '--seed': {'type': int, 'default': 1, 'help': 'of all that is random (default: 1)'},
+    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
+               'help': 'processes that render (default: one per processor)'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 1 after an error."""
     repository = Path(__file__).resolve().parents[2]
-    parser = argparse.ArgumentParser(
+    options = parsed(argparse.ArgumentParser(
         prog='sample', description='Render a flight and write it as a bag.',
-        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items()))
-    parser.add_argument('--variant', nargs='+', choices=[*VARIANTS, 'all'], default=['sample'],
-                        metavar='NAME', help=f'which: {", ".join(VARIANTS)} or all '
-                        '(default: sample)')
-    parser.add_argument('--out', type=Path, help='folder that will hold the bags (default: bags '
-                        'for sample, build/bags for the others)')
-    parser.add_argument('--seed', type=int, default=1, help='of all that is random (default: 1)')
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
-                        help='processes that render (default: one per processor)')
-    options = parser.parse_args(args)
-    if options.jobs < 1:
-        parser.error(f'--jobs = {options.jobs}: must be at least 1')
+        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items())),
+        args, _OPTIONS, valid={'jobs': Range(1, whole=True)})
 
     def render() -> int:
         for name in VARIANTS if 'all' in options.variant else options.variant:

@@ -59,7 +59,7 @@ from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs
 from flock_desk.vehicle_ahead import VehicleAhead
-from flock_follower.live_line import LiveLine
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN

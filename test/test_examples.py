@@ -41,13 +41,6 @@ def run(name: str, *arguments: object, folder: Path) -> subprocess.CompletedProc
         env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60.0)
 
 
-def test_they_are_short() -> None:
-    pages = sorted(EXAMPLES.glob('*.[py]*'))
-    assert [page.stem for page in pages] == [
-        'bag_in_ci', 'bag_in_ci', 'law_alone', 'own_node', 'scenario_report']
-    assert all(len(page.read_text().splitlines()) < 65 for page in pages)
-
-
 def test_the_law_alone_draws_a_flock_that_agrees(tmp_path: Path) -> None:
     ended = run('law_alone.py', folder=tmp_path)
     assert ended.returncode == 0, ended.stderr

@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 
 from flock_desk.camera.leader import Face, leader
 from flock_desk.camera.lens import Camera
+from flock_follower.files import resource
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.resources import resource
 
 Image = NDArray[np.float32]
 

@@ -36,7 +36,6 @@ from flock_follower.follower import Follower
 from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
 
@@ -122,7 +121,7 @@ class OperatedVehicle:
                             position + operation.height * UP)
             case 'offboard':
                 self.asked = True
-                follower.permit(time, OffboardRequested(now - 1e-3))
+                follower.permit(time, now - 1e-3)
                 # The bridge has to stream first, and to receive the mode by HEARTBEAT.
                 self._mode_asked = now + self._dialect.stream_before_offboard
             case 'engage':

@@ -27,8 +27,8 @@ from flock_desk.closed_loop.real_time_flight import RealTimeFlight, RenderedImag
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.flight_log import FlightLog
 from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_follower.files import whole_file
 from flock_follower.geometry import quaternion_to_matrix
-from flock_follower.whole_file import whole_file
 
 _ODOM: Final = ('odom_stamp', 'odom_position', 'odom_quaternion', 'odom_velocity')
 _IMAGE: Final = (

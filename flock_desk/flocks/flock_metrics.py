@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_desk.flocks.graph import Graph
+from flock_desk.flocks.laws import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
 from flock_follower.geometry import Array
 

@@ -53,7 +53,7 @@ def column_tracks(scenario: Scenario, flights: Mapping[str, LiveRecord]
         first['image_stamp'] - int(first['epoch_ns'])) * 1e-9, first['leader_position'])}
     for i, (name, log) in enumerate(logs.items()):
         tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + _at(
-            times, flights[name].velocity_times + float(log['began']), log['position'])
+            times, flights[name].speeds['follower'][0] + float(log['began']), log['position'])
     return times - began, tracks, {
         f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
         for a, b in combinations(tracks, 2)}
@@ -77,7 +77,7 @@ def column_figures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> dic
         'column_of': scenario.name, 'followers': len(flights),
         'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
         'speed_max_m_s': most(np.concatenate(
-            [np.linalg.norm(flight.velocities, axis=1) for flight in flights.values()]))})
+            [flight.speeds['follower'][1] for flight in flights.values()]))})
 
 
 def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> list[Chapter]:
@@ -88,10 +88,7 @@ def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> li
     times, tracks, distances = column_tracks(scenario, flights)
     figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
     above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
-    plots.draw_map(above, [
-        plots.Curve(name, colour, *track[:, :2].T)
-        for (name, track), colour in zip(tracks.items(), cycle(plots.COLOURS))],
-        'from above (● start, ■ end)')
+    plots.draw_map(above, tracks, 'from above (● start, ■ end)')
     law = next(iter(flights.values())).params.law
     apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=plots.LEADER, alpha=0.08, lw=0)
     for (name, distance), colour in zip(distances.items(), cycle(plots.COLOURS)):

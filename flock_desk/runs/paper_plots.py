@@ -40,9 +40,9 @@ import numpy as np
 from flock_desk.flocks.agents import Simulation
 from flock_desk.runs.plots import with_gaps
 from flock_desk.runs.record import LiveRecord
+from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
@@ -378,8 +378,7 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
     """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column
-            for who, places in (('leader', flight.leader), ('follower', flight.follower))
-            for name, column in zip('xy', places.T)}
+            for who, places in flight.paths.items() for name, column in zip('xy', places.T)}
     return with_gaps({**flight.table, **true})
 
 

@@ -12,12 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Child processes that are always stopped: Ctrl-C first, SIGKILL after a deadline."""
+"""
+Work in other processes: children that are always stopped, and tasks for a Dask cluster.
+
+Dask is an extra, ``pip install 'flock_follower[cluster]'``, imported only where it is asked for;
+its workers need this package in the same version, and the same files where tasks name some.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from functools import cache
 import os
@@ -30,9 +35,10 @@ import sys
 import threading
 import time
 from types import FrameType, TracebackType
+from typing import TypeVar
 
 from flock_follower.checks.system import dead_segments
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 #: A flight is not judged if its processes, ready to run, wait for a processor for more than this
 #: share of the time for which they wait or run, over so long, s.
@@ -41,7 +47,9 @@ BUSY_WINDOW = 8.0
 TOO_BUSY_EXIT_CODE = 3
 PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
-
+SCHEDULER_TIMEOUT = 10.0  # s to find the scheduler of a cluster
+Given = TypeVar('Given')
+Result = TypeVar('Result')
 
 #: Sockets whose names claim domains. Their names end with the process, however it ends.
 _CLAIMS: list[socket.socket] = []
@@ -302,3 +310,34 @@ class Processes:
         self.stop_all()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
+
+
+def mapped(address: str, function: Callable[[Given], Result],
+           tasks: Sequence[Given]) -> Iterator[Result]:
+    """
+    Yield what a function makes of each task, in their order, computed by a cluster's workers.
+
+    :param address: of its scheduler, such as ``tcp://192.168.1.5:8786``.
+    :raises RuntimeError: if Dask is not installed here.
+    :raises OSError: if no scheduler answers there, or it is lost.
+    """
+    try:
+        from distributed import CancelledError, Client
+    except ImportError as error:
+        raise RuntimeError("--scheduler needs Dask: pip install 'flock_follower[cluster]' "
+                           f'({error})') from None
+    try:
+        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f'--scheduler {address}: no scheduler answers there: {error}') from None
+    with client:
+        futures = client.map(function, tasks, pure=False)
+        try:
+            while futures:
+                result = futures[0].result()
+                del futures[0]  # the cluster may forget it
+                yield result
+        except CancelledError:
+            raise OSError(f'--scheduler {address}: the scheduler is lost') from None
+        finally:
+            client.cancel(futures)

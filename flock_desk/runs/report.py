@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
 from flock_desk.runs.summary import consistency, write_summary
-from flock_follower.whole_file import whole_file
+from flock_follower.files import whole_file
 
 #: The figures printed, beside all that have a bound; the others are in summary.json.
 SHOWN = (

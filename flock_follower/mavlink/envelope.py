@@ -131,9 +131,6 @@ class Location(NamedTuple):
     """(2,), m, horizontally from where it became ACTIVE; None before."""
 
 
-NOWHERE: Final[Location] = Location()
-
-
 def approach_speed(distance: float, deceleration: float) -> float:
     """
     Return the largest speed, m/s, towards a bound from which the vehicle still stops before it.

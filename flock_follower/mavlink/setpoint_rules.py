@@ -47,8 +47,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
-from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
-from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
+from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
@@ -215,14 +215,10 @@ class Held(NamedTuple):
     """m."""
 
 
-NOT_HELD: Final[Held] = Held()
-
-
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, armed: bool, airborne: bool = True,
-           withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
-           held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
-           wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
+           command_age: float, link_age: float, armed: bool, airborne: bool, withheld: str,
+           place: Location, unplaced: str, held: Held, relative: Relative, wind: ArrayLike,
+           offset: float) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 

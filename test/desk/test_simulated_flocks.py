@@ -27,8 +27,7 @@ from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.flight_metrics import measure, of_runs
 from flock_desk.closed_loop.flights_log import STATES
 from flock_desk.scenarios.flock import Flock, FollowerFailure
-from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Outage, RangeErrors, Scenario
+from flock_desk.scenarios.scenario import LeaderMotion, Outage, RangeErrors, Scenario
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.planner.modes import State
 

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_desk.flocks.graph import nearest, pairs_within
-from flock_desk.flocks.models import accelerations
+from flock_desk.flocks.laws import accelerations, nearest, pairs_within
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array

@@ -26,9 +26,15 @@ from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import approach_speed, GateLimits, Location
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.relative_flight import LONGEST_STEP, Reckoning, Relative
-from flock_follower.mavlink.setpoint_rules import COMMAND, decide, encode_setpoint, LEVEL, NONE
+from flock_follower.mavlink.setpoint_rules import (
+    COMMAND,
+    decide,
+    encode_setpoint,
+    Held,
+    LEVEL,
+    NONE,
+)
 from flock_follower.mavlink.velocity_check import KnownMotion, Motion, ODOM
 from flock_follower.messages import Command
 
@@ -43,7 +49,8 @@ def judge(limits=LIMITS, **changes):
     """Return the setpoint for a command on the marker alone, with some arguments changed."""
     arguments = {'known': LOST, 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
                  'armed': True, 'place': Location(2.0), 'full': limits,
-                 'relative': Relative(5.0, False, 0.2)}
+                 'relative': Relative(5.0, False, 0.2), 'airborne': True, 'withheld': '',
+                 'unplaced': '', 'held': Held(), 'wind': (0.0, 0.0, 0.0), 'offset': 0.0}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -121,7 +128,7 @@ class Flown:
         self.flown = []  # times of commands on the marker alone
 
     def permit(self):
-        self.gate.permit(OffboardRequested(self.now - 0.001))
+        self.gate.permit(self.gate.permission.requested(self.now - 0.001))
 
     def cycle(self, relative, status=OFFBOARD, command=True):
         self.now += 0.05

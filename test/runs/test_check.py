@@ -39,8 +39,8 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.check import COLUMNS, main
 from flock_follower.checks.bug_report import newest_recording, write_report
 from flock_follower.checks.observations import NodeStatus, Observations
+from flock_follower.files import resource
 from flock_follower.perception.markers import draw_marker
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 SAMPLE = resource('bags/sample')

@@ -37,6 +37,7 @@ from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
 from flock_follower.check import main as check_main
 from flock_follower.checks.recorded_system import check_bag
+from flock_follower.files import resource
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 from flock_follower.messages import (
     from_odometry,
@@ -46,7 +47,6 @@ from flock_follower.messages import (
     to_array,
 )
 from flock_follower.parameters.files import read_parameters, TABLE
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')

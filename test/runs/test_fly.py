@@ -68,12 +68,13 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
     elsewhere = {} if external is None else {
         'pose_source': 'HIL_STATE_QUATERNION', 'clock': np.array([[0.0, 0.0], [10.0, 10.0]])}
     return LiveRecord(
-        10.0, scenario.flight.planner(True), table, leader, follower,
-        np.full(COUNT, distance), TIMES, 0.1 * along, TIMES, speed * along, list(states),
-        [(1.0, status)], scenario=scenario, log={
-            'leader_velocity': np.multiply.outer(
-                np.broadcast_to(leader_speed, COUNT), [1.0, 0.0, 0.0]), 'skipped_images': 0,
-            'pose_source': '', 'pose_source_of_leader': '', 'duration': 10.0, 'ended_early': '',
+        duration=10.0, params=scenario.flight.planner(True), table=table,
+        paths={'leader': leader, 'follower': follower},
+        speeds={'follower': (TIMES, np.full(COUNT, speed)),
+                'leader': (TIMES, np.broadcast_to(leader_speed, COUNT))},
+        distance=np.full(COUNT, distance), setpoint_times=TIMES, setpoints=0.1 * along,
+        states=list(states), diagnostics=[(1.0, status)], scenario=scenario, log={
+            'skipped_images': 0, 'pose_source': '', 'pose_source_of_leader': '', 'duration': 10.0, 'ended_early': '',
             **elsewhere, **(external or {})})
 
 
@@ -100,7 +101,8 @@ def test_the_bounds_are_those_of_band_and_limits():
 @pytest.mark.parametrize('wrong', [np.nan, np.inf, -np.inf])
 def test_a_single_figure_that_is_not_finite_fails_its_bound(wrong):
     flight = synthetic(external={})
-    flight.setpoints[7, 1] = flight.velocities[7, 1] = flight.follower[200, 2] = wrong
+    flight.setpoints[7, 1] = flight.speeds['follower'][1][7] = wrong
+    flight.paths['follower'][200, 2] = wrong
     figures, faults = judged(flight)
     for key in ('setpoints.acceleration_max_m_s2', 'speed_max_m_s', 'altitude_off_m'):
         assert figures[key] is None and 'not known' in faults[key]
@@ -188,7 +190,7 @@ def record(began, position, leader=(0.0, 0.0, 0.0)):
     """Return what the column's figures need of a flight of a second at 50 Hz."""
     stamps = (np.linspace(began, began + 1.0, 31) * 1e9).astype(np.int64)
     return SimpleNamespace(
-        velocity_times=np.linspace(0.0, 1.0, 51), velocities=np.zeros((51, 3)), log={
+        speeds={'follower': (np.linspace(0.0, 1.0, 51), np.zeros(51))}, log={
             'began': began, 'ended': began + 1.0, 'position': np.tile(position, (51, 1)),
             'start': 0.0, 'epoch_ns': 0, 'image_stamp': stamps,
             'leader_position': np.tile(leader, (31, 1))})

@@ -28,8 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flock_desk.marker import main
-from flock_desk.runs.marker_pages import Box, draw, layout, Page, PAGES
+from flock_desk.marker import Box, draw, layout, main, Page, PAGES
 from flock_follower.geometry import Array
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage

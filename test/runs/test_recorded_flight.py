@@ -24,7 +24,7 @@ from bag_excerpts import Change, edited, SAMPLE
 import numpy as np
 import pytest
 
-from flock_desk.runs.recorded_flight import RecordedFlight
+from flock_desk.runs.evaluation import RecordedFlight
 from flock_follower.bags.bag import BagMessage, open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.follower import ControlCycle, ImageOutcome, Listener, Tick
@@ -76,14 +76,10 @@ def play(messages: list[BagMessage], **parameters: Any) -> Log:
     parameters.setdefault('odom_twist_frame', 'child')  # the bag is too short to find it out
     values = parse_parameters({'/**': {'ros__parameters': parameters}}, TABLE)
     flight = RecordedFlight(values, log, empty)
+    ours = {ODOM: 'odom', CAMERA: 'camera_info', IMAGE: 'image_raw'}
     for message in messages:
-        if message.topic == ODOM:
-            flight.take_odometry(message.stamp_ns, message.data)
-        elif message.topic == CAMERA:
-            flight.take_camera_info(message.stamp_ns, message.data)
-        elif message.topic == IMAGE:
-            flight.take_image(message.stamp_ns, message.msgtype, message.data)
-    flight.finish()
+        flight.take(ours[message.topic], message.stamp_ns, message.msgtype, message.data)
+    flight.follower.finish()
     return log
 
 

@@ -25,10 +25,10 @@ from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Sensor
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.files import resource
 from flock_follower.geometry import Transform
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.markers import detect
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 TOPICS = {'/image_raw/compressed': 360, '/camera_info': 360, '/odom': 2401,

@@ -62,7 +62,7 @@ def table(estimates: dict[int, dict[str, Estimate]], leader: list[float],
     """Return the table of estimates where the leader really was at an offset."""
     return compared(estimates, straight([0.0, 0.0, 0.0], yaw), straight([5.0, 0.0, 1.0]),
                     straight(np.add(leader, [5.0, 0.0, 1.0]).tolist()), STAMPS,
-                    np.ones(len(STAMPS)) if visible is None else visible, 0)[0]
+                    np.ones(len(STAMPS)) if visible is None else visible, 0)
 
 
 def test_drift_common_to_both_is_no_error() -> None:
