@@ -32,9 +32,8 @@ import sys
 from typing import NamedTuple
 
 from flock_desk.flocks.agents import Integrator, Neighbors, simulate
-from flock_desk.flocks.graph import Coupling, initial_graph
-from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
-from flock_desk.flocks.starts import random_start
+from flock_desk.flocks.laws import Coupling, initial_graph
+from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS, random_start
 from flock_follower.flocking import FlockingParams
 
 VARIANTS: tuple[tuple[Neighbors, Coupling], ...] = (

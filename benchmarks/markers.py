@@ -32,10 +32,18 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-from flock_desk.camera.leader import board, Face, marker_print, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import render_in_one_thread, Renderer, Sensor
-from flock_desk.runs.marker_pages import entry, layout, panel_entry, SIZES
+from flock_desk.camera.renderer import (
+    board,
+    Face,
+    marker_print,
+    render_in_one_thread,
+    Renderer,
+    Sensor,
+    T_BODY_MARKER,
+    T_BODY_OPTICAL,
+)
+from flock_desk.marker import entry, layout, panel_entry, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,

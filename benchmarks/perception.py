@@ -50,14 +50,14 @@ import cv2
 from detectors import ARUCO, detectors, Look, TAG
 import numpy as np
 
-from flock_desk.camera.leader import (
+from flock_desk.camera.renderer import (
     leader,
     marker_print,
+    Renderer,
     SIDE_LENGTH,
     T_BODY_MARKER,
     T_BODY_OPTICAL,
 )
-from flock_desk.camera.renderer import Renderer
 from flock_desk.runs.frame_errors import FrameErrors
 from flock_desk.sample_bag import (
     IMAGE_RATE,
@@ -68,6 +68,7 @@ from flock_desk.sample_bag import (
 )
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.geometry import Array, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
 from flock_follower.perception import markers as neighbors
@@ -77,7 +78,6 @@ from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 from flock_follower.planner.params import PlannerParams
-from flock_follower.resources import resource
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time
@@ -255,10 +255,10 @@ class Flight:
                 errors.odometry(self.own[-1])
         elif topic == '/truth/odom':
             for errors in self.errors.values():
-                errors.true_odometry(from_odometry(message))
+                errors.truth(from_odometry(message), own=True)
         elif topic == '/truth/neighbors':
             for errors in self.errors.values():
-                errors.true_neighbor(from_odometry(message))
+                errors.truth(from_odometry(message))
         elif topic == '/camera_info':
             self.info = message
             if self.perceiver.take_camera_info(message):

@@ -31,10 +31,9 @@ import time
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flock_desk.flocks import graph as flock_graph
+from flock_desk.flocks import laws
 from flock_desk.flocks.agents import NEAREST
-from flock_desk.flocks.graph import nearest, pairs_within
-from flock_desk.flocks.models import accelerations, velocities_after
+from flock_desk.flocks.laws import accelerations, nearest, pairs_within, velocities_after
 from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
 from flock_follower.geometry import Array
 
@@ -102,11 +101,11 @@ def neighbors(n: int, repeats: int) -> list[tuple[str, bool]]:
 def neighbor_steps(x: Array, v: Array) -> dict[str, Callable[[], object]]:
     """Return what one step of each model costs, the search for neighbours included."""
     distance = np.sqrt(FLIGHT_PARAMS.d1)
-    graph = flock_graph.Graph(len(x), pairs_within(x, distance))
+    graph = laws.Graph(len(x), pairs_within(x, distance))
     return {
-        '7 nearest': lambda: flock_graph.nearest_accelerations(
+        '7 nearest': lambda: laws.nearest_accelerations(
             x, v, FLIGHT_PARAMS, nearest(x, NEAREST)),
-        'neighbour graph': lambda: flock_graph.accelerations(x, v, FLIGHT_PARAMS, graph),
+        'neighbour graph': lambda: laws.graph_accelerations(x, v, FLIGHT_PARAMS, graph),
         'plain numpy loop': lambda: plain(x, v),
         'Vicsek': lambda: velocities_after(x, v, _RADIUS)}
 

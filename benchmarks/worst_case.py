@@ -36,8 +36,7 @@ import sys
 import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
-from flock_desk.scenarios.scenario import FlightParams, Outage, Scenario, Start
+from flock_desk.scenarios.scenario import FlightParams, LeaderMotion, Leg, Outage, Scenario, Start
 from flock_follower.geometry import Array
 
 LEGS, LEG = 7, 4.0  # legs of so many s: longer than a change of velocity takes

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure, summary
+from flock_desk.closed_loop.metrics import measure, summary
 from flock_desk.runs.judge import judge, parse_bounds
 from flock_desk.runs.report import announce, Chapter, Illustration, write_report
 from flock_desk.runs.summary import write_summary

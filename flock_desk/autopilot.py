@@ -31,7 +31,7 @@ import signal
 import socket
 import sys
 import time
-from typing import Any, Protocol
+from typing import Any, Final
 
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
@@ -97,26 +97,16 @@ def loopback_address(text: str) -> tuple[str, int]:
     return ip, int(port)
 
 
-class Stepped(Protocol):
-    """Bytes in, bytes out; times are s on the monotonic clock."""
-
-    def receive(self, data: bytes, now: float) -> list[bytes]:
-        """Take bytes that have arrived, and return the immediate answers."""
-
-    def step(self, now: float) -> list[bytes]:
-        """Fly on to a time, and return the messages that are due."""
-
-
 class Endpoint:
     """
     An embedded autopilot's end of a MAVLink connection to a bridge on this machine.
 
     :param address: where the bridge listens.
-    :param autopilot: the autopilot, or another link of it.
+    :param autopilot: the autopilot, or another link of it with the same ``receive`` and ``step``.
     :raises OSError: if the socket cannot be made.
     """
 
-    def __init__(self, address: tuple[str, int], autopilot: Stepped) -> None:
+    def __init__(self, address: tuple[str, int], autopilot: Any) -> None:
         self.autopilot = autopilot
         self._transport = UdpTransport(
             f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
@@ -128,14 +118,6 @@ class Endpoint:
         for data, peer in self._transport.read():
             if peer == self._transport.peer:
                 self._send(self.autopilot.receive(data, time.monotonic()))
-
-    def known(self, now: float) -> float:
-        """Return until when, s on the monotonic clock, it can be flown: now."""
-        return now
-
-    def wake(self, due: float) -> float:
-        """Return when to look whether a step can be flown that is due at a time, s: then."""
-        return due
 
     def step(self, now: float) -> None:
         """Fly on to ``now``, s on the monotonic clock, and send the messages that are due."""
@@ -155,14 +137,6 @@ def settings(options: argparse.Namespace) -> dict[str, Any]:
     signing = None
     if options.signing_key_file:
         signing = Signing.from_file(options.signing_key_file, time.time()).state
-    return {'personality': options.personality, 'start': options.start,
-            'altitude': options.altitude, 'yaw': math.radians(options.yaw),
-            'system_id': options.system_id, 'parameters': _parameters(options),
-            'arming_denial': options.deny_arming, 'ready_after': options.ekf_ready,
-            'signing': signing}
-
-
-def _parameters(options: argparse.Namespace) -> dict[str, float]:
     parameters = {}
     if options.param_file:
         text = Path(options.param_file).read_text(encoding='utf-8')
@@ -174,41 +148,11 @@ def _parameters(options: argparse.Namespace) -> dict[str, float]:
             parameters[name] = float(value)
         except ValueError:
             raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
-    return parameters
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='autopilot', description='An embedded autopilot for tests and the demo.')
-    parser.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
-                        help='where a bridge listens; loopback only (%(default)s)')
-    parser.add_argument('--personality', choices=tuple(PROFILES), default='px4',
-                        help='whose modes, masks and answers (%(default)s)')
-    parser.add_argument('--start', choices=STARTS, default='airborne',
-                        help='hovering, or on the ground armed or disarmed (%(default)s)')
-    parser.add_argument('--altitude', type=_number(0.1, 1000.0), default=2.0, metavar='M',
-                        help='of a hovering start, m (%(default)s)')
-    parser.add_argument('--yaw', type=_number(-360.0, 360.0), default=0.0, metavar='DEG',
-                        help='at the start, degrees anticlockwise from east (%(default)s)')
-    parser.add_argument('--system-id', type=int, default=1, metavar='ID',
-                        help='MAVLink system id (%(default)s)')
-    parser.add_argument('--ekf-ready', type=_number(0.0, 3600.0), default=0.0, metavar='S',
-                        help='until a landed vehicle knows its position, s (%(default)s)')
-    parser.add_argument('--deny-arming', default='', metavar='REASON',
-                        help='refuse arming with this reason')
-    parser.add_argument('--param-file', default='', metavar='FILE',
-                        help='set the parameters of a file such as config/px4.params, but '
-                             'those for forwarded odometry')
-    parser.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
-                        help='set a parameter of the autopilot; may be repeated')
-    parser.add_argument('--signing-key-file', default='', metavar='FILE',
-                        help='sign messages, and accept only signed ones')
-    parser.add_argument('--duration', type=_number(0.0, 1e9), default=math.inf, metavar='S',
-                        help='stop after this long, s (never)')
-    parser.add_argument('--log', default='', metavar='FILE.npz',
-                        help='write the true state and every setpoint received')
-    return parser
+    return {'personality': options.personality, 'start': options.start,
+            'altitude': options.altitude, 'yaw': math.radians(options.yaw),
+            'system_id': options.system_id, 'parameters': parameters,
+            'arming_denial': options.deny_arming, 'ready_after': options.ekf_ready,
+            'signing': signing}
 
 
 def _number(low: float, high: float) -> Any:
@@ -218,6 +162,44 @@ def _number(low: float, high: float) -> Any:
             raise argparse.ArgumentTypeError(f'{text}: must be {valid}')
         return value
     return number
+
+
+_OPTIONS: Final[dict[str, dict[str, Any]]] = {
+    'connect': {'default': '127.0.0.1:14540', 'metavar': 'HOST:PORT',
+                'help': 'where a bridge listens; loopback only (%(default)s)'},
+    'personality': {'choices': tuple(PROFILES), 'default': 'px4',
+                    'help': 'whose modes, masks and answers (%(default)s)'},
+    'start': {'choices': STARTS, 'default': 'airborne',
+              'help': 'hovering, or on the ground armed or disarmed (%(default)s)'},
+    'altitude': {'type': _number(0.1, 1000.0), 'default': 2.0, 'metavar': 'M',
+                 'help': 'of a hovering start, m (%(default)s)'},
+    'yaw': {'type': _number(-360.0, 360.0), 'default': 0.0, 'metavar': 'DEG',
+            'help': 'at the start, degrees anticlockwise from east (%(default)s)'},
+    'system-id': {'type': int, 'default': 1, 'metavar': 'ID',
+                  'help': 'MAVLink system id (%(default)s)'},
+    'ekf-ready': {'type': _number(0.0, 3600.0), 'default': 0.0, 'metavar': 'S',
+                  'help': 'until a landed vehicle knows its position, s (%(default)s)'},
+    'deny-arming': {'default': '', 'metavar': 'REASON', 'help': 'refuse arming with this reason'},
+    'param-file': {'default': '', 'metavar': 'FILE',
+                   'help': 'set the parameters of a file such as config/px4.params, but those for '
+                           'forwarded odometry'},
+    'param': {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
+              'help': 'set a parameter of the autopilot; may be repeated'},
+    'signing-key-file': {'default': '', 'metavar': 'FILE',
+                         'help': 'sign messages, and accept only signed ones'},
+    'duration': {'type': _number(0.0, 1e9), 'default': math.inf, 'metavar': 'S',
+                 'help': 'stop after this long, s (never)'},
+    'log': {'default': '', 'metavar': 'FILE.npz',
+            'help': 'write the true state and every setpoint received'}}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='autopilot', description='An embedded autopilot for tests and the demo.')
+    for name, option in _OPTIONS.items():
+        parser.add_argument(f'--{name}', **option)
+    return parser
 
 
 if __name__ == '__main__':

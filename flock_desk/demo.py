@@ -33,7 +33,7 @@ import time
 
 import numpy as np
 
-from flock_desk.runs.console import guarded
+from flock_desk.runs.console import guarded, parsed
 from flock_desk.runs.flight import COMMANDS, COUNTED, RECORDED, start
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.processes import (
@@ -46,12 +46,11 @@ from flock_desk.runs.record import FlightRecord, read_replayed
 from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.files import resource, whole_file
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.resources import resource
-from flock_follower.whole_file import whole_file
 
 # The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
 # faster than the 0.5 m/s of a first flight.
@@ -87,9 +86,9 @@ BOUNDS = (
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demonstration and return the exit code."""
     parser = argparse.ArgumentParser(prog='demo', description='Replay a bag into an autopilot.')
-    parser.add_argument('--output', type=Path, default=Path('build/demo'),
-                        help='folder for report and logs (%(default)s)')
-    out: Path = parser.parse_args(args).output
+    out: Path = parsed(parser, args, {'--output': {
+        'type': Path, 'default': Path('build/demo'),
+        'help': 'folder for report and logs (%(default)s)'}}).output
     return guarded(partial(_demonstrate, out), hint=f'\nthe logs of every process are in {out}')
 
 
@@ -108,11 +107,10 @@ def _demonstrate(out: Path) -> int:
 
 
 def _pictures(flight: FlightRecord, picture: Path) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
-    plotted = PlottedFlight.of(flight)
+    from flock_desk.runs.plots import chapters, flight_picture
     with whole_file(picture) as file:
-        file.write(flight_picture(plotted, TITLE))
-    return chapters(plotted)
+        file.write(flight_picture(flight, TITLE))
+    return chapters(flight)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:

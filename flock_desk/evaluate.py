@@ -47,41 +47,42 @@ from typing import Any, NamedTuple
 
 import cv2
 
-from flock_desk.runs.cluster import mapped
-from flock_desk.runs.console import explained, guarded
+from flock_desk.runs.console import explained, guarded, Options, parsed
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_desk.runs.judge import check_names, Judgement, load_bounds
+from flock_desk.runs.processes import mapped
 from flock_desk.runs.report import announce, Chapter, report
 from flock_desk.runs.summary import evaluation_figures
-from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
+from flock_follower.checks.findings import ERROR, ready, WARNING
 from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.files import resource
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
-from flock_follower.resources import resource
+
+_OPTIONS: Options = {
+    'bag': {'type': Path, 'nargs': '+', 'help': '.mcap, .db3, .bag or ROS 2 bag folder'},
+    '--config': {'type': Path, 'help': 'ROS 2 parameter file (default: those flown, of a '
+                 'recording of the black box, else config/follower.yaml of this package)'},
+    '--output': {'type': Path, 'default': Path('build/evaluate'),
+                 'help': 'folder for the results (default: %(default)s)'},
+    '--expect': {'type': Path, 'metavar': 'FILE',
+                 'help': 'YAML file of bounds; exit code 1 where one is broken'},
+    '--check': {'choices': ('fail', 'report', 'skip'), 'default': 'fail',
+                'help': 'errors that the rules of check find in the bag: exit code 1, only '
+                'reported, or not looked for (default: %(default)s)'},
+    '--namespace': {'default': '', 'help': 'of the topics in the bag'},
+    '--remap': {'action': 'append', 'default': [], 'metavar': 'FROM:=TO',
+                'help': 'one of our topics by its name in the bag, as '
+                'odom:=/camera/odom/sample; may be repeated'},
+    '--scheduler': {'default': '', 'metavar': 'ADDRESS',
+                    'help': 'of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
+                    'same files'}}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
-    parser.add_argument('bag', type=Path, nargs='+', help='.mcap, .db3, .bag or ROS 2 bag folder')
-    parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: those flown, '
-                        'of a recording of the black box, else config/follower.yaml of this '
-                        'package)')
-    parser.add_argument('--output', type=Path, default=Path('build/evaluate'),
-                        help='folder for the results (default: %(default)s)')
-    parser.add_argument('--expect', type=Path, metavar='FILE',
-                        help='YAML file of bounds; exit code 1 where one is broken')
-    parser.add_argument('--check', choices=('fail', 'report', 'skip'), default='fail',
-                        help='errors that the rules of check find in the bag: exit code 1, only '
-                        'reported, or not looked for (default: %(default)s)')
-    parser.add_argument('--namespace', default='', help='of the topics in the bag')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
-                        help='one of our topics by its name in the bag, as '
-                        'odom:=/camera/odom/sample; may be repeated')
-    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
-                        help='of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
-                        'same files')
-    options = parser.parse_args(args)
+    options = parsed(parser, args, _OPTIONS)
     names = [bag.expanduser().resolve().name for bag in options.bag]
     if twice := {name for name in names if names.count(name) > 1}:
         parser.error(f'{", ".join(sorted(twice))}: bags of one name would share a folder')
@@ -91,38 +92,30 @@ def main(args: Sequence[str] | None = None) -> int:
         for bag, name in zip(options.bag, names)]
     if options.scheduler:  # its workers run in other folders
         for one in each:
-            for key in ('bag', 'config', 'expect', 'output'):
-                if (path := getattr(one, key)) is not None:
-                    setattr(one, key, path.expanduser().absolute())
+            vars(one).update({key: value.expanduser().absolute()
+                              for key, value in vars(one).items() if isinstance(value, Path)})
     return guarded(partial(_evaluate_all, each, options.scheduler), refused=2)
 
 
 def _evaluate_all(each: Sequence[argparse.Namespace], scheduler: str) -> int:
     """Evaluate bags, here or on a cluster, print the outcomes and return the exit code."""
-    code = 0
+    codes = []
     for options, outcome in zip(each, mapped(scheduler, evaluated, each) if scheduler
                                 else map(evaluated, each)):
         if len(each) > 1:
             print(f'\n{options.bag}')
-        if outcome.refused:
-            print(f'error: {outcome.refused}', file=sys.stderr)
-            code = 2
-            continue
-        for line in (*(finding.line for finding in outcome.findings),
-                     *(f'warning: {warning}' for warning in outcome.warnings)):
+        for line in outcome.problems:
             print(line, file=sys.stderr)
-        code = max(code, int(options.check == 'fail' and not ready(outcome.findings)), announce(
-            outcome.summary, outcome.judgements, [options.output / 'report.html']))
-    return code
+        codes.append(outcome.code if outcome.code == 2 else max(outcome.code, announce(
+            outcome.summary, outcome.judgements, [options.output / 'report.html'])))
+    return max(codes)
 
 
 class BagOutcome(NamedTuple):
-    """The outcome of one bag; ``refused`` is the reason if it failed, or ''."""
+    """The outcome of one bag: its exit code without the bounds, the lines on stderr, figures."""
 
-    refused: str = ''
-    findings: Sequence[Finding] = ()
-    """Errors and warnings of ``check``."""
-    warnings: Sequence[str] = ()
+    code: int
+    problems: Sequence[str]
     summary: Mapping[str, Any] = {}
     judgements: Sequence[Judgement] = ()
 
@@ -133,7 +126,7 @@ def evaluated(options: argparse.Namespace) -> BagOutcome:
     try:
         return run(options)
     except (OSError, ValueError) as error:
-        return BagOutcome(explained(error))
+        return BagOutcome(2, [f'error: {explained(error)}'])
 
 
 def run(options: argparse.Namespace) -> BagOutcome:
@@ -158,17 +151,20 @@ def run(options: argparse.Namespace) -> BagOutcome:
                 if finding.level == level and finding.what != 'bag']
     fast = too_fast(summary, evaluation.flight.planner_params.v_max)
     flown_with = ', with the parameters flown' if flown else ''
+    lines = [finding.line for finding in findings]
     judgements = report(
         options.output, f'Evaluation of {evaluation.bag}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
         'setpoints.', summary, bounds, partial(_pictures, evaluation),
-        warnings=[*(finding.line for finding in findings), *fast])
+        warnings=[*lines, *fast])
     warnings = [f'the truth of {stranger!r} is not used: no neighbor has that name'
                 for stranger in sorted(evaluation.errors.strangers)]
     if evaluation.incomplete:
         warnings.insert(0, f'{options.bag} is incomplete: {evaluation.incomplete}')
-    return BagOutcome('', findings, [*warnings, *fast], summary, judgements)
+    failed = options.check == 'fail' and not ready(findings)
+    return BagOutcome(int(failed), [*lines, *(f'warning: {each}' for each in (*warnings, *fast))],
+                      summary, judgements)
 
 
 def _pictures(evaluation: Evaluation) -> Sequence[Chapter]:

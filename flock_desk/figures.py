@@ -42,8 +42,8 @@ from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
 from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
-from flock_desk.flocks.starts import random_start
-from flock_desk.runs.console import aligned, guarded, Progress
+from flock_desk.flocks.paper import random_start
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
 from flock_desk.runs.record import last_flight, read_flown
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.bags.bag import BagError, failures
@@ -63,9 +63,34 @@ FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 
 
+_OPTIONS: Options = {
+    '--out': {'type': Path, 'default': Path('build/figures'), 'help': '%(default)s'},
+    '--flights': {'type': Path, 'default': Path('build/fly'), 'metavar': 'FOLDER',
+                  'help': 'folder of the flights of fly; %(default)s'},
+    '--campaign': {'type': Path, 'default': Path('build/flights/flights.json'), 'metavar': 'FILE',
+                   'help': 'results of flights; %(default)s'}}
+_FLOCK: Options = {
+    '--agents': {'type': int, 'metavar': 'N', 'help': 'how many, instead of the paper'},
+    '--dim': {'type': int, 'choices': (2, 3), 'default': 2, 'help': '%(default)s'},
+    '--seed': {'type': int, 'default': 1, 'help': 'of the start; %(default)s'},
+    '--model': {'choices': tuple(MODELS), 'default': 'flocking', 'help': '%(default)s'},
+    '--band': {'choices': ('paper', 'flight'), 'default': 'flight',
+               'help': '1 to 2.25 or 1 to 8 m^2; %(default)s'},
+    '--neighbors': {'choices': ('all', 'graph', 'nearest'),
+                    'help': 'graph for the flocking law, all for the other models'},
+    '--coupling': {'choices': ('flock', 'pair'), 'default': 'flock',
+                   'help': 'whose disagreement scales the forces; %(default)s'},
+    '--duration': {'type': float, 'default': 20.0, 'help': 's; %(default)s'},
+    '--dt': {'type': float, 'default': 0.005, 'help': 's; %(default)s'},
+    '--method': {'choices': ('auto', 'whole', 'blocked'), 'default': 'auto',
+                 'help': 'of the sum over all pairs; %(default)s'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Draw the figures and return the exit code."""
-    return guarded(partial(_draw, _parser().parse_args(args)))
+    parser = argparse.ArgumentParser(
+        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
+    return guarded(partial(_draw, parsed(parser, args, _OPTIONS, {'one larger flock': _FLOCK})))
 
 
 def _draw(options: argparse.Namespace) -> int:
@@ -215,13 +240,14 @@ def one_flock(options: argparse.Namespace) -> list[str]:
 def row(scenario: str, name: str, run: Simulation) -> Row:
     """Return the line of the table that a simulation fills."""
     m = run.metrics
-    least, greatest = (extremum(m.time, values, least=side)
-                       for values, side in ((m.min_r2, True), (m.max_r2, False)))
+    (nearest_at, nearest), (farthest_at, farthest) = (
+        extremum(m.time, values, least=side)
+        for values, side in ((m.min_r2, True), (m.max_r2, False)))
     mean = run.velocities[-1].mean(axis=0)
     heading = np.degrees(np.arctan2(mean[1], mean[0]))
-    kept = least.value > run.params.d0 and greatest.value < run.params.d1
-    return (scenario, name, _text(least.value, 6), _text(least.time, 3), _text(greatest.value, 6),
-            _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
+    kept = nearest > run.params.d0 and farthest < run.params.d1
+    return (scenario, name, _text(nearest, 6), _text(nearest_at, 3), _text(farthest, 6),
+            _text(farthest_at, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
             _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
             _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
 
@@ -238,32 +264,6 @@ def _text(value: float, digits: int) -> str:
     """Return a number as text; empty for NaN, and never a negative zero."""
     zero = '0.' + '0' * digits
     return '' if np.isnan(value) else f'{value:.{digits}f}'.replace(f'-{zero}', zero)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
-    parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
-    parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
-                        help='folder of the flights of fly; %(default)s')
-    parser.add_argument('--campaign', type=Path, default=Path('build/flights/flights.json'),
-                        metavar='FILE', help='results of flights; %(default)s')
-    flock = parser.add_argument_group('one larger flock')
-    flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
-    flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')
-    flock.add_argument('--seed', type=int, default=1, help='of the start; %(default)s')
-    flock.add_argument('--model', choices=tuple(MODELS), default='flocking', help='%(default)s')
-    flock.add_argument('--band', choices=('paper', 'flight'), default='flight',
-                       help='1 to 2.25 or 1 to 8 m^2; %(default)s')
-    flock.add_argument('--neighbors', choices=('all', 'graph', 'nearest'),
-                       help='graph for the flocking law, all for the other models')
-    flock.add_argument('--coupling', choices=('flock', 'pair'), default='flock',
-                       help='whose disagreement scales the forces; %(default)s')
-    flock.add_argument('--duration', type=float, default=20.0, help='s; %(default)s')
-    flock.add_argument('--dt', type=float, default=0.005, help='s; %(default)s')
-    flock.add_argument('--method', choices=('auto', 'whole', 'blocked'), default='auto',
-                       help='of the sum over all pairs; %(default)s')
-    return parser
 
 
 if __name__ == '__main__':

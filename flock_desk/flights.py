@@ -23,15 +23,11 @@ OUTPUT/flights.json. The same seed gives the same file for any number of jobs.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
-import json
-import multiprocessing
 import os
 from pathlib import Path
-import signal
 import sys
 import time
 from typing import NamedTuple
@@ -40,7 +36,7 @@ import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
-from flock_desk.closed_loop.flight_metrics import (
+from flock_desk.closed_loop.metrics import (
     band_exits,
     joined,
     measure,
@@ -48,11 +44,12 @@ from flock_desk.closed_loop.flight_metrics import (
     of_runs,
     summary,
 )
-from flock_desk.runs.cluster import mapped
-from flock_desk.runs.console import aligned, guarded, Progress
-from flock_desk.scenarios.key_tables import markdown
+from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
+from flock_desk.runs.processes import mapped, pooled
+from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
+    key_tables,
     load,
     names,
     ScenarioError,
@@ -60,7 +57,6 @@ from flock_desk.scenarios.scenario_file import (
 )
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
@@ -109,17 +105,37 @@ class Flown(NamedTuple):
     """Which runs left the band, when and why, one line each."""
 
 
+_OPTIONS: Options = {
+    '--controllers': {'nargs': '+', 'choices': CONTROLLERS, 'default': list(CONTROLLERS),
+                      'metavar': 'NAME', 'help': f'{", ".join(CONTROLLERS)}; a flock flies '
+                      f'{" and ".join(IN_FLOCKS)} only (all)'},
+    '--keys': {'action': 'store_true',
+               'help': 'print every key of a scenario file with its default and range'},
+    '--flock': {'nargs': '+', 'default': [], 'metavar': 'KEY=VALUE',
+                'help': "other values for the scenarios' flock: followers=12 words=false "
+                "'fails={follower: 2, at: 20}'"},
+    '--runs': {'type': int, 'default': 200, 'help': 'of each (%(default)s)'},
+    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
+               'help': 'processes (one per processor)'},
+    '--scheduler': {'default': '', 'metavar': 'ADDRESS',
+                    'help': 'of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead of '
+                    '--jobs processes here; it has the same results'},
+    '--seed': {'type': int, 'default': 0, 'help': '%(default)s'},
+    '--output': {'type': Path, 'default': Path('build/flights'), 'metavar': 'FOLDER',
+                 'help': '%(default)s'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
-    parser = _parser()
-    options = parser.parse_args(args)
-    try:
-        for name, valid in (('runs', _COUNTS), ('jobs', _COUNTS), ('seed', _SEEDS)):
-            valid.check(f'--{name}', getattr(options, name))
-    except ValueError as error:
-        parser.error(str(error))
+    parser = argparse.ArgumentParser(
+        prog='flights', description='Fly scenarios many times, with several controllers.')
+    scenario = {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
+                'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is the '
+                'default'}
+    options = parsed(parser, args, {'--scenario': scenario, **_OPTIONS},
+                     valid={'runs': _COUNTS, 'jobs': _COUNTS, 'seed': _SEEDS})
     if options.keys:
-        print(markdown())
+        print(key_tables())
         return 0
     return guarded(partial(_campaign, options))
 
@@ -133,8 +149,7 @@ def _campaign(options: argparse.Namespace) -> int:
     results, cpu, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
                                   options.seed, options.scheduler)
     path = options.output / 'flights.json'
-    with whole_file(path) as file:
-        file.write((json.dumps(results, indent=2) + '\n').encode())
+    write_summary(results, path)
     print(table(results))
     print(COLUMN_NOTES)
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
@@ -189,7 +204,7 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
              for controller in of_scenario(scenario) for k in range(0, runs, size)]
     parts: dict[tuple[str, str], list[Flown]] = {}
-    flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
+    flown = mapped(scheduler, _fly, tasks) if scheduler else pooled(jobs, _fly, tasks)
     with Progress(len(scenarios)) as progress:
         for name, group in groupby(tasks, lambda task: task.scenario.name):
             progress.start(name)
@@ -225,28 +240,6 @@ def shorten(name: str) -> str:
     return name if len(name) <= LONGEST_NAME else f'{name[:LONGEST_NAME - 1]}…'
 
 
-def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
-    if jobs == 1:
-        yield from map(_fly, tasks)
-        return
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
-    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        flown = pool.map(_fly, tasks)
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        yield from flown
-    except BaseException:
-        # A task runs for up to a minute: its result is no longer needed.
-        for worker in multiprocessing.active_children():
-            worker.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def _fly(task: Task) -> Flown:
     _, law, guard = CONTROLLERS[task.controller]
     flights = fly(task.scenario, task.runs, guard, cpu_time=time.thread_time, law=law)
@@ -258,33 +251,6 @@ def _fly(task: Task) -> Flown:
         which = f'follower {follower + 1} ' if many > 1 else ''
         exits.append(f'run {task.runs[run]}: {which}{left}')
     return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), cpu, exits)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='flights', description='Fly scenarios many times, with several controllers.')
-    parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
-                        help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
-                        'the default')
-    parser.add_argument('--controllers', nargs='+', choices=CONTROLLERS,
-                        default=list(CONTROLLERS), metavar='NAME',
-                        help=f'{", ".join(CONTROLLERS)}; a flock flies {" and ".join(IN_FLOCKS)} '
-                        'only (all)')
-    parser.add_argument('--keys', action='store_true',
-                        help='print every key of a scenario file with its default and range')
-    parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
-                        help="other values for the scenarios' flock: followers=12 words=false "
-                        "'fails={follower: 2, at: 20}'")
-    parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
-                        help='processes (one per processor)')
-    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
-                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead '
-                        'of --jobs processes here; it has the same results')
-    parser.add_argument('--seed', type=int, default=0, help='%(default)s')
-    parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
-                        help='%(default)s')
-    return parser
 
 
 if __name__ == '__main__':

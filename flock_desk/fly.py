@@ -33,76 +33,94 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import combinations
+import math
 from pathlib import Path
 import sys
 from typing import Any
 
-from flock_desk.runs.column import column_chapters, column_figures
-from flock_desk.runs.console import guarded
-from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH
-from flock_desk.runs.judge import FigureBound, Judgement, nearest, scenario_bounds
+import numpy as np
+
+from flock_desk.runs.console import guarded, Options, parsed
+from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
+from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.record import clear, LiveRecord, locked, PICTURE, read_flown, set_aside
 from flock_desk.runs.report import announce, Chapter, report
-from flock_desk.runs.summary import scenario_figures
+from flock_desk.runs.summary import (
+    hold_within,
+    jsonable,
+    judged_outages,
+    most,
+    outage_name,
+    scenario_figures,
+)
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
+from flock_follower.files import whole_file
+from flock_follower.geometry import Array
 from flock_follower.ranges import Range
-from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 BUSY = 0.02  # of the images, not rendered in time: the machine was too slow
+SPEED_TOLERANCE = 0.05  # m/s: what noise and gusts add to a speed that is held at v_max
+SAFE = 0.9  # of sqrt(d0): nearer than this no follower may come
+CORES = 1.5
+MISSED = 0.005  # of the planner's ticks
+RECALL = 0.9
+GAP = 0.5  # s without an estimate although the leader could be seen
+IN_BAND_EXTERNAL = 0.99  # of the time; what a real autopilot's loops and estimator may cost
+ALTITUDE_OFF = 0.3  # m from the leader's height
+DURATION_SHORT = 0.1  # s by which a flight may be shorter than requested
+PACE = 0.9  # of our clock: a slower vehicle is another vehicle
+AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
+STEP = 0.02  # s between the times at which the vehicles of a column are compared
 
 
-def _options(args: Sequence[str] | None) -> argparse.Namespace:
-    """Return the checked options of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='fly', description='Fly a scenario on the desk, through the real nodes.',
-        epilog=f'scenarios: {", ".join(names())}')
-    parser.add_argument('--scenario', default='indoor', metavar='NAME',
-                        help='a name in config/scenarios, or the path of a file (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
-    parser.add_argument('--duration', type=float, default=0.0, metavar='S',
-                        help='fly no longer than this, s; never longer than the scenario (as '
-                        'long as it)')
-    parser.add_argument('--followers', type=int, default=1, metavar='N',
-                        help='in a column, each behind the one before it (%(default)s); every one '
-                        'takes about one core')
-    group = parser.add_argument_group('an autopilot that runs already, see docs/desk.md')
-    group.add_argument('--autopilot', default='', metavar='URL',
-                       help='where the bridge finds it: udp:HOST:PORT where it sends to, '
-                       'tcp:HOST:PORT where it listens')
-    group.add_argument('--truth', default='', metavar='URL',
-                       help='another link, on which it sends the true place '
-                       f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
-    group.add_argument('--leader-truth', default='', metavar='URL',
-                       help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
-                       "the leader (the scenario's own leader)")
-    group.add_argument('--forward-odometry', action='store_true',
-                       help='send it the odometry, for flight without GPS')
-    parser.add_argument('--output', type=Path, default=Path('build/fly'),
-                        help='folder for report and logs (%(default)s)')
-    parser.add_argument('--moving', type=Path, metavar='FILE',
-                        help='also write a moving picture of the flight, an animated WebP')
-    options = parser.parse_args(args)
-    try:
-        SEEDS.check('--seed', options.seed)
-        DURATIONS.check('--duration', options.duration)
-        FOLLOWERS.check('--followers', options.followers)
-    except ValueError as error:
-        parser.error(str(error))
-    if not options.autopilot and (
-            options.truth or options.leader_truth or options.forward_odometry):
-        parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
-    if options.autopilot and options.followers > 1:
-        parser.error('--followers: not with --autopilot')
-    if options.moving and options.followers > 1:
-        parser.error('--moving: not with --followers')
-    return options
+_OPTIONS: Options = {
+    '--scenario': {'default': 'indoor', 'metavar': 'NAME',
+                   'help': 'a name in config/scenarios, or the path of a file (%(default)s)'},
+    '--seed': {'type': int, 'default': 0, 'help': 'of everything that chance decides'},
+    '--duration': {'type': float, 'default': 0.0, 'metavar': 'S',
+                   'help': 'fly no longer than this, s; never longer than the scenario (as '
+                   'long as it)'},
+    '--followers': {'type': int, 'default': 1, 'metavar': 'N',
+                    'help': 'in a column, each behind the one before it (%(default)s); every one '
+                    'takes about one core'},
+    '--output': {'type': Path, 'default': Path('build/fly'),
+                 'help': 'folder for report and logs (%(default)s)'},
+    '--moving': {'type': Path, 'metavar': 'FILE',
+                 'help': 'also write a moving picture of the flight, an animated WebP'}}
+_EXTERNAL: Options = {
+    '--autopilot': {'default': '', 'metavar': 'URL',
+                    'help': 'where the bridge finds it: udp:HOST:PORT where it sends to, '
+                    'tcp:HOST:PORT where it listens'},
+    '--truth': {'default': '', 'metavar': 'URL',
+                'help': 'another link, on which it sends the true place '
+                f'(udp: {SIH_TRUTH}; tcp: its port + 2)'},
+    '--leader-truth': {'default': '', 'metavar': 'URL',
+                       'help': "likewise of a second autopilot, MAVLink system 2, whose vehicle "
+                       "is the leader (the scenario's own leader)"},
+    '--forward-odometry': {'action': 'store_true',
+                           'help': 'send it the odometry, for flight without GPS'}}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, and return the exit code."""
-    options = _options(args)
+    parser = argparse.ArgumentParser(
+        prog='fly', description='Fly a scenario on the desk, through the real nodes.',
+        epilog=f'scenarios: {", ".join(names())}')
+    options = parsed(
+        parser, args, _OPTIONS, {'an autopilot that runs already, see docs/desk.md': _EXTERNAL},
+        {'seed': SEEDS, 'duration': DURATIONS, 'followers': FOLLOWERS})
+    column = options.followers > 1
+    for wrong, fault in (
+            (not options.autopilot and (
+                options.truth or options.leader_truth or options.forward_odometry),
+             '--truth, --leader-truth and --forward-odometry: only with --autopilot'),
+            (options.autopilot and column, '--followers: not with --autopilot'),
+            (options.moving and column, '--moving: not with --followers')):
+        if wrong:
+            parser.error(fault)
     return guarded(partial(_fly, options),
                    hint=f'; the logs of every process are in {options.output}')
 
@@ -123,7 +141,7 @@ def _fly(options: argparse.Namespace) -> int:
                                 options.output, external, options.followers)
         code = conclude(scenario, options.output, options.followers, cores, exit_codes)
         if options.moving:
-            from flock_desk.runs.moving import moving_picture
+            from flock_desk.runs.fly_pictures import moving_picture
             with whole_file(options.moving) as file:
                 file.write(moving_picture(read_flown(scenario, options.output)))
         return code
@@ -135,37 +153,122 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
     flights: dict[str, LiveRecord] = {}
     summaries: dict[str, dict[str, Any]] = {}
     limits: list[FigureBound] = []
-    judgements: list[Judgement] = []
+    title = f'flock_follower on the desk: {scenario.name}'
     for namespace in namespaces(followers):
-        folder, title = out / namespace, ' '.join(filter(None, [scenario.name, namespace]))
+        folder = out / namespace
         flight = flights[namespace] = read_flown(scenario, folder, namespace)
         summary = summaries[namespace] = scenario_figures(
             flight, own(cores, namespace), own(exit_codes, namespace))
         bounds = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in bounds]
         judgements = report(
-            folder, f'flock_follower on the desk: {title}', scenario.summary, summary, bounds,
+            folder, f'{title} {namespace}'.rstrip(), scenario.summary, summary, bounds,
             partial(_pictures, folder, flight), warnings=cautions(summary))
-    print()
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         judgements = report(
-            out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
-            scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
-            partial(column_chapters, scenario, flights), parts=summaries)
+            out, f'{title}, a column of {followers}', scenario.summary, summary,
+            [nearest(scenario, 'nearest_m'), *limits],
+            partial(_column_pictures, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
+    print()
     code = announce(summary, judgements, pages, out)
-    for warning in (warning for each in summaries.values() for warning in cautions(each)):
-        print(f'warning: {warning}', file=sys.stderr)
+    for each in summaries.values():
+        for warning in cautions(each):
+            print(f'warning: {warning}', file=sys.stderr)
     return code
 
 
+def scenario_bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
+    """Return what `fly` demands; an outrun follower must warn instead of holding the band."""
+    params = flight.scenario.flight
+    if summary['leader_faster_than_v_max']:
+        bounds = [FigureBound('planner.warnings', least=1)]
+    elif flight.external:
+        bounds = [FigureBound('time_in_band_share', least=IN_BAND_EXTERNAL)]
+    else:
+        bounds = [FigureBound('time_in_band_share', least=1),
+                  FigureBound('true_distance_m.max', most=round(math.sqrt(params.d1), 2))]
+    if flight.external:
+        bounds += [
+            FigureBound('duration_s', least=float(flight.log['duration']) - DURATION_SHORT),
+            FigureBound('altitude_off_m', most=ALTITUDE_OFF),
+            FigureBound('external.pace', least=PACE)]
+    bounds += [nearest(flight.scenario, 'true_distance_m.min'),
+               FigureBound('recall', least=RECALL),
+               FigureBound('longest_gap_in_view_s', most=GAP),
+               FigureBound('planner.missed_ticks_share', most=MISSED),
+               FigureBound('setpoints.acceleration_max_m_s2', most=params.a_max),
+               FigureBound('speed_max_m_s', most=params.v_max + SPEED_TOLERANCE)]
+    for outage in judged_outages(flight):
+        key = f'outages.{outage_name(outage)}'
+        bounds += [FigureBound(f'{key}.hold_after_s', 0, hold_within(outage)),
+                   FigureBound(f'{key}.reasons', least=1)]
+        if flight.duration > outage.at + outage.duration + AGAIN_WITHIN:
+            bounds.append(FigureBound(f'{key}.track_after_s', 0, AGAIN_WITHIN))
+    return [*bounds, FigureBound('cpu_cores.total', most=CORES),
+            FigureBound('failed_processes', most=0)]
+
+
+def nearest(scenario: Scenario, key: str) -> FigureBound:
+    """Return the bound on the least distance of two vehicles."""
+    return FigureBound(key, least=round(SAFE * math.sqrt(scenario.flight.d0), 3))
+
+
+def column_tracks(scenario: Scenario, flights: Mapping[str, LiveRecord]
+                  ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """
+    Return the motion of a column while all of it flew the scenario, in the first one's frame.
+
+    :returns: times (n,), s; positions (n, 3), m, by vehicle; distances (n,), m, by pair.
+    """
+    logs = {name: flight.log for name, flight in flights.items()}
+    began = max(float(log['began']) for log in logs.values())
+    times = np.arange(began, min(float(log['ended']) for log in logs.values()), STEP)
+    first = next(iter(logs.values()))
+    tracks = {'leader': _at(times, float(first['start']) + (
+        first['image_stamp'] - int(first['epoch_ns'])) * 1e-9, first['leader_position'])}
+    for i, (name, log) in enumerate(logs.items()):
+        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + _at(
+            times, flights[name].speeds['follower'][0] + float(log['began']), log['position'])
+    return times - began, tracks, {
+        f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
+        for a, b in combinations(tracks, 2)}
+
+
+def _at(times: Array, known: Array, positions: Array) -> Array:
+    """Return positions (n, 3) at times (n,); NaN if they are unknown."""
+    return np.stack([np.interp(times, known, column, np.nan, np.nan)
+                     for column in positions.T], axis=1)
+
+
+def column_figures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> dict[str, Any]:
+    """
+    Return the figures of a column as a whole.
+
+    ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
+    """
+    _, _, distances = column_tracks(scenario, flights)
+    pairs = {pair: float(np.nanmin(distance)) for pair, distance in distances.items()}
+    return jsonable({
+        'column_of': scenario.name, 'followers': len(flights),
+        'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
+        'speed_max_m_s': most(np.concatenate(
+            [flight.speeds['follower'][1] for flight in flights.values()]))})
+
+
 def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import portrait, scenario_chapters
+    from flock_desk.runs.fly_pictures import portrait, scenario_chapters
     with whole_file(folder / PICTURE) as file:
         file.write(portrait(flight))
     return scenario_chapters(flight)
+
+
+def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> Sequence[Chapter]:
+    from flock_desk.runs.fly_pictures import column_chapters
+    return column_chapters(*column_tracks(scenario, flights),
+                           next(iter(flights.values())).params.law)
 
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:

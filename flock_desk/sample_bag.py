@@ -24,14 +24,11 @@ from __future__ import annotations
 import argparse
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
-import multiprocessing
+from functools import cache, cached_property, partial
 import os
 from pathlib import Path
 import shutil
-import signal
 import sys
 import tempfile
 from typing import Any
@@ -40,10 +37,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.runs.console import guarded, Progress
+from flock_desk.camera.renderer import Renderer, Sensor, T_BODY_OPTICAL
+from flock_desk.runs.console import guarded, Options, parsed, Progress
+from flock_desk.runs.processes import pooled
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
@@ -51,6 +48,7 @@ from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import odometry as odometry_message
+from flock_follower.ranges import Range
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
@@ -216,34 +214,24 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     if out.exists() and not (out / 'metadata.yaml').is_file():
         raise BagError(f'{out}: exists and is not a bag: not replaced')
     out.parent.mkdir(parents=True, exist_ok=True)
-    recording = Recording(variant, seed)
+    recording = _recording(variant, seed)
     count = len(recording.image_stamps_ns)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix='.writing-') as scratch:
-        pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'),
-                                   _start_worker, (variant, seed))
-        try:
-            images = _counted(pool.map(_rendered, range(count)), count, out.name)
-            with BagWriter(Path(scratch) / out.name) as bag:
-                for message in recording.messages(images):
-                    bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
-        finally:
-            pool.shutdown(cancel_futures=True)
+        images = pooled(jobs, partial(_rendered, variant, seed), range(count))
+        with BagWriter(Path(scratch) / out.name) as bag:
+            for message in recording.messages(_counted(images, count, out.name)):
+                bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
         if out.exists():
             shutil.rmtree(out)
         shutil.move(str(Path(scratch) / out.name), out)
 
 
-_worker: dict[str, Recording] = {}  # what a worker process renders
+_recording = cache(Recording)  # one in each process that renders
 
 
-def _start_worker(variant: Variant, seed: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+def _rendered(variant: Variant, seed: int, k: int) -> BagMessage:
     cv2.setNumThreads(1)
-    _worker['recording'] = Recording(variant, seed)
-
-
-def _rendered(k: int) -> BagMessage:
-    return _worker['recording'].image(k)
+    return _recording(variant, seed).image(k)
 
 
 def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
@@ -272,23 +260,24 @@ def _seconds(stamp_ns: int) -> float:
     return (stamp_ns - START_NS) * 1e-9
 
 
+_OPTIONS: Options = {
+    '--variant': {'nargs': '+', 'choices': [*VARIANTS, 'all'], 'default': ['sample'],
+                  'metavar': 'NAME', 'help': f'which: {", ".join(VARIANTS)} or all '
+                  '(default: sample)'},
+    '--out': {'type': Path, 'help': 'folder that will hold the bags (default: bags '
+              'for sample, build/bags for the others)'},
+    '--seed': {'type': int, 'default': 1, 'help': 'of all that is random (default: 1)'},
+    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
+               'help': 'processes that render (default: one per processor)'}}
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 1 after an error."""
     repository = Path(__file__).resolve().parents[2]
-    parser = argparse.ArgumentParser(
+    options = parsed(argparse.ArgumentParser(
         prog='sample', description='Render a flight and write it as a bag.',
-        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items()))
-    parser.add_argument('--variant', nargs='+', choices=[*VARIANTS, 'all'], default=['sample'],
-                        metavar='NAME', help=f'which: {", ".join(VARIANTS)} or all '
-                        '(default: sample)')
-    parser.add_argument('--out', type=Path, help='folder that will hold the bags (default: bags '
-                        'for sample, build/bags for the others)')
-    parser.add_argument('--seed', type=int, default=1, help='of all that is random (default: 1)')
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
-                        help='processes that render (default: one per processor)')
-    options = parser.parse_args(args)
-    if options.jobs < 1:
-        parser.error(f'--jobs = {options.jobs}: must be at least 1')
+        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items())),
+        args, _OPTIONS, valid={'jobs': Range(1, whole=True)})
 
     def render() -> int:
         for name in VARIANTS if 'all' in options.variant else options.variant:

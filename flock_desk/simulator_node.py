@@ -36,30 +36,31 @@ import os
 import sys
 import time
 
+import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 from flock_desk.autopilot import Endpoint, loopback_address
 from flock_desk.camera.renderer import render_in_one_thread
-from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.closed_loop.flown_vehicle import EmbeddedVehicle, ExternalVehicle
+from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
     LATEST_NS,
     real_time_camera,
     RealTimeFlight,
+    RenderedImage,
     STEP_NS,
 )
-from flock_desk.closed_loop.real_time_log import RealTimeLog
-from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.external_vehicles import ExternalVehicles
+from flock_desk.external.external_autopilot import ExternalAutopilot, ExternalVehicles
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
-from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs
-from flock_desk.vehicle_ahead import VehicleAhead
-from flock_follower.live_line import LiveLine
+from flock_desk.sensors.vio import Odometry
+from flock_desk.simulator_outputs import LATCHED, ODOMETRY, SimulatorOutputs, VehicleAhead
+from flock_desk.vehicles.embedded import STEP
+from flock_follower.bags.live_line import LiveLine
+from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
@@ -73,6 +74,7 @@ LATE = 0.5  # s behind the clock from which on /diagnostics complains
 POSES_LATE_NS = 40_000_000
 #: Messages taken in each service period: the vehicle ahead sends at 50 Hz, too.
 MESSAGES = 3
+PICTURE_PERIOD = 10.0  # s between images that are logged
 
 SPECS = [
     Spec('scenario', 'indoor',
@@ -162,7 +164,8 @@ class Simulator(FlockNode):
         self._flight = RealTimeFlight(
             scenario, seed, self._vehicle, camera,
             LATEST_NS + POSES_LATE_NS if external else LATEST_NS, leader)
-        self._log = RealTimeLog(self._vehicle.log, self._epoch_ns, self._start)
+        self._log = self._vehicle.log
+        self._next_picture = -math.inf
         if self.context.ok():  # else interrupted meanwhile
             self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
                                    'mode and planner/engage')
@@ -211,7 +214,8 @@ class Simulator(FlockNode):
             while self.context.ok() and not self._finished():
                 self._wait(next_service)
                 now = time.monotonic()
-                while self._end.known(now) >= self._step_due():
+                while (now if self._external is None
+                       else self._external.known(now)) >= self._step_due():
                     self._step()
                     if self._external is None:
                         break  # lost time is flown through, but the bridge is answered between
@@ -234,15 +238,36 @@ class Simulator(FlockNode):
             self._end.close()
         self._line.end()
         if self._values['log'] and self.context.ok():
-            sources, clock = ({}, []) if self._external is None else (
-                self._external.sources, self._external.follower.motion.times)
             try:
-                self._log.save(self._values['log'], self._flight, self._duration, sources, clock,
-                               self._early)
+                self._save_log()
             except OSError as error:
                 print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
                 return 1
         return 0
+
+    def _save_log(self) -> None:
+        """
+        Write the log.
+
+        Besides the rows it has ``epoch_ns``, ROS time, and ``start``, monotonic s, of the start;
+        ``began`` and ``ended``, monotonic s, of the scenario, what came after is left out;
+        ``skipped_images``; ``pose_source`` and ``pose_source_of_leader``, the messages that placed
+        vehicles flown elsewhere, else '', and ``clock`` (c, 2), s, our time and the follower's;
+        ``duration``, s, that was to be flown, and ``ended_early``, why it was not, else ''.
+        """
+        flight = self._flight
+        sources, clock = ({}, []) if self._external is None else (
+            self._external.sources, self._external.follower.motion.times)
+        began = math.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9
+        ended = self._start + flight.time_ns * 1e-9
+        flown, why = self._early or (self._duration, '')
+        if flight.time > flown + STEP and began + flown < ended:
+            ended = began + flown
+        self._log.save(
+            self._values['log'], epoch_ns=self._epoch_ns, start=self._start, began=began,
+            ended=ended, duration=self._duration, ended_early=why,
+            skipped_images=flight.skipped_images, pose_source=sources.get('vehicle', ''),
+            pose_source_of_leader=sources.get('leader', ''), clock=np.reshape(clock, (-1, 2)))
 
     def _finished(self) -> bool:
         """Return whether the scenario is flown, and an external vehicle has landed."""
@@ -261,38 +286,49 @@ class Simulator(FlockNode):
 
     def _wait(self, next_service: float) -> None:
         """Receive from the autopilot until the next step, image or service is due."""
-        wake = min(self._end.wake(self._step_due()), next_service,
+        # An external vehicle is stepped once a pose has come, which ends the wait.
+        wake = min(self._step_due() if self._external is None else math.inf, next_service,
                    self._start + self._outputs.next_image)
         self._end.receive(wake - time.monotonic())
 
     def _step(self) -> None:
         due = self._step_due()
         self._lateness.add(time.monotonic() - due)
-        self._flight.before_step()
+        if isinstance(self._vehicle, EmbeddedVehicle):  # an external simulator has its own wind
+            self._vehicle.autopilot.controller.wind = self._flight.scenario.wind(self._flight.time)
         self._end.step(due)
         if isinstance(self._vehicle, ExternalVehicle) and self._external is not None:
             autopilot = self._external.follower
             self._vehicle.armed, self._vehicle.mode = autopilot.armed, autopilot.mode
         arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
-        self._log.distance(due, self._flight.distance)
-        self._outputs.motion(self._epoch_ns + self._flight.time_ns, self._flight.follower)
+        now_ns = self._epoch_ns + self._flight.time_ns
+        self._log.add('distance', due, self._flight.distance)
+        self._outputs.motion(now_ns, self._flight.follower)
         for sampled_ns, estimate in arrived:
-            stamp_ns = self._epoch_ns + sampled_ns
-            self._outputs.odometry(stamp_ns, estimate)
-            self._log.odometry(stamp_ns, estimate)
+            self._outputs.odometry(ODOMETRY, self._epoch_ns + sampled_ns, estimate)
+            self._log.add('odom', self._epoch_ns + sampled_ns, *_logged(estimate))
         if (distance := self._flight.measured()) is not None:
-            self._outputs.range(self._epoch_ns + self._flight.time_ns, distance)
+            self._outputs.range(now_ns, distance)
         began = time.monotonic()
         frame = self._flight.look(round((began - self._start) * 1e9))
         if frame is not None:
             self._rendering.add(time.monotonic() - began)
-            stamp_ns = self._epoch_ns + frame.stamp_ns
-            self._outputs.image(stamp_ns, frame)
-            self._log.image(stamp_ns, frame)
+            self._take_image(self._epoch_ns + frame.stamp_ns, frame)
+
+    def _take_image(self, stamp_ns: int, frame: RenderedImage) -> None:
+        """Publish an image; log its truth, and some images, from the first leader on."""
+        self._outputs.image(stamp_ns, frame)
+        if frame.leader is None:
+            return
+        self._log.add('image', stamp_ns, frame.usable, *_logged(frame.follower),
+                      *_logged(frame.leader))
+        if frame.time >= 0.0 and stamp_ns >= self._next_picture:
+            self._next_picture = stamp_ns + PICTURE_PERIOD * 1e9
+            self._log.add('picture', stamp_ns, frame.pixels)
 
     def _take_state(self, message: String) -> None:
         self._state = message.data
-        self._log.planner(time.monotonic(), message.data)
+        self._log.add('planner', time.monotonic(), message.data)
 
     def _take_permission(self, message: String) -> None:
         assert isinstance(self._vehicle, ExternalVehicle)
@@ -332,6 +368,12 @@ class Simulator(FlockNode):
         where = 'no leader' if math.isnan(apart) else f'distance {apart:.2f} m'
         self._line.show(f'{when}  {where}  {self._state or "no planner":<6}  '
                         f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
+
+
+def _logged(state: Odometry) -> tuple[Array, Array, Array]:
+    """Return position, quaternion, and the velocity in the odom frame."""
+    return (state.position, state.quaternion,
+            quaternion_to_matrix(state.quaternion) @ state.linear)
 
 
 def main(args: list[str] | None = None) -> int:

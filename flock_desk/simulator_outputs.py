@@ -12,52 +12,65 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the simulator node publishes: images, odometry, and where the vehicles truly are."""
+"""
+The topics of the simulator node: images, odometry, and where the vehicles truly are.
+
+Stamps are in ns. The vehicle of another simulator node can be the leader of this one.
+"""
 
 from __future__ import annotations
 
 from array import array
 from collections import deque
+from collections.abc import Sequence
+import contextlib
 import math
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
+import numpy as np
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, Range
 
+from flock_desk.closed_loop.flown import ExternalLeader
 from flock_desk.closed_loop.real_time_flight import RenderedImage
-from flock_desk.sensors.vio import Odometry as Motion
+from flock_desk.external.external_motion import ExternalMotion, Motion
+from flock_desk.sensors.vio import Odometry as TrueMotion
+from flock_follower.geometry import normalize_quaternion
+from flock_follower.messages import from_odometry
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.diagnostics import Rate
+from flock_follower.nodes.support.runtime import FlockNode
 
 ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
     'odom', 'base_link', 'leader', 'camera_optical_frame')
 MOTION_PERIOD_NS = 20_000_000
+SILENT_NS = 500_000_000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ODOMETRY, OWN_TRUTH, LEADER_TRUTH, MOTION = (
+    'odom', 'truth/odom', 'truth/neighbors', 'truth/motion')
+#: The vehicle of each topic of odometry, by the name of its frame.
+_VEHICLES = {ODOMETRY: BODY_FRAME, OWN_TRUTH: BODY_FRAME, LEADER_TRUTH: LEADER, MOTION: BODY_FRAME}
 
 
 class SimulatorOutputs:
     """
-    Publishes, with stamps in ns; images are kept until they have been under way for long enough.
+    Publishes; images are kept until they have been under way for long enough.
 
     :param info: the camera's calibration.
     :param rate: of images sent.
     """
 
-    def __init__(self, node: Node, info: CameraInfo, rate: Rate) -> None:
+    def __init__(self, node: FlockNode, info: CameraInfo, rate: Rate) -> None:
         self._info, self._rate = info, rate
         self._info.header.frame_id = CAMERA_FRAME
         self._pending: deque[tuple[int, RenderedImage]] = deque()
-        self._odometry = node.create_publisher(Odometry, 'odom', 10)
-        self._images = node.create_publisher(Image, 'image_raw', qos_profile_sensor_data)
-        self._infos = node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
-        self._ranges = node.create_publisher(Range, 'ranges', qos_profile_sensor_data)
-        self._true_own = node.create_publisher(Odometry, 'truth/odom', 10)
-        self._armed_at = node.create_publisher(
-            PointStamped, 'mavlink_bridge/armed_at', LATCHED)
-        self._true_leader = node.create_publisher(Odometry, 'truth/neighbors', 10)
-        self._motion = node.create_publisher(Odometry, 'truth/motion', 10)
+        self._odometry = {topic: node.create_publisher(Odometry, topic, 10)
+                          for topic in _VEHICLES}
+        self._images, self._infos, self._ranges = (
+            node.create_publisher(kind, topic, qos_profile_sensor_data) for kind, topic in (
+                (Image, 'image_raw'), (CameraInfo, 'camera_info'), (Range, 'ranges')))
+        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', LATCHED)
         self._motion_sent = 0
 
     def armed_below(self) -> None:
@@ -66,16 +79,17 @@ class SimulatorOutputs:
         message.header.frame_id = ODOM_FRAME
         self._armed_at.publish(message)
 
-    def motion(self, stamp_ns: int, true: Motion) -> None:
+    def odometry(self, topic: str, stamp_ns: int, motion: TrueMotion) -> None:
+        """Publish odometry, or a true motion."""
+        self._odometry[topic].publish(to_odometry(
+            nanoseconds_to_stamp(stamp_ns), ODOM_FRAME, _VEHICLES[topic], *motion[1:]))
+
+    def motion(self, stamp_ns: int, true: TrueMotion) -> None:
         """Publish the vehicle's true motion at 50 Hz, where another simulator wants it."""
         if stamp_ns - self._motion_sent >= MOTION_PERIOD_NS and (
-                self._motion.get_subscription_count()):
+                self._odometry[MOTION].get_subscription_count()):
             self._motion_sent = stamp_ns
-            self._motion.publish(_message(stamp_ns, BODY_FRAME, true))
-
-    def odometry(self, stamp_ns: int, estimate: Motion) -> None:
-        """Publish odometry."""
-        self._odometry.publish(_message(stamp_ns, BODY_FRAME, estimate))
+            self.odometry(MOTION, stamp_ns, true)
 
     def range(self, stamp_ns: int, distance: float) -> None:
         """Publish a measured distance to the leader, m."""
@@ -86,9 +100,9 @@ class SimulatorOutputs:
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Publish the truth of an image, and keep the image until it is due."""
-        self._true_own.publish(_message(stamp_ns, BODY_FRAME, frame.follower))
+        self.odometry(OWN_TRUTH, stamp_ns, frame.follower)
         if frame.leader is not None:
-            self._true_leader.publish(_message(stamp_ns, LEADER, frame.leader))
+            self.odometry(LEADER_TRUTH, stamp_ns, frame.leader)
         self._pending.append((stamp_ns, frame))
 
     @property
@@ -111,7 +125,29 @@ class SimulatorOutputs:
             self._rate.tick(now)
 
 
-def _message(stamp_ns: int, child: str, motion: Motion) -> Odometry:
-    return to_odometry(
-        nanoseconds_to_stamp(stamp_ns), ODOM_FRAME, child, motion.position, motion.quaternion,
-        motion.linear, motion.angular, motion.pose_covariance, motion.twist_covariance)
+class VehicleAhead:
+    """Receives the true motion of the vehicle of another simulator node on a topic."""
+
+    def __init__(self, node: FlockNode, topic: str) -> None:
+        self._motion = ExternalMotion()
+        node.subscribe(Odometry, topic, self._take, QoSProfile(depth=10))
+
+    def left(self, now_ns: int) -> int | None:
+        """Return the time of its last motion, ns, if it is silent since then; else None."""
+        newest = self._motion.newest
+        return newest if newest is not None and now_ns - newest > SILENT_NS else None
+
+    def leader(self, epoch_ns: int, offset: Sequence[float]) -> ExternalLeader:
+        """
+        Return it as the leader of a flight that begins at ``epoch_ns`` of ROS time.
+
+        :param offset: (3,), m, where the odom frame of that vehicle begins in ours.
+        """
+        return ExternalLeader(self._motion, epoch_ns, np.asarray(offset, dtype=float))
+
+    def _take(self, message: Odometry) -> None:
+        state = from_odometry(message)
+        with contextlib.suppress(ValueError):  # not normalizable: no attitude
+            self._motion.add(Motion(
+                state.stamp, state.position, state.velocity,
+                normalize_quaternion(state.quaternion), state.angular_velocity))

@@ -52,9 +52,9 @@ from flock_follower.checks.findings import (
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.checks.topic_names import full_name, parse_remaps
+from flock_follower.files import resource
 from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
-from flock_follower.resources import resource
 
 SECONDS = 6.0
 MOST_SECONDS = 600.0

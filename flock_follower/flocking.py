@@ -91,7 +91,7 @@ class FlockingParams(Checked):
         :param differences: neighbours' velocities minus the own one, (m, n), m/s.
         """
         own = np.zeros((1, differences.shape[1]))
-        return _sum_over_neighbors(offsets, differences,
+        return sum_over_neighbors(offsets, differences,
                                    disagreement(np.vstack([own, differences])), self, 'flocking')
 
 
@@ -109,7 +109,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     :raises ValueError: for another model, other shapes, or values not finite or beyond 1e100.
     """
     x, v = checked(positions, velocities)
-    return _sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
+    return sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
                                disagreement(v), params, model)
 
 
@@ -173,9 +173,14 @@ def disagreement(velocities: Array) -> float:
     return float(np.linalg.norm(velocities - velocities.mean(axis=0))) if len(velocities) else 0.0
 
 
-def _sum_over_neighbors(offsets: Array, differences: Array, scale: float,
+def sum_over_neighbors(offsets: Array, differences: Array, scale: float,
                         params: FlockingParams, model: Model) -> Array:
-    """Return u, (..., n), from x_j - x_i and v_j - v_i, both (..., m, n), summed over j."""
+    """
+    Return u, (..., n), of agents from x_j - x_i and v_j - v_i, both (..., m, n), summed over j.
+
+    :param scale: L, m/s.
+    :raises ValueError: for another model.
+    """
     if model not in get_args(Model):
         raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')
     r2 = np.sum(offsets ** 2, axis=-1, keepdims=True)

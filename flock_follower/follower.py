@@ -39,7 +39,6 @@ from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
@@ -140,7 +139,7 @@ class Follower:
     Perception, planner and setpoint control on one clock; every time is in ns.
 
     :param planner: gathers inputs and takes one step per tick, with ``params``.
-    :param control: the setpoint gate; None while the bridge is dead.
+    :param control: the setpoint gate.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None if neighbors come from elsewhere.
@@ -162,7 +161,7 @@ class Follower:
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.sharing = sharing
-        self.control: Gate | None = control
+        self._control = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
         self._rpy = camera_rpy if isinstance(camera_rpy, Mapping) else {'': camera_rpy}
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
@@ -178,7 +177,7 @@ class Follower:
         self._gate_received = 0
         self._state: State | None = None
         self._bridge_state = ''
-        self._bridge_ended = 0
+        self._bridge_ended: int | None = None  # when the bridge died, ns, while it is dead
 
     # Events.
 
@@ -187,25 +186,22 @@ class Follower:
         self.advance(time)
         self.planner.engage(requested)
 
-    def permit(self, time: int, event: Event) -> None:
-        """Take a request to the bridge, or its result; see ``permission``."""
+    def permit(self, time: int, since: float) -> None:
+        """Take a request for offboard, which HEARTBEATs after the time ``since``, s, answer."""
         self.advance(time)
-        if self.control is not None:
-            self.control.permit(event)
-            self._announce_bridge_state()
+        self._control.permit(self._control.permission.requested(since))
+        self._announce_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
         """Take the status of the vehicle."""
         self.advance(time)
-        if self.control is not None:
-            self.control.see(status, self._seconds(), airborne)
-            self._announce_bridge_state()
+        self._control.see(status, self._seconds(), airborne)
+        self._announce_bridge_state()
 
     def estimate(self, time: int, velocity: Array) -> None:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
-        if self.control is not None:
-            self.control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
+        self._control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
 
     def attitude(self, time: int, quaternion: Array, rates: Array) -> OdometryState | None:
         """
@@ -214,9 +210,9 @@ class Follower:
         :returns: the motion without odometry, while that is flown on.
         """
         self.advance(time)
-        motion = None if self.control is None else self.control.update_attitude(
+        motion = self._control.update_attitude(
             quaternion, rates, self._seconds(), self._seconds())
-        if motion is None:
+        if motion is None or self._bridge_ended is not None:
             return None
         motion = motion._replace(stamp=time)
         self._take_motion(time, motion)
@@ -226,21 +222,19 @@ class Follower:
     def height(self, time: int, altitude: float, height: float) -> None:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
-        if self.control is not None:
-            gate = self.control
-            gate.update_height(altitude, self._seconds())
-            if not gate.heights.referenced:
-                gate.heights.refer(height, self._seconds())
+        self._control.update_height(altitude, self._seconds())
+        if not self._control.heights.referenced:
+            self._control.heights.refer(height, self._seconds())
 
     def bridge_died(self, time: int) -> None:
         """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
         self.advance(time)
-        self._bridge_ended, self.control = self._now, None
+        self._bridge_ended = self._now
 
     def bridge_started(self, time: int, control: Gate) -> None:
         """Let a new bridge start, which knows nothing of the one before."""
         self.advance(time)
-        self.control = control
+        self._control, self._bridge_ended = control, None
         self._announce_bridge_state()
 
     def odometry(self, time: int, state: OdometryState) -> None:
@@ -360,8 +354,8 @@ class Follower:
                 self._tick()
             else:
                 self._next_cycle += self._cycle
-                if self.control is not None:
-                    self._send(self.control)
+                if self._bridge_ended is None:
+                    self._send()
 
     def _process_due(self) -> None:
         perceiver = self.perceiver
@@ -408,7 +402,8 @@ class Follower:
             for event in self.sharing.new_events():
                 self._listener.rejected(*event)
         start = self._cpu_time()
-        bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_ended) * 1e-9
+        bridge_age = (0.0 if self._bridge_ended is None
+                      else (self._now - self._bridge_ended) * 1e-9)
         decision, command = self.planner.tick(self._now, self.params, bridge_age)
         cpu = self._cpu_time() - start
         for rejection in decision.rejected:
@@ -424,15 +419,15 @@ class Follower:
                 message = trajectory(self._make, command)
                 self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
                 command = from_trajectory(message, self._odom_frame)
-            if self.control is not None:
+            if self._bridge_ended is None:
                 age, source_age = command.ages(self._now)
-                if refused := self.control.take_command(
+                if refused := self._control.take_command(
                         command, age, self._seconds(), source_age):
                     self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
         self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
 
-    def _send(self, control: Gate) -> None:
-        start = self._cpu_time()
+    def _send(self) -> None:
+        start, control = self._cpu_time(), self._control
         state, self._gate_odometry = self._gate_odometry, None
         if state is not None:  # the newest since the last cycle: no other counts
             received = self._seconds(self._gate_received)
@@ -452,9 +447,8 @@ class Follower:
 
     def _announce_bridge_state(self) -> None:
         """Pass a new announcement of the bridge to the planner."""
-        assert self.control is not None
-        text = self.control.permission.announced()
-        if text != self._bridge_state:
+        text = self._control.permission.announced()
+        if text != self._bridge_state and self._bridge_ended is None:
             self._bridge_state = text
             self.planner.take_bridge_state(text, 0.0)
 

@@ -356,29 +356,27 @@ def trajectory(make: Make, command: Command) -> Any:
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
     message.header.frame_id = RELATIVE if command.relative else command.frame
-    message.joint_names = ['base_link']
-    transform = make('geometry_msgs/msg/Transform')
-    velocity, acceleration = make('geometry_msgs/msg/Twist'), make('geometry_msgs/msg/Twist')
-    for nothing in (transform.translation, velocity.linear):
-        set_vector(nothing, [math.nan] * 3)
+    joints = {'base_link': command.acceleration}
+    if command.separation_axis is not None:
+        joints[SEPARATION] = command.separation_axis
+    if command.thrust_bias:
+        joints[THRUST_BIAS] = [0.0, 0.0, command.thrust_bias]
+    message.joint_names = list(joints)
+    transform, velocity = make('geometry_msgs/msg/Transform'), _twist(make, [math.nan] * 3)
+    set_vector(transform.translation, [math.nan] * 3)
     set_quaternion(transform.rotation, quaternion_from_yaw(command.yaw))
     velocity.angular.z = float(command.yaw_rate)
-    set_vector(acceleration.linear, command.acceleration)
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
-    point.transforms, point.velocities, point.accelerations = (
-        [transform], [velocity], [acceleration])
-    more = [] if command.separation_axis is None else [(SEPARATION, command.separation_axis)]
-    if command.thrust_bias:
-        more.append((THRUST_BIAS, np.array([0.0, 0.0, command.thrust_bias])))
-    for name, vector in more:
-        beside = make('geometry_msgs/msg/Twist')
-        set_vector(beside.linear, vector)
-        message.joint_names = [*message.joint_names, name]
-        point.transforms = [*point.transforms, transform]
-        point.velocities = [*point.velocities, velocity]
-        point.accelerations = [*point.accelerations, beside]
+    point.transforms, point.velocities = [transform] * len(joints), [velocity] * len(joints)
+    point.accelerations = [_twist(make, vector) for vector in joints.values()]
     set_stamp(point.time_from_start, command.ahead)
     message.points = [point]
+    return message
+
+
+def _twist(make: Make, linear: ArrayLike) -> Any:
+    message = make('geometry_msgs/msg/Twist')
+    set_vector(message.linear, linear)
     return message
 
 

@@ -21,7 +21,7 @@ from memory_line import MemoryLine
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import STEP
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link

@@ -48,8 +48,7 @@ os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
     HERE.parent / 'config' / 'fastdds.xml')
 
 #: Modules of the packages that import rclpy.
-NODES = ('flock_follower.nodes', 'flock_desk.simulator_', 'flock_desk.recorder_node',
-         'flock_desk.vehicle_ahead')
+NODES = 'flock_follower.nodes', 'flock_desk.simulator_', 'flock_desk.recorder_node'
 
 settings.register_profile(
     'repeatable', derandomize=True, deadline=None, print_blob=False,

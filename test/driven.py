@@ -54,21 +54,30 @@ class Driven:
         self.now = START
         self.sent: dict[str, list[Any]] = defaultdict(list)
         self.diagnostics = node.diagnostics
-        self.counters, self.values = node.diagnostics.counters, node.diagnostics.values
+        self.counters = node.diagnostics.counters
         space = node.get_namespace().rstrip('/')
         for publisher in node.publishers:
             name = publisher.topic_name.removeprefix(f'{space}/').lstrip('/')
             publisher.publish = self.sent[name].append
 
-    def give(self, topic: str, message: Any, number: int | None = None) -> None:
-        """Pass a message to the callbacks of a topic."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Return the values of /diagnostics."""
+        found = dict(self.diagnostics.values)
+        for part in self.diagnostics.parts.values():
+            found |= part
+        return found
+
+    def give(self, topic: str, message: Any, number: int | None = None,
+             received: int | None = 0) -> None:
+        """Pass a message to the callbacks of a topic, some with its number and its arrival, ns."""
         name = self.node.resolve_topic_name(topic)
         subscriptions = [s for s in self.node.subscriptions if s.topic_name == name]
         assert subscriptions, f'{topic} is not subscribed'
+        info = {'publication_sequence_number': number, 'received_timestamp': received}
         for each in subscriptions:
             informed = each._callback_type is Subscription.CallbackType.WithMessageInfo
-            each.callback(as_taken(each, message), *([{
-                'publication_sequence_number': number, 'received_timestamp': 0}] * informed))
+            each.callback(as_taken(each, message), *([info] if informed else []))
 
     def turn(self) -> None:
         """Call the timers that are due."""

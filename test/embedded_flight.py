@@ -19,7 +19,7 @@ import math
 from faulty_autopilot import FaultyAutopilot
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import STEP
 
 MASK_YAW, MASK = 0x83F, 0xC3F
 #: DO_SET_MODE's param2 and param3.

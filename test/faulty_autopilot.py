@@ -32,8 +32,7 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
-from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.mavlink_vehicle import global_position, STEP
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 
@@ -139,7 +138,7 @@ class FaultyAutopilot(EmbeddedAutopilot):
             if begins <= since and fault not in self._begun:
                 self._begun.add(fault)
                 self._begin(fault, now)
-        self.equipment.barometer.offset = sum(
+        self.barometer.offset = sum(
             f.offset for f in self.faults if f.kind == 'barometer' and f.active(since))
         return self._sent.carry([*self._answers([], now), *super().step(now)], since)
 
@@ -149,7 +148,7 @@ class FaultyAutopilot(EmbeddedAutopilot):
         elif fault.kind == 'pilot':
             self.controller.pilot_switches(fault.mode, fault.climb)
         elif fault.kind == 'battery':
-            self.equipment.charge = fault.remaining
+            self.charge = fault.remaining
 
     def _answers(self, datagrams, now):
         answers = []
@@ -224,7 +223,7 @@ class TruthLink:
             mavlink.MAV_TYPE_QUADROTOR, controller.PROFILE.autopilot,
             mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             | mavlink.MAV_MODE_FLAG_SAFETY_ARMED * controller.armed,
-            controller.custom_mode, controller.system_status, 3)
+            controller.PROFILE.modes[controller.mode].number, controller.system_status, 3)
 
     def _truth(self, now):
         vehicle = self._flown.vehicle

@@ -45,12 +45,11 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure
+from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.messages import Command, OdometryState
 
 FOLDER = Path(__file__).resolve().parent / 'frozen'
@@ -129,7 +128,7 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
                 np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(6), np.eye(3)), now, now)
         match k % 100:
             case 0 | 25 | 50 | 75:
-                bridge.gate.permit(OffboardRequested(now))
+                bridge.gate.permit(bridge.gate.permission.requested(now))
             case 30:
                 bridge.requests.arm(True, now)
             case 60:

@@ -81,21 +81,17 @@ class MessageFuzzer:
 
     def _spoil_one(self, message):
         r = self.random
-        fields = list(message.get_fields_and_field_types().items())
-        name, kind = r.choice(fields)
-        inner = getattr(message, name)
-        if hasattr(inner, 'get_fields_and_field_types') and r.random() < 0.9:
-            self._spoil_one(inner)
-        elif isinstance(inner, list) and inner and r.random() < 0.8 and hasattr(
-                inner[0], 'get_fields_and_field_types'):
-            self._spoil_one(r.choice(inner))
-        elif _ARRAY.fullmatch(kind) and r.random() < 0.7:
-            element = _ARRAY.fullmatch(kind)[1]
-            values = list(inner)
-            values[r.randrange(len(values))] = self.value(element)
-            setattr(message, name, values)
-        else:
-            setattr(message, name, self.value(kind))
+        name, kind = r.choice(list(message.get_fields_and_field_types().items()))
+        inner, array = getattr(message, name), _ARRAY.fullmatch(kind)
+        part = r.choice(inner) if isinstance(inner, list) and inner else inner
+        if hasattr(part, 'get_fields_and_field_types') and r.random() < 0.9:
+            self._spoil_one(part)
+            return
+        value = self.value(kind)
+        if array and r.random() < 0.7:
+            value = list(inner)
+            value[r.randrange(len(value))] = self.value(array[1])
+        setattr(message, name, value)
 
     def _several(self, kind, count):
         if kind == 'uint8':

@@ -29,7 +29,7 @@ import time
 
 from builtin_interfaces.msg import Time
 import cv2
-from driven import as_taken, overrides
+from driven import Driven, overrides
 from fuzz_mavlink import FuzzError, judge_odometry, judge_setpoint, LONGEST, no_hang, place
 from fuzz_messages import MessageFuzzer
 from geometry_msgs.msg import Transform, Twist
@@ -38,7 +38,6 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 from rclpy.logging import LoggingSeverity
-from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header, String
@@ -70,13 +69,12 @@ _GRAY = render(_CAMERA, {0: facing((0.0, 0.0, 0.8), (0.1, 0.1, 0.0))})
 _FILES = [cv2.imencode(form, _GRAY)[1].tobytes() for form in ('.png', '.jpg')]
 
 
-class NodeUnderFire:
+class NodeUnderFire(Driven):
     """One node without an executor, in a time of its own."""
 
     def __init__(self, kind, seed):
         self.fuzzer = MessageFuzzer(seed)
         self.random = self.fuzzer.random
-        self.now_ns = 1_000_000_000_000
         self.published = Counter()
         self.given = 0
         self.autopilot = self._line = None
@@ -86,7 +84,8 @@ class NodeUnderFire:
             self.autopilot = EmbeddedAutopilot('px4', now=time.monotonic(), seed=seed)
             host, port = self._line.address
             parameters = {**parameters, 'connection': f'udpout:{host}:{port}'}
-        self.node = make(parameter_overrides=overrides(use_sim_time=True, **parameters))
+        super().__init__(make(parameter_overrides=overrides(use_sim_time=True, **parameters)))
+        self.now = 1_000_000_000_000
         self.node.get_logger().set_level(LoggingSeverity.FATAL)
         self.errors = []
         self.node.diagnostics.internal_error = self._note_error
@@ -100,7 +99,6 @@ class NodeUnderFire:
 
     def _take_over(self):
         """Ask for offboard until the vehicle flies the setpoints: before, no command gets far."""
-        service = next(s for s in self.node.services if s.srv_name.endswith('offboard'))
         asking = answer = None
         deadline = time.monotonic() + 20.0
         while self.node._bridge.gate.permission.phase is not Phase.ACTIVE:
@@ -109,8 +107,8 @@ class NodeUnderFire:
             time.sleep(0.005)
             self._exchange()
             if asking is None:
-                asking = service.callback(
-                    service.srv_type.Request(data=True), service.srv_type.Response())
+                asking = self.call('offboard', data=True)
+            self.turn()
             try:
                 asking.send(None)
             except StopIteration as end:  # refused while nothing is heard yet
@@ -118,24 +116,25 @@ class NodeUnderFire:
 
     def close(self):
         """Release everything."""
-        self.node.destroy_node()
+        super().close()
         if self._line is not None:
             self._line.close()
 
     def fire(self):
         """Send one message to one callback, and now and then let a timer run or a service act."""
         r = self.random
-        self.now_ns += PERIOD_NS
-        subscriptions = [s for s in self.node.subscriptions
-                         if s.topic_name.lstrip('/') not in ('parameter_events',)]
-        subscription = r.choice(subscriptions)
+        self.now += PERIOD_NS
+        subscription = r.choice([s for s in self.node.subscriptions
+                                 if s.topic_name != '/parameter_events'])
         if subscription.msg_type is Clock:
             message = Clock(clock=self._stamp(jitter=r.random() < 0.01))
         else:
-            self._set_clock(subscriptions)
+            self.give('/clock', Clock(clock=self._stamp()))
             message = self._message(subscription.msg_type)
             self._address(subscription, message)
-        self._give(subscription, message)
+        self.given += 1  # how a message came: in order, or untold
+        self.give(subscription.topic_name, message, *r.choice(
+            [(self.given, 0), (self.given, time.time_ns()), (None, None)]))
         if r.random() < self._timer_share:
             for timer in self.node.timers:
                 timer.callback()
@@ -146,8 +145,8 @@ class NodeUnderFire:
 
     def tick(self, change=None):
         """Let every input have a good message, changed by a function, and every timer run."""
-        self.now_ns += PERIOD_NS
-        self._set_clock(self.node.subscriptions)
+        self.now += PERIOD_NS
+        self.give('/clock', Clock(clock=self._stamp()))
         for subscription in self.node.subscriptions:
             if subscription.msg_type in (
                     CameraInfo, Odometry, Image, CompressedImage, Header, String):
@@ -156,7 +155,7 @@ class NodeUnderFire:
                 self._address(subscription, message)
                 if change is not None:
                     change(message)
-                subscription.callback(as_taken(subscription, message))
+                self.give(subscription.topic_name, message)
         self._engage(True)
         for timer in self.node.timers:
             timer.callback()
@@ -177,27 +176,9 @@ class NodeUnderFire:
             if message.child_frame_id == 'base_link':
                 message.child_frame_id = 'f2'
 
-    def _give(self, subscription, message):
-        """Call a callback; where it wants to know how a message came: in order, or untold."""
-        message = as_taken(subscription, message)
-        if subscription._callback_type is not Subscription.CallbackType.WithMessageInfo:
-            subscription.callback(message)
-            return
-        self.given += 1
-        number, time_ns = self.random.choice(
-            [(self.given, 0), (self.given, time.time_ns()), (None, None)])
-        subscription.callback(message, {
-            'publication_sequence_number': number, 'received_timestamp': time_ns})
-
-    def _set_clock(self, subscriptions):
-        for subscription in subscriptions:
-            if subscription.msg_type is Clock:
-                subscription.callback(Clock(clock=self._stamp()))
-
     def _engage(self, value):
-        for service in self.node.services:
-            if service.srv_name.endswith('engage'):
-                service.callback(service.srv_type.Request(data=value), service.srv_type.Response())
+        if isinstance(self.node, Planner):
+            self.call('engage', data=value)
 
     def _message(self, kind):
         lot = self.random.random()
@@ -209,7 +190,7 @@ class NodeUnderFire:
         return message if lot < 0.5 else self.fuzzer.spoil(message, self.random.randint(1, 4))
 
     def _stamp(self, jitter=False):
-        now = self.now_ns + (self.random.randint(-10**9, 10**9) if jitter else 0)
+        now = self.now + (self.random.randint(-10**9, 10**9) if jitter else 0)
         return Time(sec=now // 10**9, nanosec=now % 10**9)
 
     def good(self, kind, of_leader=False):

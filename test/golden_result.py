@@ -25,12 +25,12 @@ from pathlib import Path
 import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.files import resource
 from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nanoseconds
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.pending_images import Perceiver
-from flock_follower.resources import resource
 
 GOLDEN = Path(__file__).resolve().parent / 'golden' / 'sample.csv'
 COLUMNS = 'topic,time,x,y,z,vx_or_yaw,vy,vz'

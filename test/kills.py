@@ -47,8 +47,8 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.bags.bag import deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS
-from flock_follower.resources import resource
 
 VICTIMS = ('planner', 'relative_pose', 'replay')
 LIMIT = 0.3  # s

@@ -36,6 +36,7 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.topic_names import names_there, TYPES
+from flock_follower.files import resource
 from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,
@@ -50,7 +51,6 @@ from flock_follower.geometry import (
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.parameters.files import read_parameters, TABLE
 from flock_follower.perception.camera import CameraModel
-from flock_follower.resources import resource
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

@@ -41,13 +41,6 @@ def run(name: str, *arguments: object, folder: Path) -> subprocess.CompletedProc
         env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True, timeout=60.0)
 
 
-def test_they_are_short() -> None:
-    pages = sorted(EXAMPLES.glob('*.[py]*'))
-    assert [page.stem for page in pages] == [
-        'bag_in_ci', 'bag_in_ci', 'law_alone', 'own_node', 'scenario_report']
-    assert all(len(page.read_text().splitlines()) < 65 for page in pages)
-
-
 def test_the_law_alone_draws_a_flock_that_agrees(tmp_path: Path) -> None:
     ended = run('law_alone.py', folder=tmp_path)
     assert ended.returncode == 0, ended.stderr
@@ -110,15 +103,3 @@ def test_the_workflow_judges_a_bag(tmp_path: Path) -> None:
     verdicts = {line.split(maxsplit=2)[2]: line.split()[0] for line in judged.stdout.splitlines()}
     assert verdicts['share of images in which the leader was found: at least 0.95'] == 'ok'
     assert judged.returncode == ('BROKEN' in verdicts.values())
-
-
-def test_a_broken_bound_ends_the_workflow(tmp_path: Path) -> None:
-    summary = {
-        'recall': 0.5, 'distance_m': {'min': 1.5}, 'distance_rms_m': None,
-        'velocity_rms_m_s': None, 'planner': {'ticks': 10, 'states': {'TRACK': 10}},
-        'setpoints': {'brake': 0, 'command': 20}}
-    (tmp_path / 'summary.json').write_text(json.dumps(summary))
-    ended = run('bag_in_ci.py', 'summary.json', folder=tmp_path)
-    assert ended.returncode == 1
-    assert [line.split()[0] for line in ended.stdout.splitlines()] == [
-        'BROKEN', 'ok', 'ok', 'ok', 'unknown', 'unknown']

@@ -154,24 +154,6 @@ def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
     assert r2.max() == pytest.approx(2.0049, abs=1e-4)
 
 
-def euler_holds_the_band(dt: float, velocity_first: bool) -> bool:
-    x, v = LEADER_FOLLOWER
-    for n in range(round(10.0 / dt)):
-        t = n * dt
-        u = np.stack([leader_input(t, t >= 1.25 - 1e-9), accelerations(x, v, PAPER)[1]])
-        before, v = v, v + dt * u
-        x = x + dt * (v if velocity_first else before)
-        if not PAPER.d0 < np.sum((x[0] - x[1]) ** 2) < PAPER.d1:
-            return False
-    return True
-
-
-def test_explicit_euler_leaves_the_band_where_velocity_first_holds_it() -> None:
-    assert not euler_holds_the_band(0.02, velocity_first=False)
-    assert euler_holds_the_band(0.01, velocity_first=False)
-    assert euler_holds_the_band(0.1, velocity_first=True)
-
-
 @st.composite
 def flocks(draw: st.DrawFn) -> tuple[Array, Array]:
     """Return positions and velocities (k, n), in and out of the band but not at its very edge."""
@@ -327,9 +309,3 @@ def test_bad_states_are_refused_with_what_to_change(positions: Any, velocities: 
             function(positions, velocities, PAPER)
     with pytest.raises(ValueError, match=f'relative_{message}'.replace(' velocities ', ' .*')):
         acceleration(positions, velocities, PAPER)
-
-
-def test_an_unknown_model_is_refused_with_the_known_ones() -> None:
-    model: Any = 'vicsek'
-    with pytest.raises(ValueError, match=r"^model = 'vicsek': must be one of flocking, cucker_d"):
-        accelerations(*LEADERLESS, PAPER, model)

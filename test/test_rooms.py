@@ -28,13 +28,13 @@ from pathlib import Path
 import sys
 from typing import NamedTuple
 
-from conftest import is_ros, loads_ros
+from conftest import is_ros
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'geometry', 'live_line', 'ranges', 'resources', 'whole_file'}
+SHARED = {'files', 'geometry', 'ranges'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
@@ -48,16 +48,15 @@ ROOMS = {
     'bags': ('', 'mcap numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
-    'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
     'follower': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
-    'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink yaml'),
-    'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
-              'planner support visualization', 'ROS numpy'),
+    'support': ('checks mavlink messages odometry parameters planner',
+                'ROS numpy pymavlink yaml'),
+    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support',
+              'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),
     'external': ('mavlink', 'numpy pymavlink'),
@@ -73,24 +72,15 @@ ROOMS = {
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
                    'mavlink messages nodes parameters perception planner runs scenarios '
-                   'sensors support vehicles', 'ROS cv2 numpy yaml'),
+                   'sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
 }
-HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy', 'tqdm'}  # not on a drone
-IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')
-
-
-class Import(NamedTuple):
-    """One module that another one imports."""
-
-    name: str
-    ours: bool
-    at_start: bool  # not only when a function runs, or if it is installed
 
 
 class Module(NamedTuple):
-    path: Path
     room: str
-    imports: list[Import]
+    ours: set[str]
+    """Modules of the packages that it imports."""
+    libraries: set[str]
 
 
 def module_names() -> dict[str, Path]:
@@ -99,26 +89,14 @@ def module_names() -> dict[str, Path]:
             for package in PACKAGES for path in sorted((ROOT / package).rglob('*.py'))}
 
 
-def imports_of(tree: ast.Module, names: dict[str, Path]) -> Iterator[Import]:
-    def resolved(name: str, at_start: bool) -> Import:
-        library = name.partition('.')[0]
-        if library not in PACKAGES:
-            return Import(library, False, at_start)
-        while name not in names:  # the rest is the name of a class or function
-            name = name.rpartition('.')[0]
-        return Import(name, True, at_start)
-
-    def visit(node: ast.AST, at_start: bool) -> Iterator[Import]:
+def imports_of(path: Path) -> Iterator[str]:
+    """Yield the names that a module imports anywhere, of modules or of what they hold."""
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (resolved(alias.name, at_start) for alias in node.names)
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.module and not node.level, 'a relative import hides the module'
-            yield from (resolved(f'{node.module}.{a.name}', at_start) for a in node.names)
-        later = isinstance(node, ast.FunctionDef | ast.Try)
-        for child in ast.iter_child_nodes(node):
-            yield from visit(child, at_start and not later)
-
-    return visit(tree, True)
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
 
 
 def room_of(name: str, path: Path) -> str:
@@ -130,10 +108,17 @@ def room_of(name: str, path: Path) -> str:
 
 
 def read_house() -> dict[str, Module]:
-    names = module_names()
-    return {name: Module(path, room_of(name, path),
-                         list(imports_of(ast.parse(path.read_text()), names)))
-            for name, path in names.items()}
+    names, house = module_names(), {}
+    for name, path in names.items():
+        house[name] = Module(room_of(name, path), set(), set())
+        for target in imports_of(path):
+            if target.partition('.')[0] not in PACKAGES:
+                house[name].libraries.add(target.partition('.')[0])
+                continue
+            while target not in names:  # the rest is the name of a class or function
+                target = target.rpartition('.')[0]
+            house[name].ours.add(target)
+    return house
 
 
 HOUSE = read_house()
@@ -148,10 +133,10 @@ def arrows() -> dict[tuple[str, str], list[str]]:
     """
     found = defaultdict(list)
     for name, module in HOUSE.items():
-        for target in module.imports:
-            if target.ours and (room := HOUSE[target.name].room) != module.room and (
-                    not name.startswith(f'{target.name}.')):
-                found[module.room, room].append(f'{name} -> {target.name}')
+        for target in module.ours:
+            room = HOUSE[target].room
+            if room != module.room and not name.startswith(f'{target}.'):
+                found[module.room, room].append(f'{name} -> {target}')
     return dict(found)
 
 
@@ -172,17 +157,15 @@ def test_a_room_imports_only_what_it_may(room):
 @pytest.mark.parametrize('room', sorted(ROOMS))
 def test_a_room_uses_only_the_libraries_it_may(room):
     for name, module in HOUSE.items():
-        for target in module.imports:
-            if module.room == room and not target.ours and (
-                    target.name not in sys.stdlib_module_names):
-                library = 'ROS' if is_ros(target.name) else target.name
-                assert library in ROOMS[room][1].split(), f'{name} imports {target.name}'
+        if module.room == room:
+            used = {'ROS' if is_ros(library) else library
+                    for library in module.libraries - sys.stdlib_module_names}
+            assert used <= {*ROOMS[room][1].split()}, name
 
 
 def test_what_flies_imports_nothing_of_the_desk():
-    assert not [f'{name} -> {target.name}' for name, module in HOUSE.items()
-                for target in module.imports
-                if name.startswith('flock_follower') and target.name.startswith('flock_desk')]
+    assert not [f'{name} -> {target}' for name, module in HOUSE.items() for target in module.ours
+                if name.startswith('flock_follower') and target.startswith('flock_desk')]
 
 
 def test_no_rooms_import_each_other_in_a_circle():
@@ -190,24 +173,3 @@ def test_no_rooms_import_each_other_in_a_circle():
     for source, target in ARROWS:
         graph[source].add(target)
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
-
-
-@pytest.mark.parametrize('node', IN_FLIGHT)
-def test_what_flies_loads_no_bag_reader_and_no_heavy_library(node):
-    loaded: dict[str, Import] = {}
-    waiting = [Import(f'flock_follower.nodes.{node}', True, True)]
-    while waiting:
-        target = waiting.pop()
-        if target.at_start and target.name not in loaded:
-            loaded[target.name] = target
-            waiting += HOUSE[target.name].imports if target.ours else []
-    assert len(loaded) > 10
-    assert not [name for name in loaded if name in HEAVY or '.bags' in name]
-
-
-def test_a_test_is_told_to_need_ros_by_what_it_imports(request):
-    here = Path(__file__).parent
-    assert loads_ros(here / 'nodes' / 'test_planner_node.py')
-    assert loads_ros(here / 'nodes' / 'test_fuzz_nodes.py') and loads_ros(here / 'fuzz.py')
-    assert not loads_ros(Path(__file__)) and not loads_ros(here / 'conftest.py')
-    assert request.node.get_closest_marker('unit')

@@ -38,13 +38,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math
 
-from flock_desk.closed_loop.flights_log import Flights, FlightsLog
-from flock_desk.closed_loop.simulated_follower import SimulatedFollower
+from flock_desk.closed_loop.follower import SimulatedFollower
+from flock_desk.closed_loop.lookout import Lookout
+from flock_desk.closed_loop.metrics import Flights, FlightsLog
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
-from flock_desk.sensors.radio import Radio
-from flock_desk.sensors.sensing import PerceptionNoise
+from flock_desk.sensors.sensing import PerceptionNoise, Radio
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
@@ -65,29 +65,32 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     :param law: the law, or a controller in its place: see ``controllers``.
     """
-    world = World(scenario, runs, noise or _noise(scenario))
-    followers = _followers(scenario, runs, guard, world, cpu_time, law)
+    world, noise = World(scenario, runs), noise or _noise(scenario)
+    lookout = Lookout(world, noise)
+    followers = _followers(world, guard, noise, cpu_time, law)
     flock, radio = scenario.company, _radio(scenario, runs)
     failing = [] if flock.fails is None else followers[
         flock.fails.follower - 1::flock.followers]
     count = round(scenario.duration / STEP)
-    log = FlightsLog(world)
+    log = FlightsLog(world, lookout)
     for k in range(1, count + 1):
         now = k * STEP
         world.advance(k)
+        lookout.look(k)
         log.distances()
         if k % ODOMETRY_STEPS == 0:
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
             if scenario.flight.relative_flight:
                 attitudes = world.attitudes()
-                world.look_alone([follower.lean(now, matrix_to_quaternion(rotation))
-                                  for follower, rotation in zip(followers, attitudes)], attitudes)
+                lookout.look_alone(k, [follower.lean(now, matrix_to_quaternion(rotation))
+                                       for follower, rotation in zip(followers, attitudes)],
+                                   attitudes)
             for row, message in radio.arrived(now):
                 followers[row].receive(now, message)
         if k % PLANNER_STEPS == 0:
             for row, (follower, (looked, seen)) in enumerate(zip(
-                    followers, world.lookout.arrived(now))):
+                    followers, lookout.arrived(now))):
                 follower.plan(now, looked, seen)
                 radio.send(now, row, follower.outbox)
                 follower.outbox = []
@@ -98,8 +101,8 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.fail(now)
             failing = []
         if k % GATE_STEPS == GATE_STEPS // 2:
-            world.obey([follower.obey(now, *known, altitude) for follower, known, altitude in zip(
-                followers, world.flown(), world.heights(now).tolist())])
+            world.obey([follower.obey(now, *known)
+                        for follower, known in zip(followers, world.flown(now))])
     return log.flights()
 
 
@@ -112,24 +115,23 @@ def _noise(scenario: Scenario) -> PerceptionNoise:
                    half_height=flock.half_width * usual.half_height / usual.half_width)
 
 
-def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: World,
+def _followers(world: World, guard: bool, noise: PerceptionNoise,
                cpu_time: Callable[[], float],
                law: type[FlockingParams]) -> list[SimulatedFollower]:
     """Return the follower of every row."""
-    flock = scenario.company
-    aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
+    scenario, flock = world.scenario, world.scenario.company
+    aside, up = math.atan(noise.half_width), math.atan(noise.half_height)
     # The planner keeps neighbours in the view ahead, unless cameras look to all sides.
     ahead = 'front' in flock.cameras and not flock.all_round
     view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []
-    for row, (start, yaw) in enumerate(zip(world.starts, world.yaws.tolist())):
-        name = flock.names[1 + row % flock.followers]
+    for (run, number), start, yaw in zip(world.rows, world.starts, world.yaws.tolist()):
+        name = flock.names[number]
         frame, T_world_odom = ('odom', Transform()) if scenario.flock is None else (
             f'{name}/odom', Transform.from_quaternion(
                 start * [1.0, 1.0, 0.0], quaternion_from_yaw(yaw)))
         followers.append(SimulatedFollower(
-            scenario, guard, runs[row // flock.followers], frame, T_world_odom.inverse(), start,
-            view, name, cpu_time, law))
+            scenario, guard, run, frame, T_world_odom.inverse(), start, view, name, cpu_time, law))
     return followers
 
 

@@ -26,18 +26,19 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from flock_desk.closed_loop.world import ODOMETRY_STEPS, World
 from flock_desk.scenarios.courses import STEP
-from flock_desk.scenarios.flock import Flock, LEADER
-from flock_desk.scenarios.scenario import Scenario
-from flock_desk.sensors.radio import Radios
+from flock_desk.scenarios.flock import LEADER
+from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import (
     facing,
     hidden,
     in_view,
     PerceptionNoise,
+    Radios,
     relative_noise,
 )
-from flock_desk.sensors.vio import GaussMarkov, turned, Vio
+from flock_desk.sensors.vio import Due, GaussMarkov, turned
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -60,62 +61,46 @@ _CENTRE = np.zeros(3)
 _STILL, _STANDING = np.zeros(3), 1e-4 * np.eye(3)  # m/s, and its covariance: of a print
 
 
-class Scene(NamedTuple):
-    """How all vehicles of n runs stand, the leader first, then its m followers."""
+class Sighted(NamedTuple):
+    """The estimate of one vehicle, in ENU, with the drift of the own odometry."""
 
-    offsets: Array
-    """(n, m, m, 3), from each follower to each of the others, m, ENU."""
-    yaws: Array
-    """(n, m + 1), rad."""
-    rotations: Array
-    """(n, m + 1, 3, 3), FLU to ENU."""
-    present: Any
-    """(m, m), whether those others are there."""
-
-
-def others(flock: Flock) -> Any:
-    """Return the vehicles around each follower, by number (m, m); 0 is the leader."""
-    m = flock.followers
-    return np.array([[v for v in range(m + 1) if v != f] for f in range(1, m + 1)])
+    name: str
+    estimate: Estimate
+    """Its attitude is not used."""
+    yaw: float | None
+    """rad; None if it is not known."""
+    relative: bool = False
+    """Whether it is in the frame without odometry."""
 
 
 class Lookout:
-    """
-    The cameras and the neighbour filters of all rows.
+    """The cameras and the neighbour filters of all rows of a world."""
 
-    :param odometry_latency: of each row, s: perception waits for odometry.
-    """
-
-    def __init__(self, scenario: Scenario, runs: Sequence[int], noise: PerceptionNoise,
-                 odometry_latency: Sequence[float]) -> None:
-        self._sensing, self._noise, self._flock = scenario.sensing, noise, scenario.company
-        self._others = others(self._flock)
-        m = self._flock.followers
-        rows = [(run, number) for run in runs for number in range(1, m + 1)]
-        drawn = [_drawn(scenario, run, number) for run, number in rows]
-        self._prints = scenario.prints
+    def __init__(self, world: World, noise: PerceptionNoise) -> None:
+        self._world, self._noise = world, noise
+        scenario, m, rows = world.scenario, len(world.others), len(world.rows)
+        drawn = [_drawn(scenario, run, number) for run, number in world.rows]
         self._latency = np.stack([each[0] for each in drawn], axis=1)
         self._drawn, self._visible = (
             np.concatenate([each[k] for each in drawn], axis=1) for k in (1, 2))
-        self._names = [[self._flock.names[v] for v in self._others[number - 1]]
-                       for _, number in rows]
+        self._names = [scenario.company.names[v] for _, number in world.rows
+                       for v in world.others[number - 1]]
         errors = scenario.odometry
-        self._tilt = GaussMarkov(
-            [scenario.random(run, 'tilt', number) for run, number in rows], 2, errors.tilt,
-            errors.tilt_memory, IMAGE_STEPS * STEP, errors.tilt_bias)
-        self._odometry_latency = np.array(odometry_latency)
-        self._turned = np.concatenate([scenario.random(run, 'attitudes', number).standard_normal(
-            (len(self._latency), m)) for run, number in rows], axis=1)
+        self._tilt = GaussMarkov(world.random('tilt'), 2, errors.tilt, errors.tilt_memory,
+                                 IMAGE_STEPS * STEP, errors.tilt_bias)
+        self._turned = np.concatenate([g.standard_normal((len(self._latency), m))
+                                       for g in world.random('attitudes')], axis=1)
         askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
-                          for run in runs])
-        self._askew = askew[:, self._others].ravel()
-        self._filters = [NeighborFilter() for _ in range(m * len(rows))]
+                          for run, number in world.rows if number == 1])
+        self._askew = askew[:, world.others].ravel()
+        self._filters = [NeighborFilter() for _ in range(m * rows)]
         """Of all rows, one after the other."""
-        self._radios: Radios | None = None
+        self._ranges_due: Due | None = None
         if scenario.measures_ranges:
+            self._ranges_due = Due(scenario.ranges.rate)
             draws = ['ranges', *(f'ranges of other {k}' for k in range(2, m + 1))]
             generators = [scenario.random(run, draw, number)
-                          for run, number in rows for draw in draws]
+                          for run, number in world.rows for draw in draws]
             self._range_latency = np.array([g.uniform(*scenario.ranges.latency)
                                             for g in generators])
             self._radios = Radios(scenario.ranges, generators)
@@ -123,48 +108,49 @@ class Lookout:
         self._alone: dict[int, NeighborFilter] = {}
         """Filters of those rows that fly without odometry."""
         self._sight: Array | None = None
-        self._images: list[_Coming[float]] = [[] for _ in rows]
-        self._coming: list[_Coming[Sighted]] = [[] for _ in rows]
-        self.seen: Any = np.zeros((len(rows), m), dtype=bool)
+        self._images: list[_Coming[float]] = [[] for _ in range(rows)]
+        self._coming: list[_Coming[Sighted]] = [[] for _ in range(rows)]
+        self.seen: Any = np.zeros((rows, m), dtype=bool)
         """Which of the other vehicles an image has shown since this was last set to False."""
-        self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
+        self.in_sight: Any = np.ones((rows, m), dtype=bool)
         """Which of them are in the newest image, ignoring outages and missed detections."""
 
-    def look(self, k: int, scene: Scene, vio: Vio, travel: Array, placed: float,
-             lost: bool) -> None:
-        """
-        Take the images of step k.
+    def look(self, k: int) -> None:
+        """Take the images, and measure the ranges, of step k of the world."""
+        world, now = self._world, k * STEP
+        if k % IMAGE_STEPS == 0:
+            self._look(k // IMAGE_STEPS, now)
+            for number, place in enumerate(world.scenario.prints, start=1):
+                self._look_at_print(duplicate_name(LEADER, number), place)
+        if self._ranges_due is not None and k % ODOMETRY_STEPS == 0 and (
+                not world.odometry_lost and self._ranges_due.at(now)):
+            self._measure_ranges(now)
 
-        :param travel: integral of the velocity of ``vio`` (rows, 3), m.
-        :param placed: when there is odometry of the images, or newer, s.
-        :param lost: whether odometry is lost, so that nothing can be placed in its frame.
-        """
-        image, now, m = k // IMAGE_STEPS, k * STEP, len(self._others)
-        offsets: Array = scene.offsets.reshape(-1, 3)
-        self.in_sight = self._in_sight(scene)
-        found = self._visible[image] & self.in_sight.ravel()
-        if lost:
-            found = np.zeros_like(found)
+    def _look(self, image: int, now: float) -> None:
+        world, m = self._world, len(self._world.others)
+        sensing, vio = world.scenario.sensing, world.vio
+        offsets: Array = world.offsets.reshape(-1, 3)
+        eyes = np.repeat(world.vehicle.rotation, m, axis=0)
+        self.in_sight = self._in_sight(offsets, eyes)
+        found = self._visible[image] & self.in_sight.ravel() & (not world.odometry_lost)
         self.seen = self.seen | found.reshape(self.seen.shape)
-        tilt: Array = self._tilt.step()
-        tilt = np.repeat(np.concatenate([tilt, np.zeros((len(tilt), 1))], axis=1), m, axis=0)
-        covariance = relative_noise(offsets, self._noise, self._turning(scene))
+        tilt = np.repeat(np.pad(self._tilt.step(), ((0, 0), (0, 1))), m, axis=0)
+        covariance = relative_noise(offsets, self._noise, self._turning(offsets, eyes))
         offsets = turned(offsets + np.cross(tilt, offsets), np.repeat(vio.yaw_error, m))
-        scale = self._sensing.noise
         # Along and across the line of sight are the covariance's own axes.
-        drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
-                                  self._drawn[image, :, :3])
+        drawn = sensing.noise * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
+                                          self._drawn[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
-        measured = np.repeat(travel, m, axis=0) + offsets + drawn
-        covariance = max(scale, 1e-3) ** 2 * covariance
-        correction = vio.position - travel
-        velocity_noise = self._sensing.velocity_noise * self._drawn[image, :, 3:]
-        yaws = (scene.yaws[:, self._others].ravel() + np.repeat(vio.yaw_error, m)
+        measured = np.repeat(world.travel, m, axis=0) + offsets + drawn
+        covariance = max(sensing.noise, 1e-3) ** 2 * covariance
+        correction = vio.position - world.travel
+        velocity_noise = sensing.velocity_noise * self._drawn[image, :, 3:]
+        yaws = (world.headings + np.repeat(vio.yaw_error, m)
                 + YAW_NOISE * self._turned[image] + self._askew)
-        arrivals = np.maximum(
-            now + self._latency[image], placed + self._odometry_latency).tolist()
-        for row, arrival in enumerate(arrivals):
-            self._images[row].append((arrival, now))
+        arrivals = np.maximum(now + self._latency[image],
+                              world.placed(now) + world.odometry_latency).tolist()
+        for images, arrival in zip(self._images, arrivals):
+            images.append((arrival, now))
         for i in np.flatnonzero(found).tolist():
             state = _updated(self._filters[i], now, measured[i], covariance[i])
             if state is not None:
@@ -172,17 +158,19 @@ class Lookout:
                     position=state.position + correction[i // m],
                     velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
 
-    def look_alone(self, k: int, scene: Scene, motions: Sequence[OdometryState | None],
+    def look_alone(self, k: int, motions: Sequence[OdometryState | None],
                    attitudes: Array) -> None:
         """
-        Take the same images in rows that fly without odometry; of each it sees the leader only.
+        Take the images of step k in rows without odometry; of each it sees the leader only.
 
         :param motions: the motion by attitude of each row, None with odometry.
         :param attitudes: by the autopilot (rows, 3, 3), FLU to ENU.
         """
-        image, now, m = k // IMAGE_STEPS, k * STEP, len(self._others)
-        found, offsets = self._visible[image] & self.in_sight.ravel(), scene.offsets.reshape(-1, 3)
-        covariances, scale = relative_noise(offsets, self._noise), self._sensing.noise
+        if k % IMAGE_STEPS != 0 or not any(motions):
+            return
+        world, image, now, m = self._world, k // IMAGE_STEPS, k * STEP, len(self._world.others)
+        found, offsets = self._visible[image] & self.in_sight.ravel(), world.offsets.reshape(-1, 3)
+        covariances, scale = relative_noise(offsets, self._noise), world.scenario.sensing.noise
         for row, motion in enumerate(motions):
             if motion is None:
                 self._alone.pop(row, None)
@@ -191,82 +179,72 @@ class Lookout:
             if not found[i]:
                 continue
             self.seen[row, 0] = True
-            turn = attitudes[row] @ scene.rotations[:, 1:].reshape(-1, 3, 3)[row].T
+            turn = attitudes[row] @ world.vehicle.rotation[row].T
             noise = scale * np.linalg.cholesky(covariances[i]) @ self._drawn[image, i, :3]
             state = _updated(self._alone.setdefault(row, NeighborFilter()), now,
                              motion.position + turn @ (offsets[i] + noise),
                              max(scale, 1e-3) ** 2 * covariances[i])
             if state is not None:
-                self._send(now + self._latency[image, row], i, state,
-                           float(scene.yaws[:, self._others].ravel()[i]), relative=True)
+                self._send(now + self._latency[image, row], i, state, float(world.headings[i]),
+                           relative=True)
 
     def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None,
               relative: bool = False) -> None:
-        row, j = divmod(i, len(self._others))
-        self._coming[row].append((arrival, Sighted(
-            self._names[row][j], state.stamp, state.position, state.velocity, yaw,
-            state.covariance[POSITION, POSITION], state.covariance[VELOCITY, VELOCITY],
-            state.acceleration, relative)))
+        self._coming[i // len(self._world.others)].append(
+            (arrival, Sighted(self._names[i], state, yaw, relative)))
 
-    def measure_ranges(self, now: float, scene: Scene, vio: Vio, travel: Array,
-                       placed: float) -> None:
-        """Measure the distances to the others by radio; parameters as of ``look``."""
-        if self._radios is None:
-            return
-        m, noise = len(self._others), RangingParams().range_noise ** 2
-        measured = self._radios.measure(np.linalg.norm(scene.offsets.reshape(-1, 3), axis=1))
+    def _measure_ranges(self, now: float) -> None:
+        """Measure the distances to the others by radio."""
+        world, m, noise = self._world, len(self._world.others), RangingParams().range_noise ** 2
+        measured = self._radios.measure(np.linalg.norm(world.offsets.reshape(-1, 3), axis=1))
         arrivals = np.maximum(now + self._range_latency,
-                              placed + np.repeat(self._odometry_latency, m))
+                              world.placed(now) + np.repeat(world.odometry_latency, m))
+        there = world.present[world.others].ravel()
         for i, distance in enumerate(measured.tolist()):
-            if not scene.present.ravel()[i % m ** 2]:
+            if not there[i % m ** 2]:
                 continue
             row = i // m
-            own = OdometrySample(now, vio.position[row], IDENTITY_QUATERNION, vio.velocity[row],
-                                 _STILL, travel[row])
-            state = self._series[i].take(PlacedRange(now, distance, noise, travel[row]), own)
+            own = OdometrySample(now, world.vio.position[row], IDENTITY_QUATERNION,
+                                 world.vio.velocity[row], _STILL, world.travel[row])
+            state = self._series[i].take(PlacedRange(now, distance, noise, own.travel), own)
             if state is not None:
                 self._send(float(arrivals[i]), i, state, None)
 
-    def look_at_prints(self, positions: Array, rotations: Array, vio: Vio) -> None:
+    def _look_at_print(self, name: str, place: Print) -> None:
         """
-        Add the prints in view to the images just taken.
+        Add a print to the images just taken that show it.
 
         Which of two is the leader is not modelled: perception is taken to know, as its tests show.
-
-        :param positions: of the followers (rows, 3), m; :param rotations: theirs (rows, 3, 3).
         """
-        for number, place in enumerate(self._prints, start=1):
-            offsets = np.array(place.position) - positions
-            bodies = np.tile(quaternion_to_matrix(quaternion_from_yaw(place.yaw)),
-                             (len(offsets), 1, 1))
-            shown = in_view(offsets, rotations, self._noise) & facing(
-                offsets, bodies, self._sensing.marker_angle)
-            covariances = relative_noise(offsets, self._noise)
-            seen_from = vio.position + turned(offsets, vio.yaw_error)
-            for row in np.flatnonzero(shown).tolist():
-                arrival, stamp = self._images[row][-1]
-                self._coming[row].append((arrival, Sighted(
-                    duplicate_name(LEADER, number), stamp, seen_from[row], _STILL, place.yaw,
-                    covariances[row], _STANDING, _STILL)))
+        world, vio = self._world, self._world.vio
+        offsets = np.array(place.position) - world.vehicle.position
+        body = quaternion_to_matrix(quaternion_from_yaw(place.yaw))
+        shown = in_view(offsets, world.vehicle.rotation, self._noise) & facing(
+            offsets, np.tile(body, (len(offsets), 1, 1)), world.scenario.sensing.marker_angle)
+        seen_from = vio.position + turned(offsets, vio.yaw_error)
+        covariances = np.zeros((len(offsets), 15, 15))
+        covariances[:, POSITION, POSITION] = relative_noise(offsets, self._noise)
+        covariances[:, VELOCITY, VELOCITY] = _STANDING
+        for row in np.flatnonzero(shown).tolist():
+            arrival, stamp = self._images[row][-1]
+            self._coming[row].append((arrival, Sighted(name, Estimate(
+                stamp, seen_from[row], _STILL, body, _STILL, _STILL, covariances[row]),
+                place.yaw)))
 
-    def _in_sight(self, scene: Scene) -> Any:
-        n, m, _, _ = scene.offsets.shape
-        offsets = scene.offsets.reshape(-1, 3)
-        eyes = np.repeat(scene.rotations[:, 1:], m, axis=1).reshape(-1, 3, 3)
-        bodies = scene.rotations[:, self._others].reshape(-1, 3, 3)
-        flock = self._flock
+    def _in_sight(self, offsets: Array, eyes: Array) -> Any:
+        """Return which of the others each row sees (rows, m), given its rotations (rows * m)."""
+        world, flock, m = self._world, self._world.scenario.company, len(self._world.others)
         shown = in_view(offsets, eyes, self._noise, flock.cameras) & facing(
-            offsets, bodies, self._sensing.marker_angle, flock.faces)
+            offsets, world.bodies, world.scenario.sensing.marker_angle, flock.faces)
+        shown = shown.reshape(-1, m, m)
         if m > 1:
-            shown &= ~hidden(scene.offsets, scene.present, BODY).ravel()
-            shown &= np.broadcast_to(scene.present, (n, m, m)).ravel()
-        return shown.reshape(n * m, m)
+            there = world.present[world.others]
+            shown &= ~hidden(world.offsets, there, BODY) & there
+        return shown.reshape(-1, m)
 
-    def _turning(self, scene: Scene) -> Array:
+    def _turning(self, offsets: Array, eyes: Array) -> Array:
         """Return how fast the others have moved across the images since the last, rad/s."""
-        m = len(self._others)
-        eyes = np.repeat(scene.rotations[:, 1:], m, axis=1).reshape(-1, 3, 3)
-        sight = np.einsum('nji,nj->ni', eyes, scene.offsets.reshape(-1, 3))
+        sight = np.einsum('nji,nj->ni', eyes, offsets)
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         before, self._sight = sight if self._sight is None else self._sight, sight
         turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
@@ -290,28 +268,6 @@ def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
     full[:3, :3] = covariance
     outcome = track.update(now, Transform(translation=place), _CENTRE, full)
     return track.newest if outcome in _USED else None
-
-
-class Sighted(NamedTuple):
-    """The estimate of one vehicle, in ENU, with the drift of the own odometry."""
-
-    name: str
-    stamp: float
-    """s."""
-    position: Array
-    """(3,), m."""
-    velocity: Array
-    """(3,), m/s."""
-    yaw: float | None
-    """rad; None if it is not known."""
-    position_covariance: Array
-    """(3, 3), m^2."""
-    velocity_covariance: Array
-    """(3, 3), m^2/s^2."""
-    acceleration: Array
-    """(3,), m/s^2."""
-    relative: bool = False
-    """Whether it is in the frame without odometry."""
 
 
 T = TypeVar('T')

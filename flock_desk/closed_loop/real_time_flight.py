@@ -30,16 +30,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
-from flock_desk.closed_loop.flown_vehicle import FlownVehicle
+from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import (
+    EmbeddedVehicle,
+    FlownLeader,
+    FlownVehicle,
+    ScenarioLeader,
+)
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.radio import Radios
+from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
-from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import STEP
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,
@@ -90,7 +93,8 @@ class RealTimeFlight:
         self.camera = camera
         self._latest_ns = latest_ns
         self._images = 0
-        self._leader = leader or ScenarioLeader(self.scenario, vehicle.in_place)
+        self._leader = leader or ScenarioLeader(
+            self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
         self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
         self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
@@ -110,18 +114,14 @@ class RealTimeFlight:
     @property
     def distance(self) -> float:
         """Return the true distance between the vehicles, m; NaN without a leader."""
-        leader = self._leader.pose(self.time_ns, self.time)
+        leader = self._leader.motion(self.time_ns, self.time)
         return (math.nan if leader is None
-                else float(np.linalg.norm(leader.translation - self.follower.position)))
+                else float(np.linalg.norm(leader.position - self.follower.position)))
 
     @property
     def follower(self) -> Odometry:
         """Return the follower's true motion at the last step."""
         return self._past[-1]
-
-    def before_step(self) -> None:
-        """Let the wind blow as it will during the next step of the autopilot."""
-        self.vehicle.blow(self.scenario.wind(self.time))
 
     def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
@@ -133,7 +133,7 @@ class RealTimeFlight:
             self.skipped_images = 0
         self._leader.step(state, self.time, self.vehicle.offboard)
         estimate = self._vio.step(state)
-        if self._due.at(state.time) and not self._fails('vio', self.time) and (
+        if self._due.at(state.time) and not self.scenario.scenario.fails('vio', self.time) and (
                 self.vehicle.knows(self.time_ns)):
             self._under_way.append((self.time_ns, estimate))
         arrived = []
@@ -151,9 +151,6 @@ class RealTimeFlight:
             return None
         return float(radios.measure(np.array([self.distance]))[0])
 
-    def _fails(self, what: str, time: float) -> bool:
-        return self.scenario.scenario.fails(what, time)
-
     def look(self, now_ns: int) -> RenderedImage | None:
         """Return the next image, if its exposure is over; leave out images that are too late."""
         while True:
@@ -170,12 +167,12 @@ class RealTimeFlight:
     def _frame(self, stamp_ns: int) -> RenderedImage:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
-        hidden = self._fails('marker', time)
+        hidden = self.scenario.scenario.fails('marker', time)
         leader = self._leader.motion(stamp_ns, time)
         usable = not (hidden or leader is None or self.scenario.blinding(time)
-                      or self._fails('vio', time))
-        poses = [self._leader.pose(t, self._scenario_time(t)) for t in moments]
-        leaders = [] if hidden else [pose for pose in poses if pose is not None]
+                      or self.scenario.scenario.fails('vio', time))
+        motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
+        leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
         pixels = self.camera.image(
             self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))

@@ -24,7 +24,7 @@ from flock_desk.camera.renderer import Light
 from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.sensors.vio import Odometry
-from flock_desk.vehicles.vehicle import attitude
+from flock_desk.vehicles.quadrotor import attitude
 from flock_follower.geometry import (
     Array,
     GRAVITY,

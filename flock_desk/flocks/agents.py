@@ -24,20 +24,17 @@ Flocks of point agents under the law or its predecessors: one function from star
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import cast, get_args, Literal
+from typing import cast, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_desk.flocks import graph as flock_graph
-from flock_desk.flocks import integrators
+from flock_desk.flocks import laws
 from flock_desk.flocks.flock_metrics import Metrics, metrics
-from flock_desk.flocks.graph import Coupling, Graph
-from flock_desk.flocks.integrators import State
-from flock_desk.flocks.models import accelerations, Method, velocities_after
+from flock_desk.flocks.laws import Coupling, Graph, Method, Pairs
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -46,12 +43,15 @@ from flock_follower.ranges import Range
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mean_velocity']
 Neighbors = Literal['all', 'graph', 'nearest']
 Integrator = Literal['adaptive', 'semi_implicit']
+Acceleration = Callable[[float, Array, Array], Array]
+State = tuple[Array, Array]
 
 NEAREST = 7  # neighbours that a starling follows (Ballerini et al. 2008)
 _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
 _POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
 _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
+_SKIN = 0.05  # m that agents may move before near pairs are searched again
 
 
 @dataclass(frozen=True)
@@ -102,92 +102,81 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param model: 'flocking', 'cucker_dong', 'cucker_smale'; 'vicsek', each at its own speed, or
         'vicsek_mean_velocity', both in steps of dt.
     :param neighbors: the neighbours of an agent: 'all' as in the paper; 'graph', the neighbour
-        graph of :mod:`flock_desk.flocks.graph`; 'nearest', the seven nearest. The
-        latter two are for model 'flocking'.
+        graph of :mod:`.laws`; 'nearest', the seven nearest. The latter two are for model
+        'flocking'.
     :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.
     :param leader: a prescribed acceleration of agent 0.
     :param integrator: 'adaptive' or 'semi_implicit', in steps of dt at most.
     :param sample_period: s between the times returned; for Vicsek's, rounded to whole steps.
     :param dt: s, 0.01 by default, 0.1 for Vicsek's.
     :param radius: how far an agent sees in Vicsek's model, m.
-    :param method: how the sum over all pairs is computed, see :mod:`.models`.
+    :param method: how the sum over all pairs is computed, see :func:`.laws.accelerations`.
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
     :raises RuntimeError: if no finite solution goes on.
     """
     params = FlockingParams() if params is None else params
-    _check_names(model, neighbors, coupling, integrator)
+    _check_choices(model, neighbors, coupling, integrator)
     discrete = model in ('vicsek', 'vicsek_mean_velocity')
     dt = (0.1 if discrete else 0.01) if dt is None else dt
     for name, value in (('duration', duration), ('sample_period', sample_period), ('dt', dt),
                         ('radius', radius)):
         _POSITIVE.check(name, value)
-    x, v = _checked_start(positions, velocities)
-    if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
-        raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '
-                         f'must be {x[0].shape}, as the positions are')
+    x, v = _checked_start(positions, velocities, leader)
+    growing = None
     if discrete:
         every = max(1, round(sample_period / dt))
         time = dt * every * np.arange(round(duration / (dt * every)) + 1)
         states = _vicsek(x, v, len(time) - 1, every, dt, radius, model, leader)
-        return _collected(time, states, params, model, progress)
-    time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
-    flock = _Flock(params, model, neighbors, coupling, method, x)
-    _check_band(x, params, model, flock)
-    acceleration = flock.acceleration if leader is None else _led(flock.acceleration, leader)
-    if integrator == 'adaptive':
-        solve = partial(integrators.adaptive, acceleration,
-                        breaks=leader.breaks if leader is not None else ())
     else:
-        solve = partial(integrators.semi_implicit, acceleration, dt=dt,
-                        acceptable=flock.step_is_small if flock.graph is not None else None)
-    states = flock.looking_around(solve, (x, v), time) if flock.graph else solve((x, v), time)
-    run = _collected(time, states, params, model, progress)
-    return run if flock.graph is None else replace(
-        run, graph=flock.graph, joined=np.array(flock.joined))
+        time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
+        growing = _GrowingGraph(x, params, coupling) if neighbors == 'graph' else None
+        _check_band(x, params, model, neighbors, growing)
+        acceleration = _acceleration(params, model, growing or neighbors, coupling, method, leader)
+        solve = partial(adaptive, acceleration, breaks=leader.breaks if leader else ())
+        if integrator == 'semi_implicit':
+            solve = partial(semi_implicit, acceleration, dt=dt,
+                            acceptable=growing.step_is_small if growing else None)
+        states = growing.followed(solve, (x, v), time) if growing else solve((x, v), time)
+    run: list[State] = []
+    for state in states:
+        run.append(state)
+        if progress is not None:
+            progress((len(run) - 1) / (len(time) - 1))
+    x, v = map(np.array, zip(*run))
+    return Simulation(time, x, v, params, model, *(
+        () if growing is None else (growing.graph, np.array(growing.joined))))
 
 
-class _Flock:
-    """The accelerations of a flock, and the neighbour graph that grows with its motion."""
+def _check_choices(model: Model, neighbors: Neighbors, coupling: Coupling,
+                   integrator: Integrator) -> None:
+    for name, choice, known in (('model', model, Model), ('neighbors', neighbors, Neighbors),
+                                ('coupling', coupling, Coupling),
+                                ('integrator', integrator, Integrator)):
+        laws.check_choice(name, choice, known)
+    if neighbors != 'all' and model != 'flocking':
+        raise ValueError(f"neighbors = {neighbors!r}: must be 'all' where model = {model!r}")
 
-    def __init__(self, params: FlockingParams, model: Model, neighbors: Neighbors,
-                 coupling: Coupling, method: Method, positions: Array) -> None:
-        self.params, self.model, self.neighbors = params, model, neighbors
-        self.coupling, self.method = coupling, method
-        self._near: tuple[Array, flock_graph.Pairs] | None = None
-        self.graph: Graph | None = None
-        self.joined: list[float] = []
-        if neighbors == 'graph':
-            self.graph = flock_graph.initial_graph(positions, params)
-            self.joined = [0.0] * len(self.graph.edges)
 
-    def acceleration(self, t: float, x: Array, v: Array) -> Array:
-        if not np.abs(v).max() < _ESCAPED:  # written so that NaN fails
-            raise RuntimeError(f'the solution diverges near t = {t:.6g} s: take a smaller dt, or '
-                               "integrator = 'adaptive', or begin further from the band's edges")
-        if self.graph is not None:
-            return flock_graph.accelerations(x, v, self.params, self.graph, self.coupling,
-                                             self.near(x))
-        if self.neighbors == 'nearest':
-            return flock_graph.nearest_accelerations(
-                x, v, self.params, flock_graph.nearest(x, NEAREST), self.coupling)
-        return accelerations(x, v, self.params, cast(flocking.Model, self.model), self.method)
+class _GrowingGraph:
+    """The neighbour graph of a flock, which grows with its motion, and the law on it."""
+
+    def __init__(self, positions: Array, params: FlockingParams, coupling: Coupling) -> None:
+        self.graph = laws.initial_graph(positions, params)
+        self.joined = [0.0] * len(self.graph.edges)
+        self._params, self._coupling = params, coupling
+        self._near: tuple[Array, Pairs] | None = None
+
+    def accelerations(self, x: Array, v: Array) -> Array:
+        return laws.graph_accelerations(x, v, self._params, self.graph, self._coupling,
+                                        self._nearby(x))
 
     def step_is_small(self, before: Array, after: Array) -> bool:
-        assert self.graph is not None
-        return flock_graph.step_is_small(before, after, self.params, self.graph,
-                                         self.near(before))
+        return laws.step_is_small(before, after, self._params, self.graph, self._nearby(before))
 
-    def near(self, x: Array) -> flock_graph.Pairs:
-        """Return the pairs with r^2 < d1, or all if they are few; asked for twice a step."""
-        if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
-            self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))
-        return self._near[1]
-
-    def looking_around(self, solve: Callable[[State, Array], Iterator[State]], start: State,
-                       time: Array) -> Iterator[State]:
+    def followed(self, solve: Callable[[State, Array], Iterator[State]], start: State,
+                 time: Array) -> Iterator[State]:
         """Yield the states at each time, letting the graph grow at each, and between."""
         yield start
         state = start
@@ -195,21 +184,39 @@ class _Flock:
             looks = np.linspace(begin, end, 1 + int(np.ceil((end - begin) / _LOOK_PERIOD)))
             for since, t in pairwise(looks):
                 *_, state = solve(state, np.array([since, t]))
-                self._look(t, state[0])
+                x = state[0]
+                self.graph = laws.grown(self.graph, x, self._params, self._nearby(x))
+                self.joined += [t] * (len(self.graph.edges) - len(self.joined))
             yield state
 
-    def _look(self, t: float, x: Array) -> None:
-        assert self.graph is not None
-        self.graph = flock_graph.grown(self.graph, x, self.params, self.near(x))
-        self.joined += [t] * (len(self.graph.edges) - len(self.joined))
+    def _nearby(self, x: Array) -> Pairs:
+        """Return at least the pairs with r^2 < d1; all, if they are few."""
+        few = len(x) <= _NEAR_BY_ALL
+        if self._near is None or not (few or np.abs(x - self._near[0]).max() <= _SKIN):
+            # Each of two agents may move by _SKIN along each of at most 3 axes.
+            distance = np.sqrt(self._params.d1) + 2.0 * np.sqrt(3.0) * _SKIN
+            self._near = (x, laws.complete_graph(len(x)).edges if few
+                          else laws.pairs_within(x, distance))
+        return self._near[1]
 
 
-def _led(acceleration: integrators.Acceleration, leader: Leader) -> integrators.Acceleration:
-    def with_leader(t: float, x: Array, v: Array) -> Array:
-        u = acceleration(t, x, v)
-        u[0] = leader.acceleration(t)
+def _acceleration(params: FlockingParams, model: Model, neighbors: Neighbors | _GrowingGraph,
+                  coupling: Coupling, method: Method, leader: Leader | None) -> Acceleration:
+    """Return the function that gives the accelerations of a flock."""
+    def acceleration(t: float, x: Array, v: Array) -> Array:
+        if not np.abs(v).max() < _ESCAPED:  # written so that NaN fails
+            raise RuntimeError(f'the solution diverges near t = {t:.6g} s: take a smaller dt, or '
+                               "integrator = 'adaptive', or begin further from the band's edges")
+        if isinstance(neighbors, _GrowingGraph):
+            u = neighbors.accelerations(x, v)
+        elif neighbors == 'nearest':
+            u = laws.nearest_accelerations(x, v, params, laws.nearest(x, NEAREST), coupling)
+        else:
+            u = laws.accelerations(x, v, params, cast(flocking.Model, model), method)
+        if leader is not None:
+            u[0] = leader.acceleration(t)
         return u
-    return with_leader
+    return acceleration
 
 
 def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: float, model: Model,
@@ -217,7 +224,7 @@ def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: flo
     """Yield the first state, and one after every ``every`` steps of dt."""
     yield x, v
     for n in range(samples * every):
-        after = velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
+        after = laws.velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
         if leader is not None:
             after[0] = v[0] + dt * np.asarray(leader.acceleration(n * dt))
         x, v = x + dt * v, after  # in this order: the velocity of now takes one to the next place
@@ -225,62 +232,109 @@ def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: flo
             yield x, v
 
 
-def _collected(time: Array, states: Iterator[State], params: FlockingParams, model: Model,
-               progress: Callable[[float], None] | None) -> Simulation:
-    positions, velocities = [], []
-    for n, (x, v) in enumerate(states):
-        positions.append(x)
-        velocities.append(v)
-        if progress is not None:
-            progress(n / (len(time) - 1))
-    return Simulation(time, np.array(positions), np.array(velocities), params, model)
+def adaptive(acceleration: Acceleration, start: State, times: Array,
+             breaks: Sequence[float] = (), rtol: float = 1e-11,
+             atol: float = 1e-12) -> Iterator[State]:
+    """
+    Yield positions and velocities, both (k, n), at each time, by Dormand and Prince's 8(5,3).
+
+    :param start: the state at ``times[0]``.
+    :param breaks: where the acceleration jumps, s: no step straddles these.
+    :raises RuntimeError: if no step is small enough, as at a singularity of the law.
+    """
+    from scipy.integrate import DOP853
+    shape = np.shape(start)
+    t, y = float(times[0]), np.ravel(start)
+    yield start
+    waiting = 1
+    for end in [*(b for b in sorted(breaks) if t < b < times[-1]), float(times[-1])]:
+        # At the very end of a stretch the acceleration is still that of the stretch.
+        last = np.nextafter(end, t)
+
+        def rate(t: float, y: Array, last: float = last) -> Array:
+            x, v = y.reshape(shape)
+            return np.concatenate([v.ravel(), acceleration(min(t, last), x, v).ravel()])
+
+        solver = DOP853(rate, t, y, end, rtol=rtol, atol=atol)
+        while solver.status == 'running':
+            message = solver.step()
+            if solver.status == 'failed':
+                raise RuntimeError(f'the solution ends at t = {solver.t:.6g} s: {message}')
+            passed = int(np.searchsorted(times, solver.t, side='right'))
+            if passed > waiting:
+                for state in solver.dense_output()(times[waiting:passed]).T:
+                    x, v = state.reshape(shape)
+                    yield x, v
+                waiting = passed
+        t, y = end, solver.y
 
 
-def _check_names(model: Model, neighbors: Neighbors, coupling: Coupling,
-                 integrator: Integrator) -> None:
-    for name, value, known in (('model', model, Model), ('neighbors', neighbors, Neighbors),
-                               ('coupling', coupling, Coupling),
-                               ('integrator', integrator, Integrator)):
-        if value not in get_args(known):
-            raise ValueError(f'{name} = {value!r}: must be one of {", ".join(get_args(known))}')
-    if neighbors != 'all' and model != 'flocking':
-        raise ValueError(f"neighbors = {neighbors!r}: must be 'all' where model = {model!r}")
+def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: float,
+                  acceptable: Callable[[Array, Array], bool] | None = None) -> Iterator[State]:
+    """
+    Yield positions and velocities, both (k, n), at each time, by steps of dt s at most.
+
+    Each step takes the velocity forward first and the position with the new velocity (also
+    called symplectic Euler): first order, and stable where explicit Euler is not.
+
+    :param acceptable: of the positions before and after a step: if it returns False the step is
+        halved, and lengthened again, doubling, by the steps that follow.
+    :raises RuntimeError: if a step a millionth of dt long is not acceptable yet.
+    """
+    x, v = start
+    t, h = float(times[0]), dt
+    yield x, v
+    for end in times[1:]:
+        while end - t > 1e-9 * dt:
+            left = end - t
+            # Equal steps to the end of the interval, not a sliver after it.
+            step = left / np.ceil(left / h - 1e-9)
+            u = acceleration(t, x, v)
+            while True:
+                new_v = v + step * u
+                new_x = x + step * new_v
+                if acceptable is None or acceptable(x, new_x):
+                    break
+                step *= 0.5
+                if step < 1e-6 * dt:
+                    raise RuntimeError(f'the solution ends at t = {t:.6g} s, at a singularity')
+            t, x, v = t + step, new_x, new_v
+            h = min(dt, 2.0 * step)
+        t = float(end)
+        yield x, v
 
 
-def _checked_start(positions: ArrayLike, velocities: ArrayLike) -> State:
-    for name, value in (('positions', positions), ('velocities', velocities)):
-        a = np.asarray(value, dtype=float)
-        bad = ~np.all(np.isfinite(a), axis=-1) if a.ndim == 2 else np.zeros(0, dtype=bool)
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise ValueError(f'{name}[{i}] = {a[i].tolist()}: must be finite')
+def _checked_start(positions: ArrayLike, velocities: ArrayLike,
+                   leader: Leader | None) -> State:
     x, v = flocking.checked(positions, velocities)
     if not len(x):
         raise ValueError('positions has no agents: give at least one')
-    order = np.lexsort(x.T)
-    same = np.flatnonzero(np.all(np.diff(x[order], axis=0) == 0.0, axis=1))
-    if len(same):
-        i, j = sorted(order[same[0]:same[0] + 2])
+    if len(same := laws.pairs_within(x, 0.0)):
+        i, j = same[0]
         raise ValueError(f'positions[{i}] and positions[{j}] are both {x[i].tolist()}: '
                          'agents must start apart')
+    if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
+        raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '
+                         f'must be {x[0].shape}, as the positions are')
     return x, v
 
 
-def _check_band(x: Array, params: FlockingParams, model: Model, flock: _Flock) -> None:
+def _check_band(x: Array, params: FlockingParams, model: Model, neighbors: Neighbors,
+                growing: _GrowingGraph | None) -> None:
     """Raise ValueError if the law is undefined, or cannot keep its guarantees."""
     if model == 'cucker_smale' or len(x) < 2:
         return
-    close = flock_graph.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
+    close = laws.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
     if len(close):
         i, j = close[0]
         raise ValueError(
             f'agents {i} and {j} start {np.linalg.norm(x[i] - x[j]):.6g} m apart: must be more '
             f'than sqrt(d0) = {np.sqrt(params.d0):.6g} m (move them apart, or lower d0)')
-    if flock.graph is not None and not flock.graph.connected:
+    if growing is not None and not growing.graph.connected:
         raise ValueError(
             'the agents start in groups that are not connected: each must be nearer than '
             f'sqrt(d1) = {np.sqrt(params.d1):.6g} m to another (move them closer, or raise d1)')
-    if model == 'flocking' and flock.neighbors == 'all':
+    if model == 'flocking' and neighbors == 'all':
         for i, own in enumerate(x):
             r2 = np.sum((x - own) ** 2, axis=1)
             j = int(np.argmax(r2))

@@ -17,11 +17,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from flock_desk.flocks.graph import Graph
+from flock_desk.flocks.laws import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
 from flock_follower.geometry import Array
 
@@ -65,25 +64,18 @@ class Metrics:
         return float(self.time[last] + part * (self.time[first] - self.time[last]))
 
 
-class Extremum(NamedTuple):
-    """When, s, and how much."""
-
-    time: float
-    value: float
-
-
-def extremum(time: Array, values: Array, *, least: bool) -> Extremum:
-    """Return the least or greatest of values (m,), refined by the parabola through three."""
+def extremum(time: Array, values: Array, *, least: bool) -> tuple[float, float]:
+    """Return time, s, and value of the least or greatest of values (m,), by a parabola."""
     n = int(np.argmin(values) if least else np.argmax(values))
     if not 0 < n < len(values) - 1:
-        return Extremum(float(time[n]), float(values[n]))
+        return (float(time[n]), float(values[n]))
     a, b, c = values[n - 1:n + 2]
     bend = a - 2.0 * b + c
     if bend == 0.0:
-        return Extremum(float(time[n]), float(b))
+        return (float(time[n]), float(b))
     shift = 0.5 * (a - c) / bend  # in steps, within one
-    return Extremum(float(time[n] + shift * (time[n + 1] - time[n])),
-                    float(b - 0.25 * (a - c) * shift))
+    return (float(time[n] + shift * (time[n + 1] - time[n])),
+            float(b - 0.25 * (a - c) * shift))
 
 
 def metrics(time: Array, positions: Array, velocities: Array, params: FlockingParams,

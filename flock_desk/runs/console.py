@@ -13,17 +13,46 @@
 # limitations under the License.
 
 
-"""Commands on the console: their errors and exit codes, progress, tables."""
+"""Commands on the console: their options, errors and exit codes, progress, tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import argparse
+from collections.abc import Callable, Mapping, Sequence
 import sys
+from typing import Any
 
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
-from flock_follower.live_line import LOG_PERIOD, TERMINAL_PERIOD
+from flock_follower.bags.live_line import LOG_PERIOD, TERMINAL_PERIOD
+from flock_follower.ranges import Range
 
 WIDTH = 100  # characters of a bar
+Options = Mapping[str, Mapping[str, Any]]
+
+
+def parsed(parser: argparse.ArgumentParser, args: Sequence[str] | None,
+           options: Options, groups: Mapping[str, Options] | None = None,
+           valid: Mapping[str, Range] | None = None) -> argparse.Namespace:
+    """
+    Return the values of a command's options; a wrong one ends the program with exit code 2.
+
+    :param options: what ``add_argument`` takes, by the name of the option.
+    :param groups: likewise more options, by the title of their group in the help.
+    :param valid: the values of a number, by the name of the option without dashes.
+    """
+    sections: list[tuple[Any, Options]] = [
+        (parser, options),
+        *((parser.add_argument_group(title), rows) for title, rows in (groups or {}).items())]
+    for section, rows in sections:
+        for name, row in rows.items():
+            section.add_argument(name, **row)
+    values = parser.parse_args(args)
+    try:
+        for name, numbers in (valid or {}).items():
+            numbers.check(f'--{name}', getattr(values, name))
+    except ValueError as error:
+        parser.error(str(error))
+    return values
 
 
 def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int:

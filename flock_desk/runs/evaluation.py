@@ -12,23 +12,30 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One bag through perception, planner and gate, and the record of it."""
+"""
+One bag through perception, planner and gate, and the record of it.
+
+A message comes when it was recorded, so images and odometry are as late, and in the same order,
+as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
+mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
+``odom`` stand in where ``velocity_source`` asks for them.
+"""
 
 from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 import tempfile
 import time
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from flock_desk.runs.frame_errors import FrameErrors
-from flock_desk.runs.recorded_flight import INVALID_ODOMETRY, RecordedFlight
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
@@ -44,23 +51,43 @@ from flock_follower.checks.topic_names import (
     RAW_IMAGES,
     TYPES,
 )
-from flock_follower.follower import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
 from flock_follower.geometry import Array
+from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
+    from_range,
+    Make,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
+    read_stamp,
     STATE,
     TRAJECTORY,
 )
 from flock_follower.odometry.cdr import read_odometry
+from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters import planner_table, relative_pose_table
 from flock_follower.parameters.cameras_table import cameras, CameraValues
+from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
+from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
-_NOTHING = (float('nan'),) * 3
+#: What the autopilot is taken to be while the bag was recorded.
+FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
+INVALID_ODOMETRY: Final = 'invalid odom'
+NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')
+TRUTHS: Final = ('truth/odom', 'truth/neighbors')
+#: Where a message with a header goes on after encapsulation and stamp.
+_AFTER_STAMP: Final = 12
+_NOTHING = (math.nan,) * 3
 
 
 def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
@@ -80,81 +107,151 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     names = names_there(namespace, remaps)
     images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
     published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
-    used: dict[str, tuple[str, str]] = {}
+    # If images are named, others that happen to be in the bag are not meant.
+    meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
+    # Our name, the camera's, and the topics that it may be, each with the type that it must have.
+    wanted: list[tuple[str, str, dict[str, str]]] = [
+        (ours, camera.name, {full: published.get(full, '') for full in (
+            full_name(name, namespace) for name in choice)})
+        for camera in several for ours, choice in (
+            (RAW_IMAGES, [camera.images('raw'), camera.images('compressed')]),
+            ('camera_info', [camera.camera_info]))]
+    if not wanted:
+        wanted.append((RAW_IMAGES, '', {names[kind]: TYPES[kind] for kind in kinds
+                                        if not meant or names[kind] in meant}))
+        wanted.append(('camera_info', '', {names['camera_info']: TYPES['camera_info']}))
+    wanted += [(ours, '', {names[ours]: TYPES[ours]}) for ours in ('odom', *TRUTHS, 'ranges')]
 
-    def offered(name: str) -> str:
-        same = kinds if name in kinds else (name,)
-        offers = offer(name, published, [n for ours, n in names.items() if ours not in same])
+    def offered(ours: str) -> str:
+        same = kinds if ours == RAW_IMAGES else (ours,)
+        offers = offer(ours, published, [n for name, n in names.items() if name not in same])
         return f'; {offers}' if offers else ''
 
-    def found(name: str) -> bool:
-        full = names[name]
-        if published.get(full, TYPES[name]) != TYPES[name]:
-            raise BagError(f'{bag.path}: {full} holds {published[full]}, not {TYPES[name]}'
-                           f'{offered(name)}')
-        if full in published:
-            used[full] = RAW_IMAGES if name in kinds else name, ''
-        return full in published
-
-    missing = {}
-    if several:
-        for camera in several:
-            used |= _topics_of(camera, bag, published, namespace)
-    else:
-        # If images are named, others that happen to be in the bag are not meant.
-        meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
-        if not any(found(kind) for kind in kinds if not meant or names[kind] in meant):
-            missing[RAW_IMAGES] = ' or '.join(meant or (names[kind] for kind in kinds))
-        if not found('camera_info'):
-            missing['camera_info'] = names['camera_info']
-    if not found('odom'):
-        missing['odom'] = names['odom']
+    used: dict[str, tuple[str, str]] = {}
+    missing: dict[str, str] = {}
+    for ours, camera_name, choices in wanted:
+        full = next((full for full in choices if full in published), '')
+        if full and published[full] != choices[full]:
+            raise BagError(f'{bag.path}: {full} holds {published[full]}, not {choices[full]}'
+                           f'{offered(ours)}')
+        if full:
+            used[full] = ours, camera_name
+        elif camera_name:
+            raise BagError(f'{bag.path}: holds no message on {next(iter(choices))} of '
+                           f'camera {camera_name}, only on {", ".join(published)}')
+        elif ours in NEEDED:
+            missing[ours] = ' or '.join(meant if ours == RAW_IMAGES and meant else choices)
     if missing:
         raise BagError(f'{bag.path}: holds no message on {", ".join(missing.values())}, only on '
                        f'{", ".join(published)}{"".join(map(offered, missing))}')
-    if not (found('truth/odom') and found('truth/neighbors')):
-        used.pop(names['truth/odom'], None)
-    found('ranges')
-    return used
+    whole = all(names[truth] in used for truth in TRUTHS)
+    return {full: use for full, use in used.items() if whole or use[0] not in TRUTHS}
 
 
-def _topics_of(camera: CameraValues, bag: Bag, published: Collection[str],
-               namespace: str) -> dict[str, tuple[str, str]]:
-    """Return the topics of one of several cameras: images and calibration."""
-    used = {}
-    for ours, choice in ((RAW_IMAGES, [camera.images(t) for t in ('raw', 'compressed')]),
-                         ('camera_info', [camera.camera_info])):
-        full = next((name for name in (full_name(n, namespace) for n in choice)
-                     if name in published), '')
-        if not full:
-            raise BagError(f'{bag.path}: holds no message on {full_name(choice[0])} of '
-                           f'camera {camera.name}, only on {", ".join(published)}')
-        used[full] = ours, camera.name
-    return used
+class RecordedFlight:
+    """
+    Feeds a follower from the messages of a bag, CDR bytes with the time of recording in ns.
+
+    :param values: the checked values of every parameter, by node, see ``TABLE``.
+    :param listener: receives the events of the flight.
+    :param make: returns an empty message of a type.
+    :param cpu_time: see ``Follower``.
+    :raises ValueError: if values do not fit together, or the neighbours file is wrong.
+    :raises OSError: if the neighbours file cannot be read.
+    """
+
+    def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,
+                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+        perception, bridge = values['relative_pose'], values['mavlink_bridge']
+        self.perceiver = Perceiver(
+            relative_pose_table.build(perception), max_wait=perception['max_wait'])
+        self.planner_params = planner_table.build(values['planner'])
+        # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
+        self.follower = Follower(
+            PlannerLoop(), self.planner_params, Gate(
+                filled(GateLimits(), bridge), bridge['velocity_source']),
+            listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
+            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
+            camera_rpy={camera.name: camera.rpy for camera in cameras(values['planner'])},
+            cpu_time=cpu_time)
+        self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
+        self._listener = listener
+        self._calibrations: dict[str, bytes] = {}
+        self._began = False
+
+    def take(self, name: str, time: int, msgtype: str, data: bytes, camera: str = '',
+             message: Any = None, pixels: GrayImage | None = None) -> None:
+        """
+        Take a message of our topic ``name``; bytes that are no message of the type are counted.
+
+        :param camera: the name of the camera, if there are several.
+        :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
+        """
+        if not self._began:
+            self._began = True
+            self.follower.engage(time, True)
+            self.follower.permit(time, -math.inf)
+            self.follower.vehicle(time, FLYING)
+        if name == 'camera_info':
+            calibration = data[_AFTER_STAMP:]
+            if calibration == self._calibrations.get(camera):
+                return  # all but the first, usually
+            self._calibrations[camera] = calibration
+        try:
+            if message is None:
+                message = read_odometry(data) if name == 'odom' else deserialize(data, msgtype)
+            if name == 'camera_info':
+                self.follower.camera_info(time, message, camera)
+            elif name == 'odom':
+                state = self.source.take(message, time)
+            elif name == 'ranges':
+                measured = from_range(message)
+            else:
+                stamp = read_stamp(message.header.stamp)
+        except ValueError as error:
+            self.follower.advance(time)
+            self._listener.rejected(
+                INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
+            if name == RAW_IMAGES:
+                self._listener.image(ImageOutcome(time, camera=camera))
+            return
+        if name == 'odom':
+            for event in self.source.new_events():
+                self._listener.rejected(*event)
+            if state is not None:
+                self.follower.odometry(time, state)
+        elif name == 'ranges':
+            self.follower.range(time, measured)
+        elif name == RAW_IMAGES:
+            self.follower.image(time, message if pixels is None else pixels, stamp, camera)
 
 
 @dataclass
-class Evaluation:
+class Evaluation(Listener):
     """
     The record of a run: a few numbers for each image, tick and setpoint.
 
-    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s
-    since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
-    index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
-    ``reasons`` has the time and the reason of every tick in HOLD.
-    ``setpoints`` (n, 5): time, the acceleration sent (NaN: none), 1 for a command.
+    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s since the first
+    message, ``frame_cpu`` perception's CPU time for it, s. ``tick_rows``: time, index of the state
+    in STATES, norm of the commanded acceleration (NaN: none), own speed. ``reasons`` has the time
+    and the reason of every tick in HOLD. ``setpoint_rows``: time, the acceleration sent (NaN:
+    none), 1 for a command.
     """
 
     bag: str
     duration: float
-    errors: FrameErrors
-    flight: RecordedFlight
-    names: list[str]
-    incomplete: str = ''
+    start: int
+    """The time of the first message, ns."""
+    incomplete: str
     """Why the bag was never finished, '' if it was."""
+    writer: BagWriter
+    errors: FrameErrors = field(init=False)
+    flight: RecordedFlight = field(init=False)
+    names: list[str] = field(default_factory=list)
+    own: OwnMotion | None = None
+    """Filled for the rules of ``check``."""
     findings: list[Finding] = field(default_factory=list)
     """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
-    images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
     frames: array[float] = field(default_factory=lambda: array('d'))
@@ -168,7 +265,7 @@ class Evaluation:
 
     @property
     def ticks(self) -> Array:
-        """Return the table of ticks."""
+        """Return the ticks (n, 4)."""
         return np.frombuffer(self.tick_rows).reshape(-1, 4)
 
     @property
@@ -180,74 +277,65 @@ class Evaluation:
 
     @property
     def setpoints(self) -> Array:
-        """Return the table of setpoints."""
+        """Return the setpoints (n, 5)."""
         return np.frombuffer(self.setpoint_rows).reshape(-1, 5)
 
-
-class _Recorder(Listener):
-    """Listens to the follower: writes the messages published, keeps the rest."""
-
-    def __init__(self, writer: BagWriter, start: int) -> None:
-        self._writer = writer
-        self._start = start
-        self.evaluation: Evaluation
-        self.own: OwnMotion | None = None
-        """Filled for the rules of ``check``."""
-        self.own_until = start + round(LONGEST * NANOSECONDS)
-
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        self._writer.write(topic, msgtype, time, message)
+        """Write a message that a node would publish."""
+        self.writer.write(topic, msgtype, time, message)
 
     def odometry(self, state: OdometryState) -> None:
-        self.evaluation.errors.odometry(state)
-        if self.own is not None and state.stamp < self.own_until:
+        """Take the own state, for the errors and for the rules of ``check``."""
+        self.errors.odometry(state)
+        if self.own is not None and state.stamp < self.start + LONGEST * NANOSECONDS:
             self.own.states.append(state)
 
-    def image(self, frame: ImageOutcome) -> None:
-        evaluation = self.evaluation
-        evaluation.errors.models[frame.camera] = evaluation.flight.perceiver.model(frame.camera)
-        evaluation.frames.append(self._seconds(frame.stamp))
-        evaluation.frame_cpu.append(frame.perception)
-        sighting = frame.sighting
-        if sighting is None:
-            evaluation.errors.frame(frame.stamp, {}, {}, frame.camera)
-            return
-        self._spent('decode', frame.decoding)
-        self._spent(sighting.stage, frame.perception)
-        evaluation.errors.frame(frame.stamp, sighting.estimates, sighting.stages, frame.camera)
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+        seen, camera = outcome.sighting, outcome.camera
+        self.errors.models[camera] = self.flight.perceiver.model(camera)
+        self.frames.append(self._seconds(outcome.stamp))
+        self.frame_cpu.append(outcome.perception)
+        if seen is not None:
+            self._spent('decode', outcome.decoding)
+            self._spent(seen.stage, outcome.perception)
+        self.errors.frame(outcome.stamp, seen.estimates if seen else {},
+                          seen.stages if seen else {}, camera)
 
     def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
         self._spent('planner', tick.cpu)
         if tick.decision.state is State.HOLD:
-            self.evaluation.reasons.append((self._seconds(tick.time), tick.decision.reason))
-        self.evaluation.tick_rows.extend((
+            self.reasons.append((self._seconds(tick.time), tick.decision.reason))
+        self.tick_rows.extend((
             self._seconds(tick.time), STATES.index(tick.decision.state.value),
             _norm(tick.decision.acceleration),
             _norm(None if tick.own is None else tick.own.velocity)))
 
     def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
         self._spent('gate', cycle.cpu)
         decision = cycle.setpoint
-        self.evaluation.setpoint_kinds[decision.kind] += 1
-        if decision.reason:
-            self.evaluation.brake_reasons[decision.reason] += 1
-        self.evaluation.setpoint_rows.extend((
+        self.setpoint_kinds[decision.kind] += 1
+        self.brake_reasons.update(filter(None, [decision.reason]))
+        self.setpoint_rows.extend((
             self._seconds(cycle.time),
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
 
     def rejected(self, reason: str, detail: str) -> None:
-        self.evaluation.rejections[reason] += 1
+        """Take the reason why something was dropped."""
+        self.rejections[reason] += 1
         if self.own is not None:
             self.own.events[reason] += 1
             if reason == INVALID_ODOMETRY:
                 self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
-        return (nanoseconds - self._start) / NANOSECONDS
+        return (nanoseconds - self.start) / NANOSECONDS
 
     def _spent(self, what: str, seconds: float) -> None:
-        self.evaluation.cpu.setdefault(what, array('f')).append(seconds)
+        self.cpu.setdefault(what, array('f')).append(seconds)
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
@@ -258,26 +346,24 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
     :param values: the parameters of every node, see ``parameters.files.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
-    :param namespace: of the topics in the bag.
-    :param remaps: names of topics in the bag, by ours, if they differ.
+    :param namespace: of the topics in the bag; ``remaps``: their names, by ours, if they differ.
     :param checked: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: if the result cannot be written.
     """
-    perception = values['relative_pose']
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        mounted = cameras(perception)
+        mounted = cameras(values['relative_pose'])
         used = topics_used(bag, namespace, remaps, [camera for camera in mounted if camera.name])
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
-            recorder = _Recorder(writer, bag.start_ns)
-            flight = RecordedFlight(values, recorder, empty, time.process_time)
+            evaluation = Evaluation(
+                path.name, bag.duration_ns / NANOSECONDS, bag.start_ns, bag.incomplete, writer)
+            flight = RecordedFlight(values, evaluation, empty, time.process_time)
             neighbors = flight.perceiver.tracker.config.neighbors
-            evaluation = recorder.evaluation = Evaluation(
-                path.name, bag.duration_ns / NANOSECONDS, FrameErrors(neighbors, {
-                    camera.name: camera_mounting(camera.position, camera.rpy)
-                    for camera in mounted}, bag.start_ns),
-                flight, [n.name for n in neighbors], bag.incomplete)
+            evaluation.flight, evaluation.names = flight, [n.name for n in neighbors]
+            evaluation.errors = FrameErrors(neighbors, {
+                camera.name: camera_mounting(camera.position, camera.rpy)
+                for camera in mounted}, bag.start_ns)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *(
                     bag.topics[topic].msgtype for topic in used)):
@@ -285,8 +371,8 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             begin = time.perf_counter()
             system = None
             if checked:
-                recorder.own = OwnMotion(flight.source)
-                system = RecordedSystem(bag, values, '', namespace, remaps, recorder.own)
+                evaluation.own = OwnMotion(flight.source)
+                system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
             _play(bag, used, evaluation, system)
             if system is not None:
                 evaluation.findings = system.findings()
@@ -297,26 +383,17 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
-    errors, flight = evaluation.errors, evaluation.flight
     for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
         message, pixels = (None, None) if system is None else (
             system.take(topic, msgtype, stamp, data))
         name, camera = used.get(topic, ('', ''))
-        if name == 'odom':
-            flight.take_odometry(stamp, data, message)
-        elif name == RAW_IMAGES:
-            evaluation.images += 1
-            flight.take_image(stamp, msgtype, data, camera, message, pixels)
-        elif name == 'camera_info':
-            flight.take_camera_info(stamp, data, camera)
-        elif name == 'ranges':
-            flight.take_range(stamp, data)
-        elif name == 'truth/odom':
-            errors.true_odometry(from_odometry(read_odometry(data)))
-        elif name == 'truth/neighbors':
-            errors.true_neighbor(from_odometry(read_odometry(data)))
-    flight.finish()
+        if name in TRUTHS:
+            evaluation.errors.truth(
+                from_odometry(read_odometry(data)), own=name == 'truth/odom')
+        elif name:
+            evaluation.flight.take(name, stamp, msgtype, data, camera, message, pixels)
+    evaluation.flight.follower.finish()
 
 
 def _norm(vector: Array | None) -> float:
-    return float('nan') if vector is None else float(np.linalg.norm(vector))
+    return math.nan if vector is None else float(np.linalg.norm(vector))

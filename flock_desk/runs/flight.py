@@ -31,7 +31,8 @@ import sys
 import time
 from typing import NamedTuple, TypeVar
 
-from flock_desk.runs.column import spacing
+import numpy as np
+
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
@@ -98,6 +99,11 @@ def own(values: Mapping[str, T], namespace: str) -> dict[str, T]:
     prefix = f'{namespace}/' if namespace else ''
     return {name.removeprefix(prefix): value for name, value in values.items()
             if name.startswith(prefix)}
+
+
+def spacing(scenario: Scenario) -> float:
+    """Return the distance between two vehicles of a column at its start, m: the mean one."""
+    return float(np.mean(scenario.start.distance))
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,

@@ -77,12 +77,11 @@ _P, _V = slice(0, 3), slice(3, 6)
 
 
 class _States(NamedTuple):
-    """States at n stamps, in odom; covariances of estimates only; NaN if unknown."""
+    """States at n stamps, in odom; NaN if unknown."""
 
     position: Array
     velocity: Array
     rotation: Array
-    covariance: Array
 
 
 class FrameErrors:
@@ -106,8 +105,8 @@ class FrameErrors:
         mounted = {'': cameras} if isinstance(cameras, Transform) else cameras
         self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
         self._start = start
-        self._own, self._true_own = array('d'), array('d')
-        self._true = {name: array('d') for name in self._neighbors}
+        self._own = array('d')
+        self._true = {name: array('d') for name in ('', *self._neighbors)}  # '': the own state
         self._stamps = array('d')
         self._cameras: list[str] = []
         self._seen = {name: array('d') for name in self._neighbors}
@@ -123,16 +122,13 @@ class FrameErrors:
         """Take the own odometry."""
         self._take(self._own, state)
 
-    def true_odometry(self, state: OdometryState) -> None:
-        """Take the own true state."""
-        self._take(self._true_own, state)
-
-    def true_neighbor(self, state: OdometryState) -> None:
-        """Take a neighbour's true state; its name is the child frame."""
-        if state.child in self._true:
-            self._take(self._true[state.child], state)
+    def truth(self, state: OdometryState, own: bool = False) -> None:
+        """Take the own true state, or that of the neighbour that the child frame names."""
+        name = '' if own else state.child
+        if name in self._true:
+            self._take(self._true[name], state)
         else:
-            self.strangers.add(state.child)
+            self.strangers.add(name)
 
     def frame(self, stamp: int, estimates: Mapping[str, Estimate],
               stages: Mapping[str, str], camera: str = '') -> None:
@@ -140,12 +136,10 @@ class FrameErrors:
         self._stamps.append(stamp - self._start)
         self._cameras.append(camera)
         for name, seen in self._seen.items():
-            if (estimate := estimates.get(name)) is None:
-                seen.extend((0.0, *[np.nan] * (_SEEN - 1)))
-            else:
-                seen.extend((STAGES.index(stages.get(name, 'full')), *estimate.position,
-                             *estimate.velocity, *estimate.rotation.ravel(),
-                             *estimate.covariance[:6, :6].ravel()))
+            estimate = estimates.get(name)
+            seen.extend((0.0, *[np.nan] * (_SEEN - 1)) if estimate is None else (
+                STAGES.index(stages.get(name, 'full')), *estimate.position, *estimate.velocity,
+                *estimate.rotation.ravel(), *estimate.covariance[:6, :6].ravel()))
         if len(self._stamps) == BATCH:
             self._compare(BATCH - LATE)
 
@@ -165,21 +159,20 @@ class FrameErrors:
         stamps, cameras = np.array(self._stamps[:count]), np.array(self._cameras[:count])
         if not len(stamps):
             return
-        own, true_own = _at(self._own, stamps), _at(self._true_own, stamps)
+        own, true_own = _at(self._own, stamps), _at(self._true[''], stamps)
         for name, neighbor in self._neighbors.items():
             true = _at(self._true[name], stamps)
             seen = np.array(self._seen[name]).reshape(-1, _SEEN)[:count]
-            estimated = _States(seen[:, 1:4], seen[:, 4:7], seen[:, 7:16].reshape(-1, 3, 3),
-                                seen[:, 16:].reshape(-1, 6, 6))
+            estimated = _States(seen[:, 1:4], seen[:, 4:7], seen[:, 7:16].reshape(-1, 3, 3))
             columns = {
                 'time': stamps / NANOSECONDS, 'stage': seen[:, 0],
                 'visible': self._visible(neighbor, true, true_own, cameras),
                 'own_x': own.position[:, 0], 'own_y': own.position[:, 1],
-                **_errors(estimated, own, true, true_own)}
+                **_errors(estimated, seen[:, 16:].reshape(-1, 6, 6), own, true, true_own)}
             self._compared[name].append(np.stack([columns[key] for key in COLUMNS], axis=1))
             del self._seen[name][:len(stamps) * _SEEN]
         del self._stamps[:count], self._cameras[:count]
-        for states in (self._own, self._true_own, *self._true.values()):
+        for states in (self._own, *self._true.values()):
             before = np.array(states[::_STATE]) < min(self._stamps, default=-np.inf) - MAX_GAP
             del states[:_STATE * np.count_nonzero(before)]
 
@@ -188,15 +181,15 @@ class FrameErrors:
         """Return for every image whether a marker is in view, NaN if there is no truth."""
         position, _, rotation = _relative(true, true_own)
         visible = np.zeros(len(position), dtype=bool)
-        for name, T_camera_body in self._T_camera_body.items():
-            if (model := self.models.get(name)) is not None:
+        for name, model in self.models.items():
+            if model is not None:
                 for marker in neighbor.markers:
                     visible |= (cameras == name) & _marker_visible(
-                        marker, model, T_camera_body, position, rotation)
+                        marker, model, self._T_camera_body[name], position, rotation)
         return np.where(np.isfinite(position[:, 0]), visible, np.nan)
 
 
-def _errors(estimated: _States, own: _States, true: _States,
+def _errors(estimated: _States, covariance: Array, own: _States, true: _States,
             true_own: _States) -> dict[str, Array]:
     position, velocity, rotation = _relative(estimated, own)
     true_position, true_velocity, true_rotation = _relative(true, true_own)
@@ -206,10 +199,9 @@ def _errors(estimated: _States, own: _States, true: _States,
         'distance': np.linalg.norm(position, axis=1),
         'true_distance': np.linalg.norm(true_position, axis=1),
         'turned': np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))}
-    for kind, error, covariance in (
-            ('position', position - true_position, estimated.covariance[:, _P, _P]),
-            ('velocity', velocity - true_velocity, estimated.covariance[:, _V, _V])):
-        in_body = own.rotation.transpose(0, 2, 1) @ covariance @ own.rotation
+    for kind, error, k in (('position', position - true_position, _P),
+                           ('velocity', velocity - true_velocity, _V)):
+        in_body = own.rotation.transpose(0, 2, 1) @ covariance[:, k, k] @ own.rotation
         columns[f'nees_{kind}'] = _nees(error, in_body)
         for i, axis in enumerate('xyz'):
             columns[f'{kind}_{axis}'] = error[:, i]
@@ -232,8 +224,7 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
         normal = np.cross(in_camera[:, 2] - in_camera[:, 3], in_camera[:, 0] - in_camera[:, 3])
         facing = -np.einsum('ni,ni->n', normal, centre) > (
             GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(centre, axis=1))
-    result: NDArray[np.bool_] = inside & facing
-    return result
+    return np.asarray(inside & facing)
 
 
 def _at(states: array[float], stamps: Array) -> _States:
@@ -243,8 +234,7 @@ def _at(states: array[float], stamps: Array) -> _States:
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     n = len(stamps)
-    result = _States(np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
-                     np.empty(0))
+    result = _States(*(np.full((n, *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
     rows = np.array(states).reshape(-1, _STATE)
     if not len(rows):
         return result
@@ -287,3 +277,8 @@ def _nees(errors: Array, covariances: Array) -> Array:
     solved = np.linalg.solve(covariances[known], errors[known][:, :, None])[:, :, 0]
     nees[known] = np.einsum('ni,ni->n', errors[known], solved)
     return nees
+
+
+def by_axis(table: Table, kind: str) -> Array:
+    """Return the columns (n, 3) of a kind along x, y and z."""
+    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)

@@ -34,23 +34,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from flock_desk.runs.record import LiveRecord
-from flock_desk.runs.summary import hold_within, judged_outages, outage_name
-from flock_desk.scenarios.scenario import Scenario
-
 #: Keys under which anything may appear, a count of 0 unless it does.
 COUNTERS = ('rejections.', 'setpoints.reasons.')
-SPEED_TOLERANCE = 0.05  # m/s: what noise and gusts add to a speed that is held at v_max
-SAFE = 0.9  # of sqrt(d0): nearer than this no follower may come
-CORES = 1.5
-MISSED = 0.005  # of the planner's ticks
-RECALL = 0.9
-GAP = 0.5  # s without an estimate although the leader could be seen
-IN_BAND_EXTERNAL = 0.99  # of the time; what a real autopilot's loops and estimator may cost
-ALTITUDE_OFF = 0.3  # m from the leader's height
-DURATION_SHORT = 0.1  # s by which a flight may be shorter than requested
-PACE = 0.9  # of our clock: a slower vehicle is another vehicle
-AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
+
 
 
 class FigureBound(NamedTuple):
@@ -162,39 +148,3 @@ def _judge(bound: FigureBound, figure: float | None) -> Judgement:
 
 def _counted(key: str) -> bool:
     return key.startswith(COUNTERS)
-
-
-def scenario_bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
-    """Return what `fly` demands; an outrun follower must warn instead of holding the band."""
-    params = flight.scenario.flight
-    if summary['leader_faster_than_v_max']:
-        bounds = [FigureBound('planner.warnings', least=1)]
-    elif flight.external:
-        bounds = [FigureBound('time_in_band_share', least=IN_BAND_EXTERNAL)]
-    else:
-        bounds = [FigureBound('time_in_band_share', least=1),
-                  FigureBound('true_distance_m.max', most=round(math.sqrt(params.d1), 2))]
-    if flight.external:
-        bounds += [
-            FigureBound('duration_s', least=float(flight.log['duration']) - DURATION_SHORT),
-            FigureBound('altitude_off_m', most=ALTITUDE_OFF),
-            FigureBound('external.pace', least=PACE)]
-    bounds += [nearest(flight.scenario, 'true_distance_m.min'),
-               FigureBound('recall', least=RECALL),
-               FigureBound('longest_gap_in_view_s', most=GAP),
-               FigureBound('planner.missed_ticks_share', most=MISSED),
-               FigureBound('setpoints.acceleration_max_m_s2', most=params.a_max),
-               FigureBound('speed_max_m_s', most=params.v_max + SPEED_TOLERANCE)]
-    for outage in judged_outages(flight):
-        key = f'outages.{outage_name(outage)}'
-        bounds += [FigureBound(f'{key}.hold_after_s', 0, hold_within(outage)),
-                   FigureBound(f'{key}.reasons', least=1)]
-        if flight.duration > outage.at + outage.duration + AGAIN_WITHIN:
-            bounds.append(FigureBound(f'{key}.track_after_s', 0, AGAIN_WITHIN))
-    return [*bounds, FigureBound('cpu_cores.total', most=CORES),
-            FigureBound('failed_processes', most=0)]
-
-
-def nearest(scenario: Scenario, key: str) -> FigureBound:
-    """Return the bound on the least distance of two vehicles."""
-    return FigureBound(key, least=round(SAFE * math.sqrt(scenario.flight.d0), 3))

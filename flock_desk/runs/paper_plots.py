@@ -23,7 +23,6 @@ belongs to the caption.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +39,9 @@ import numpy as np
 from flock_desk.flocks.agents import Simulation
 from flock_desk.runs.plots import with_gaps
 from flock_desk.runs.record import LiveRecord
+from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
@@ -74,17 +73,17 @@ _TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'but
 _TIME = 'time [s]'
 
 
-def styled() -> AbstractContextManager[None]:
-    """Return the context to make a figure in; nothing of a user's matplotlibrc counts there."""
+def styled() -> Any:
+    """Return the context of a block or a function in which no user's matplotlibrc counts."""
     return style.context(['default', _STYLE])
 
 
+@styled()
 def save(figure: Figure, path: Path) -> str:
     """Write a figure in every kind, beside each other, and return the names in one."""
-    with styled():
-        for kind in KINDS:
-            with whole_file(path.with_suffix(f'.{kind}')) as file:
-                figure.savefig(file, format=kind, dpi=300, metadata=_METADATA[kind])
+    for kind in KINDS:
+        with whole_file(path.with_suffix(f'.{kind}')) as file:
+            figure.savefig(file, format=kind, dpi=300, metadata=_METADATA[kind])
     return f'{path.name}.' + '/.'.join(KINDS)
 
 
@@ -99,6 +98,7 @@ def bounds_handle(label: str) -> Handle:
     return Line2D([], [], color=INK, linestyle='--', linewidth=0.9, label=label)
 
 
+@styled()
 def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
     """Return the paths of each model's agents up to a time, s, from start to end."""
     def draw(axis: Axes, run: Simulation) -> None:
@@ -132,18 +132,18 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
                            color=INK, labelsep=0.08)
 
     first = next(iter(runs.values()))
-    with styled():
-        handles: list[Handle] = _agent_handles(names)
-        handles += [
-            Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
-                   markersize=4, label='start'),
-            Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
-                   label=f'after {end:g} s'),
-            Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
-        return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
-                       share=(False, False))
+    handles: list[Handle] = _agent_handles(names)
+    handles += [
+        Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
+               markersize=4, label='start'),
+        Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
+               label=f'after {end:g} s'),
+        Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
+    return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
+                   share=(False, False))
 
 
+@styled()
 def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
     """Return each agent's speed over time, up to a time, s."""
     top = 1.05 * max(np.linalg.norm(run.velocities, axis=2).max() for run in runs.values())
@@ -154,10 +154,10 @@ def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Fi
                       linestyle=dash)
         axis.set(xlim=(0.0, end), ylim=(0.0, top))
 
-    with styled():
-        return _panels(runs, draw, _agent_handles(names), _TIME, 'speed [m/s]', note)
+    return _panels(runs, draw, _agent_handles(names), _TIME, 'speed [m/s]', note)
 
 
+@styled()
 def distances(runs: Runs, end: float, note: str = '') -> Figure:
     """Return the distances between agents up to a time, s, and the bounds; each to its scale."""
     def draw(axis: Axes, run: Simulation) -> None:
@@ -172,78 +172,75 @@ def distances(runs: Runs, end: float, note: str = '') -> Figure:
         shown = np.sqrt(np.append(m.max_r2[:last + 1], run.params.d1))
         axis.set(xlim=(0.0, end), ylim=(0.0, 1.1 * float(shown.max())))
 
-    with styled():
-        several = next(iter(runs.values())).positions.shape[1] > 2
-        label = 'mean of the pairs' if several else 'between the two'
-        handles: list[Handle] = [Line2D([], [], color=COLOURS[0][0], label=label)]
-        if several:
-            handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
-                                 label='least to greatest'))
-        handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
-        return _panels(runs, draw, handles, _TIME, 'distance [m]', note, share=('all', False))
+    several = next(iter(runs.values())).positions.shape[1] > 2
+    label = 'mean of the pairs' if several else 'between the two'
+    handles: list[Handle] = [Line2D([], [], color=COLOURS[0][0], label=label)]
+    if several:
+        handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
+                             label='least to greatest'))
+    handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
+    return _panels(runs, draw, handles, _TIME, 'distance [m]', note, share=('all', False))
 
 
+@styled()
 def agreement(runs: Runs, end: float) -> Figure:
     """
     Return W of the first run, the law's, and how the velocities of all runs come to agree.
 
     A dot is where their disagreement has fallen below 1 % of the first for good.
     """
-    with styled():
-        figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
-        above, below = figure.subplots(2, 1, sharex=True)
-        law = next(iter(runs.values())).metrics
-        shown = law.time <= end
-        above.plot(law.time[shown], law.lyapunov[shown], color=INK)
-        last = np.flatnonzero(shown)[-1]
-        for n, place, side in ((0, (7, -2), 'left'), (last, (-3, 5), 'right')):
-            above.annotate(f'{law.lyapunov[n]:.4f} at {law.time[n]:g} s',
-                           (law.time[n], law.lyapunov[n]), place, fontsize=7, ha=side,
-                           textcoords='offset points')
-        above.set(ylabel='$W$ of the law [m/s]')
-        for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
-            m = run.metrics
-            below.semilogy(m.time, m.disagreement / m.disagreement[0], color=colour,
-                           linestyle=dash, label=name)
-            below.plot(m.time_to_agree(), 0.01, 'o', color=colour, markersize=4)
-        below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
-        below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
-                       ha='right')
-        below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel=_TIME, xlim=(0.0, end),
-                  ylim=(1e-5, 4.0))
-        figure.align_ylabels([above, below])
-        figure.legend(*below.get_legend_handles_labels(), loc='outside upper center', ncols=3,
-                      columnspacing=1.2, handlelength=1.9)
-        return figure
+    figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
+    above, below = figure.subplots(2, 1, sharex=True)
+    law = next(iter(runs.values())).metrics
+    shown = law.time <= end
+    above.plot(law.time[shown], law.lyapunov[shown], color=INK)
+    last = np.flatnonzero(shown)[-1]
+    for n, place, side in ((0, (7, -2), 'left'), (last, (-3, 5), 'right')):
+        above.annotate(f'{law.lyapunov[n]:.4f} at {law.time[n]:g} s',
+                       (law.time[n], law.lyapunov[n]), place, fontsize=7, ha=side,
+                       textcoords='offset points')
+    above.set(ylabel='$W$ of the law [m/s]')
+    for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
+        m = run.metrics
+        below.semilogy(m.time, m.disagreement / m.disagreement[0], color=colour,
+                       linestyle=dash, label=name)
+        below.plot(m.time_to_agree(), 0.01, 'o', color=colour, markersize=4)
+    below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
+    below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
+                   ha='right')
+    below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel=_TIME, xlim=(0.0, end),
+              ylim=(1e-5, 4.0))
+    figure.align_ylabels([above, below])
+    figure.legend(*below.get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                  columnspacing=1.2, handlelength=1.9)
+    return figure
 
 
+@styled()
 def flock(run: Simulation) -> Figure:
     """Return the paths, distances and agreement of a larger flock, in 2-D or 3-D."""
-    with styled():
-        figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
-        grid = figure.add_gridspec(3, 1, height_ratios=(2.2, 1.0, 1.0))
-        solid = run.positions.shape[2] == 3
-        paths = figure.add_subplot(grid[0], projection='3d' if solid else None)
-        _draw_paths(paths, run)
-        below, agreeing = figure.add_subplot(grid[1]), figure.add_subplot(grid[2])
-        m = run.metrics
-        on_graph = run.graph is not None
-        if on_graph or np.sqrt(m.max_r2.max()) < 2.0 * np.sqrt(run.params.d1):
-            below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
-                       label='longest edge' if on_graph else 'greatest')
-        below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
-        draw_bounds(below, run.params)
-        below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]))
-        below.set_ylim(bottom=0.0)
-        agreeing.plot(m.time, m.order, color=INK, label='order parameter')
-        agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
-                      linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
-        agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]))
-        agreeing.set_ylim(bottom=0.0)
-        for axis in figure.axes:  # above the axis, where no data can be
-            axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
-        figure.align_ylabels([below, agreeing])
-        return figure
+    figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
+    grid = figure.add_gridspec(3, 1, height_ratios=(2.2, 1.0, 1.0))
+    solid = run.positions.shape[2] == 3
+    paths = figure.add_subplot(grid[0], projection='3d' if solid else None)
+    _draw_paths(paths, run)
+    below, agreeing = figure.add_subplot(grid[1]), figure.add_subplot(grid[2])
+    m = run.metrics
+    on_graph = run.graph is not None
+    if on_graph or np.sqrt(m.max_r2.max()) < 2.0 * np.sqrt(run.params.d1):
+        below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
+                   label='longest edge' if on_graph else 'greatest')
+    below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
+    draw_bounds(below, run.params)
+    below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
+    agreeing.plot(m.time, m.order, color=INK, label='order parameter')
+    agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
+                  linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
+    agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
+    for axis in figure.axes:  # above the axis, where no data can be
+        axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
+    figure.align_ylabels([below, agreeing])
+    return figure
 
 
 def _draw_paths(axis: Axes, run: Simulation) -> None:
@@ -302,6 +299,7 @@ def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
             for name, (colour, dash) in zip(names, COLOURS)]
 
 
+@styled()
 def positions(flight: LiveRecord) -> Figure:
     """
     Return x and y of leader and follower over time, m in odom.
@@ -310,82 +308,72 @@ def positions(flight: LiveRecord) -> Figure:
     The true ones, in a frame without drift, are beneath.
     """
     table = _table(flight)
-    with styled():
-        figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
-        axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
-        for axis, name in zip(axes, 'xy'):
-            for who, (colour, dash), known in (('leader', COLOURS[0], f'neighbor_{name}'),
-                                               ('follower', COLOURS[1], f'own_{name}')):
-                axis.plot(table['time'], table[f'{who}_{name}'], color=colour, **_TRUTH)
-                axis.plot(table['time'], table[known], color=colour, linestyle=dash)
-            axis.set_ylabel(f'{name} [m]')
-        axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
-        figure.align_ylabels(axes)
-        handles: list[Handle] = [
-            Line2D([], [], color=colour, linestyle=dash, label=who)
-            for who, (colour, dash) in (('leader', COLOURS[0]), ('follower', COLOURS[1]))]
-        figure.legend(handles=[*handles, _truth_handle('true positions')],
-                      loc='outside upper center', ncols=3)
-        return figure
+    figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
+    axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
+    for axis, name in zip(axes, 'xy'):
+        for who, (colour, dash), known in (('leader', COLOURS[0], f'neighbor_{name}'),
+                                           ('follower', COLOURS[1], f'own_{name}')):
+            axis.plot(table['time'], table[f'{who}_{name}'], color=colour, **_TRUTH)
+            axis.plot(table['time'], table[known], color=colour, linestyle=dash)
+        axis.set_ylabel(f'{name} [m]')
+    axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
+    figure.align_ylabels(axes)
+    handles = [*_agent_handles(('leader', 'follower')), _truth_handle('true positions')]
+    figure.legend(handles=handles, loc='outside upper center', ncols=3)
+    return figure
 
 
+@styled()
 def distance(flight: LiveRecord) -> Figure:
     """Return the distance over time, m, as the follower knew it and as it was, in the band."""
     table, law = _table(flight), flight.params.law
-    with styled():
-        figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
-        axis: Axes = figure.subplots()
-        for begin, end in flight.blind:
-            axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
-        axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
-        axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
-        draw_bounds(axis, law)
-        top = max(1.12 * np.sqrt(law.d1), 1.05 * _greatest(table))
-        axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
-                 ylim=(0.0, top))
-        handles: list[Handle] = [
-            Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
-            _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
-        if flight.blind:
-            handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
-        figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
-                      columnspacing=1.2, handlelength=1.8)
-        return figure
+    figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
+    axis: Axes = figure.subplots()
+    for begin, end in flight.blind:
+        axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
+    axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
+    axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
+    draw_bounds(axis, law)
+    top = 1.05 * np.nanmax([*table['distance'], *table['true_distance'], 0.0])
+    axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
+             ylim=(0.0, max(1.12 * np.sqrt(law.d1), top)))
+    handles: list[Handle] = [
+        Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
+        _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
+    if flight.blind:
+        handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
+    figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
+                  columnspacing=1.2, handlelength=1.8)
+    return figure
 
 
+@styled()
 def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> Figure:
     """
     Return the share of runs that kept the band against the jerk, a panel for each ``v_max``, m/s.
 
     :param results: by ``v_max``, the jerk, m/s^3, and the share of each controller.
     """
-    with styled():
-        figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
-        axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
-        for axis, (v_max, points) in zip(axes, results.items()):
-            for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):
-                axis.plot(jerk, 100.0 * share, marker, markersize=5, label=name,
-                          color=COLOURS[1][0] if name == 'law and guard' else INK,
-                          markerfacecolor=None if name == 'law and guard' else 'white')
-            axis.set(title=f'$v_{{max}}$ = {v_max:g} m/s', xlabel='jerk [m/s$^3$]', ylim=(-5, 105))
-            axis.set_xlim(left=0.0)
-        axes[0].set_ylabel('runs in the band [%]')
-        figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
-                      columnspacing=1.0, handlelength=1.0)
-        return figure
+    figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
+    axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
+    for axis, (v_max, points) in zip(axes, results.items()):
+        for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):
+            axis.plot(jerk, 100.0 * share, marker, markersize=5, label=name,
+                      color=COLOURS[1][0] if name == 'law and guard' else INK,
+                      markerfacecolor=None if name == 'law and guard' else 'white')
+        axis.set(title=f'$v_{{max}}$ = {v_max:g} m/s', xlabel='jerk [m/s$^3$]', ylim=(-5, 105))
+        axis.set_xlim(left=0.0)
+    axes[0].set_ylabel('runs in the band [%]')
+    figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                  columnspacing=1.0, handlelength=1.0)
+    return figure
 
 
 def _table(flight: LiveRecord) -> Mapping[str, Array]:
     """Return the columns drawn; NaN if images are missing, and so no line."""
     true = {f'{who}_{name}': column
-            for who, places in (('leader', flight.leader), ('follower', flight.follower))
-            for name, column in zip('xy', places.T)}
+            for who, places in flight.paths.items() for name, column in zip('xy', places.T)}
     return with_gaps({**flight.table, **true})
-
-
-def _greatest(table: Mapping[str, Array]) -> float:
-    apart = np.concatenate([table['distance'], table['true_distance']])
-    return float(np.max(apart[np.isfinite(apart)], initial=0.0))
 
 
 def _truth_handle(label: str) -> Handle:

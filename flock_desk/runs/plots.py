@@ -18,24 +18,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 import io
-from typing import NamedTuple
+from itertools import cycle
 
-import cv2
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 
 from flock_desk.runs.evaluation import Evaluation
-from flock_desk.runs.frame_errors import STAGES, Table
-from flock_desk.runs.record import FlightRecord, LEADER_NAME, LiveRecord
+from flock_desk.runs.frame_errors import by_axis, STAGES, Table
+from flock_desk.runs.record import Flight, REPLAYED
 from flock_desk.runs.report import Chapter, Illustration
 from flock_desk.runs.summary import consistency, sight_figures
 from flock_follower.geometry import Array
-from flock_follower.planner.params import PlannerParams
 
 matplotlib.use('Agg')
 matplotlib.rcParams.update({
@@ -46,6 +42,7 @@ matplotlib.rcParams.update({
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 COLOURS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
+_SPEED_COLOURS = {'leader': LEADER, REPLAYED: VEHICLE}  # otherwise the follower's
 _STAGE_COLOURS = {'none': LIMIT, 'track': VEHICLE, 'roi': '#E69F00', 'full': FOLLOWER}
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
@@ -55,90 +52,26 @@ NARROWEST = 0.35  # of its length, of a map
 TIME = 'time [s]'
 
 
-class Curve(NamedTuple):
-    """A line of a picture, x and y (n,); NaN leaves a gap."""
-
-    label: str
-    colour: str
-    x: Array
-    y: Array
-
-
-@dataclass(frozen=True, eq=False)
-class PlottedFlight:
-    """
-    A flight behind one neighbour as its pictures show it, times in s from its beginning.
-
-    ``table`` is that of ``frame_errors``; ``paths`` are seen from above, m, the leader's and the
-    follower's, at the table's times; ``speeds`` are m/s over time. ``setpoints`` (k, 3), m/s^2,
-    were sent at ``setpoint_times`` (k,), for lack of a command if ``commanded`` (k,) is False.
-    ``states`` are the planner's, with the times at which it entered them. ``blind`` holds the
-    times in which the leader could not be seen, from and to.
-    """
-
-    name: str
-    duration: float
-    table: Table
-    params: PlannerParams
-    paths: Sequence[Curve]
-    speeds: Sequence[Curve]
-    setpoint_times: Array
-    setpoints: Array
-    commanded: NDArray[np.bool_]
-    states: Sequence[tuple[float, str]]
-    blind: Sequence[tuple[float, float]] = ()
-
-    @classmethod
-    def of(cls, flight: FlightRecord) -> PlottedFlight:
-        """Return a recorded flight."""
-        speeds = [Curve('follower', FOLLOWER, flight.velocity_times, _norms(flight.velocities))]
-        blind: list[tuple[float, float]] = []
-        if isinstance(flight, LiveRecord):
-            speeds.append(Curve('leader', LEADER, flight.table['time'], flight.leader_speed))
-            blind = flight.blind
-        else:
-            # The vehicle that flew the commands of a replay: its path means nothing in the bag.
-            speeds = [speeds[0]._replace(label='vehicle that flew the commands', colour=VEHICLE)]
-        return cls(
-            LEADER_NAME, flight.duration, flight.table, flight.params,
-            [Curve('leader', LEADER, *flight.leader[:, :2].T),
-             Curve('follower', FOLLOWER, *flight.follower[:, :2].T)], speeds,
-            flight.setpoint_times, flight.setpoints, np.ones(len(flight.setpoints), dtype=bool),
-            flight.states, blind)
-
-
-def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
-    """Return the pictures of the report of ``fly``: plots, and images of the follower's camera."""
-    log, times = flight.log, flight.table['time']
-    epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
-    return [*chapters(
-        PlottedFlight.of(flight),
-        note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.'),
-        Chapter("Images of the follower's camera", '', [
-            Illustration(cv2.imencode('.jpg', image)[1].tobytes(), '',
-                         f'{(int(stamp) - epoch) * 1e-9:.1f} s')
-            for stamp, image in zip(log['picture_stamp'], log['picture'])])]
-
-
 def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
     """Return what the report of ``evaluate`` shows."""
     ticks, setpoints = evaluation.ticks, evaluation.setpoints
-    speed = Curve('follower in the bag, which does not fly the setpoints', FOLLOWER, ticks[:, 0],
-                  ticks[:, 3])
     tables = {name: evaluation.errors.table(name) for name in evaluation.names}
     found: list[Chapter] = []
     for name, table in tables.items():
-        paths = [Curve(f'{name}, estimated', LEADER, table['neighbor_x'], table['neighbor_y']),
-                 Curve('follower, own odometry', FOLLOWER, table['own_x'], table['own_y'])]
-        found += chapters(PlottedFlight(
-            name, evaluation.duration, table, evaluation.flight.planner_params, paths, [speed],
-            setpoints[:, 0], setpoints[:, 1:4], setpoints[:, 4] == 1.0, evaluation.states))
+        found += chapters(Flight(
+            name=name, duration=evaluation.duration, params=evaluation.flight.planner_params,
+            table=table, states=evaluation.states, setpoint_times=setpoints[:, 0],
+            setpoints=setpoints[:, 1:4], commanded=setpoints[:, 4] == 1.0,
+            paths={f'{name}, estimated': np.stack([table['neighbor_x'], table['neighbor_y']], 1),
+                   'follower, own odometry': np.stack([table['own_x'], table['own_y']], 1)},
+            speeds={'follower in the bag, which does not fly the setpoints': (
+                ticks[:, 0], ticks[:, 3])}))
     return [*found, Chapter('Stages', '', [Illustration(stage_picture(
         tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
         evaluation.duration), 'stages and CPU time')])]
 
 
-def chapters(flight: PlottedFlight, note: str = '') -> list[Chapter]:
+def chapters(flight: Flight, note: str = '') -> list[Chapter]:
     """Return the chapters of a flight behind a neighbour: the flight and, with truth, errors."""
     result = [Chapter(f'Flight: {flight.name}', note, [Illustration(
         flight_picture(flight), 'distance, path, setpoints, speed and state')])]
@@ -152,7 +85,7 @@ def chapters(flight: PlottedFlight, note: str = '') -> list[Chapter]:
     return result
 
 
-def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
+def flight_picture(flight: Flight, title: str = '') -> bytes:
     """Return the picture of a flight, PNG; it shows errors only if there is truth."""
     truth = _has_truth(flight.table)
     figure = Figure(figsize=(13, 9.5), dpi=110, layout='constrained')
@@ -164,21 +97,21 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
         [list(row) for row in zip(left, right)], width_ratios=[1.45, 1.0],
         height_ratios=[1.2, 1.2, 1.0, 0.8])
     table, params = with_gaps(flight.table), flight.params
-    _draw_distance(axes['distance'], flight, table)
-    _draw_above(axes['above'], flight)
+    draw_distance(axes['distance'], flight, table)
+    draw_above(axes['above'], flight)
     _draw_acceleration(axes['acceleration'], flight)
     _draw_limit(axes['speed'], params.v_max, f'v_max\n{params.v_max:g} m/s')
-    for curve in flight.speeds:
-        axes['speed'].plot(curve.x, curve.y, color=curve.colour, linewidth=1.1, label=curve.label)
-    axes['speed'].set(ylabel='speed [m/s]')
-    axes['speed'].set_ylim(bottom=0.0)
+    for label, (times, speeds) in flight.speeds.items():
+        axes['speed'].plot(times, speeds, linewidth=1.1, label=label,
+                           color=_SPEED_COLOURS.get(label, FOLLOWER))
+    axes['speed'].set(ylabel='speed [m/s]', ylim=(0.0, None))
     add_key(axes['speed'])
     _draw_states(axes['state'], flight)
     if truth:
         figures = sight_figures([flight.table], params.max_velocity_std)
         for kind, unit in (('position', 'cm'), ('velocity', 'cm/s')):
             rms = figures['position_rms_m' if kind == 'position' else 'velocity_rms_m_s']
-            errors = 100.0 * _norms(_by_axis(table, kind))
+            errors = 100.0 * _norms(by_axis(table, kind))
             axes[kind].plot(table['time'], errors, color=FOLLOWER, linewidth=0.9)
             axes[kind].set(ylabel=f'{kind} error [{unit}]',
                            ylim=(0.0, 1.2 * _usually(errors, 99.5)))
@@ -194,7 +127,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
     return encoded(figure)
 
 
-def error_picture(flight: PlottedFlight) -> bytes:
+def error_picture(flight: Flight) -> bytes:
     """Return the picture of the errors and twice their deviations by axis, PNG."""
     table = with_gaps(flight.table)
     figures = sight_figures([flight.table], flight.params.max_velocity_std)
@@ -202,7 +135,7 @@ def error_picture(flight: PlottedFlight) -> bytes:
     axes = figure.subplots(3, 2, sharex=True)
     for column, (kind, unit) in enumerate((('position', 'cm'), ('velocity', 'cm/s'))):
         # One scale for the three axes, which makes them comparable.
-        errors, sigmas = 100.0 * _by_axis(table, kind), 100.0 * _by_axis(table, f'{kind}_sigma')
+        errors, sigmas = 100.0 * by_axis(table, kind), 100.0 * by_axis(table, f'{kind}_sigma')
         limit = 1.15 * max(_usually(np.abs(errors), 99.0), _usually(2.0 * sigmas, 90.0))
         for row, axis in enumerate(('x, forward', 'y, left', 'z, up')):
             plot: Axes = axes[row, column]
@@ -235,30 +168,13 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
                         markersize=13, markeredgewidth=1.2)
-    stages.set_title('stage that measured the neighbour in each image, and CPU time of perception')
-    stages.set(ylabel='stage', ylim=(-0.6, 3.6))
+    stages.set(ylabel='stage', ylim=(-0.6, 3.6), title='stage that measured the neighbour in '
+               'each image, and CPU time of perception')
     stages.set_yticks(range(len(STAGES)), STAGES)
     cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
     cpu.set(ylabel='CPU time [ms]', xlabel=TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
             xlim=(0.0, max(duration, 1e-3)))
     return encoded(figure)
-
-
-def portrait(record: LiveRecord) -> bytes:
-    """Return an image of the follower's camera beside both tracks and the distance, JPEG."""
-    flight, images = PlottedFlight.of(record), record.log['picture']
-    image: NDArray[np.uint8] = images[len(images) // 2]
-    figure = Figure(figsize=(12, 4.8), dpi=100, layout='constrained')
-    axes: dict[str, Axes] = figure.subplot_mosaic([['seen', 'above'], ['seen', 'distance']],
-                                                  width_ratios=[1.3, 1.0],
-                                                  height_ratios=[1.3, 1.0])
-    axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
-    axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
-    axes['seen'].spines[['top', 'right']].set_visible(True)
-    _draw_above(axes['above'], flight)
-    _draw_distance(axes['distance'], flight, with_gaps(flight.table))
-    axes['distance'].set(xlim=(0.0, flight.duration), xlabel=TIME)
-    return encoded(figure, 'jpg')
 
 
 def with_gaps(table: Table) -> Mapping[str, Array]:
@@ -277,7 +193,7 @@ def equal_scales(axis: Axes) -> None:
     axis.set_aspect('equal', adjustable='box')
 
 
-def _draw_distance(axis: Axes, flight: PlottedFlight, table: Table) -> None:
+def draw_distance(axis: Axes, flight: Flight, table: Table) -> None:
     law = flight.params.law
     low, high = np.sqrt(law.d0), np.sqrt(law.d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
@@ -290,36 +206,37 @@ def _draw_distance(axis: Axes, flight: PlottedFlight, table: Table) -> None:
                   linestyle=(0, (5, 3)), label='true')
     shown = np.concatenate([table['distance'], table['true_distance']])
     shown = shown[np.isfinite(shown)]
-    axis.set(ylabel='distance [m]', ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
-                                          max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
-    axis.set_title(f'distance to {flight.name}')
+    axis.set(ylabel='distance [m]', title=f'distance to {flight.name}',
+             ylim=(min(0.8 * low, 0.9 * np.min(shown, initial=np.inf)),
+                   max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
     _shade(axis, flight.blind, 'leader not visible')
     add_key(axis)
 
 
-def _draw_above(axis: Axes, flight: PlottedFlight) -> None:
+def draw_above(axis: Axes, flight: Flight) -> None:
     times = flight.table['time']
     period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
     draw_map(axis, flight.paths, f'from above (● start, ■ end; a line every {period:.0f} s)')
     for k in np.searchsorted(times, np.arange(0.0, flight.duration, period)):
         if k < len(times):
-            axis.plot([path.x[k] for path in flight.paths], [path.y[k] for path in flight.paths],
+            axis.plot(*np.transpose([path[k, :2] for path in flight.paths.values()]),
                       color=LIMIT, linewidth=0.6, alpha=0.5)
 
 
-def draw_map(axis: Axes, paths: Iterable[Curve], title: str) -> None:
-    for path in paths:
-        axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
-        known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
+def draw_map(axis: Axes, paths: Mapping[str, Array], title: str) -> None:
+    """Draw paths (n, 2) or (n, 3), m, from above, each with its label."""
+    for (label, path), colour in zip(paths.items(), cycle(COLOURS)):
+        axis.plot(*path[:, :2].T, color=colour, linewidth=1.7, label=label)
+        known = np.flatnonzero(np.isfinite(path[:, :2]).all(axis=1))
         for k, marker in zip((*known[:1], *known[-1:]), 'os'):
-            axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
+            axis.plot(*path[k, :2], marker, color=colour, markersize=6)
     axis.set(title=title, xlabel='x [m]', ylabel='y [m]')
     equal_scales(axis)
     axis.set_anchor('N')
     axis.legend(loc='best', fontsize=9)
 
 
-def _draw_acceleration(axis: Axes, flight: PlottedFlight) -> None:
+def _draw_acceleration(axis: Axes, flight: Flight) -> None:
     """Draw the setpoints by axis of odom, and their norm, which a_max limits."""
     times, setpoints = flight.setpoint_times, flight.setpoints
     a_max = flight.params.a_max
@@ -328,14 +245,15 @@ def _draw_acceleration(axis: Axes, flight: PlottedFlight) -> None:
         axis.plot(times, values, color=colour, linewidth=0.8, label=label)
     norms = _norms(setpoints)
     axis.plot(times, norms, color=LIMIT, linewidth=1.2, label='norm')
-    if (idle := ~flight.commanded).any():
+    if flight.commanded is not None and not flight.commanded.all():
+        idle = ~flight.commanded
         axis.plot(times[idle], norms[idle], '.', color=_SHADE, markersize=5,
                   label='no command: brake or level')
     axis.set(ylabel='acceleration [m/s²]', title='setpoint (odom axes)')
     add_key(axis)
 
 
-def _draw_states(axis: Axes, flight: PlottedFlight) -> None:
+def _draw_states(axis: Axes, flight: Flight) -> None:
     entered = [(max(0.0, time), _STATES.index(state)) for time, state in flight.states]
     if entered:
         times, levels = zip(*entered, (flight.duration, entered[-1][1]))
@@ -367,11 +285,6 @@ def add_key(axis: Axes) -> None:
 
 def _has_truth(table: Table) -> bool:
     return bool(np.any(np.isfinite(table['true_distance'])))
-
-
-def _by_axis(table: Table, kind: str) -> Array:
-    """Return the columns (n, 3) of a kind."""
-    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
 
 
 def _norms(vectors: Array) -> Array:

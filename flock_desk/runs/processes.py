@@ -12,14 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Child processes that are always stopped: Ctrl-C first, SIGKILL after a deadline."""
+"""
+Work in other processes: children that are always stopped, and tasks for a Dask cluster.
+
+Dask is an extra, ``pip install 'flock_follower[cluster]'``, imported only where it is asked for;
+its workers need this package in the same version, and the same files where tasks name some.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
+import multiprocessing
 import os
 from pathlib import Path
 import random
@@ -30,9 +37,10 @@ import sys
 import threading
 import time
 from types import FrameType, TracebackType
+from typing import TypeVar
 
 from flock_follower.checks.system import dead_segments
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 #: A flight is not judged if its processes, ready to run, wait for a processor for more than this
 #: share of the time for which they wait or run, over so long, s.
@@ -41,7 +49,9 @@ BUSY_WINDOW = 8.0
 TOO_BUSY_EXIT_CODE = 3
 PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
-
+SCHEDULER_TIMEOUT = 10.0  # s to find the scheduler of a cluster
+Given = TypeVar('Given')
+Result = TypeVar('Result')
 
 #: Sockets whose names claim domains. Their names end with the process, however it ends.
 _CLAIMS: list[socket.socket] = []
@@ -302,3 +312,58 @@ class Processes:
         self.stop_all()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
+
+
+def pooled(jobs: int, function: Callable[[Given], Result],
+           tasks: Iterable[Given]) -> Iterator[Result]:
+    """Yield what a function makes of each task, in their order, computed by ``jobs`` processes."""
+    if jobs == 1:
+        yield from map(function, tasks)
+        return
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
+    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        results = pool.map(function, tasks)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield from results
+    except BaseException:
+        # A task runs for up to a minute: its result is no longer needed.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def mapped(address: str, function: Callable[[Given], Result],
+           tasks: Sequence[Given]) -> Iterator[Result]:
+    """
+    Yield what a function makes of each task, in their order, computed by a cluster's workers.
+
+    :param address: of its scheduler, such as ``tcp://192.168.1.5:8786``.
+    :raises RuntimeError: if Dask is not installed here.
+    :raises OSError: if no scheduler answers there, or it is lost.
+    """
+    try:
+        from distributed import CancelledError, Client
+    except ImportError as error:
+        raise RuntimeError("--scheduler needs Dask: pip install 'flock_follower[cluster]' "
+                           f'({error})') from None
+    try:
+        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f'--scheduler {address}: no scheduler answers there: {error}') from None
+    with client:
+        futures = client.map(function, tasks, pure=False)
+        try:
+            while futures:
+                result = futures[0].result()
+                del futures[0]  # the cluster may forget it
+                yield result
+        except CancelledError:
+            raise OSError(f'--scheduler {address}: the scheduler is lost') from None
+        finally:
+            client.cancel(futures)

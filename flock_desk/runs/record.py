@@ -29,7 +29,7 @@ import json
 import math
 from pathlib import Path
 import shutil
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,41 +54,48 @@ from flock_follower.planner.params import PlannerParams
 LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
 EARLIER = 'earlier'
 PICTURE = 'picture.jpg'
+REPLAYED = 'vehicle that flew the commands'
 _RECORD = 'record'
 _FILES = ('flight.npz', 'report.html', PICTURE, 'summary.json')
 
 
-class Received(NamedTuple):
-    """A recorded message and when it was received, s on the monotonic clock."""
-
-    time: float
-    message: Any
-
-
-@dataclass(frozen=True, eq=False)
-class FlightRecord:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Flight:
     """
-    A flight; times in s from its beginning, vectors in odom or a frame like it without drift.
+    What the pictures of a flight behind one neighbour show; times in s from its beginning.
 
-    ``table`` is that of ``frame_errors``, n images; ``leader`` and ``follower`` (n, 3) are the
-    true positions, m, at these. ``distance`` holds true distances, m, as often as they are known.
-    ``setpoints`` (k, 3), m/s^2, were on the wire at ``setpoint_times`` (k,); the vehicle flew
-    ``velocities`` (m, 3), m/s, at ``velocity_times`` (m,). ``states`` are the planner's, and
-    ``diagnostics`` the arrays published, each with its time. ``command_times`` are those for which
-    the planner commanded, s on the bag's clock.
+    ``table`` is that of ``frame_errors``, n images; ``paths`` (n, 2) or (n, 3), m, are the
+    leader's and the follower's at these, ``speeds`` times (m,) and speeds (m,), m/s, each by its
+    label. ``setpoints`` (k, 3), m/s^2, were sent at ``setpoint_times`` (k,), for lack of a command
+    if ``commanded`` (k,) is False. ``states`` are the planner's, with the times at which it
+    entered them. ``blind`` holds the times in which the leader could not be seen, from and to.
     """
 
+    name: str = LEADER_NAME
     duration: float
     params: PlannerParams
     table: Table
-    leader: Array
-    follower: Array
-    distance: Array
+    paths: Mapping[str, Array]
+    speeds: Mapping[str, tuple[Array, Array]]
     setpoint_times: Array
     setpoints: Array
-    velocity_times: Array
-    velocities: Array
+    commanded: NDArray[np.bool_] | None = None
     states: list[tuple[float, str]]
+    blind: Sequence[tuple[float, float]] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FlightRecord(Flight):
+    """
+    A flight through the nodes, its vectors in odom or a frame like it without drift.
+
+    ``paths`` are the true ones; the first of ``speeds`` are those of the vehicle that flew the
+    setpoints. ``distance`` holds true distances, m, as often as they are known. ``diagnostics``
+    are the arrays published, each with its time. ``command_times`` are those for which the planner
+    commanded, s on the bag's clock.
+    """
+
+    distance: Array
     diagnostics: list[tuple[float, Any]]
     command_times: Array = field(default_factory=lambda: np.empty(0))
 
@@ -109,7 +116,7 @@ class LiveRecord(FlightRecord):
     A flight of a scenario, in the odom frame without drift.
 
     An image of the table counts as one with the leader in view if the simulator says that the
-    leader can be seen and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the
+    leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
 
@@ -129,24 +136,11 @@ class LiveRecord(FlightRecord):
                 else math.nan)
 
     @property
-    def leader_speed(self) -> Array:
-        """Return the leader's speed at each image, m/s."""
-        return np.linalg.norm(self.log['leader_velocity'], axis=1)
-
-    @property
     def time_in_band_share(self) -> float:
         """Return the share of the time for which the true distance was inside the band."""
         law = self.scenario.flight
         return float(np.mean((self.distance > math.sqrt(law.d0))
                              & (self.distance < math.sqrt(law.d1))))
-
-    @property
-    def blind(self) -> list[tuple[float, float]]:
-        """Return from when to when images could not show the leader, or place it, s."""
-        times, hidden = self.table['time'], self.table['visible'] == 0.0
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
-        return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
-                for begin, end in zip(edges[::2], edges[1::2])]
 
 
 def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
@@ -174,9 +168,10 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
     own = [state for message in odometry
            if (state := source.take(message, stamp_to_nanoseconds(message.header.stamp)))]
     # Its leader is in view in every image.
-    table, leader, follower = compared(
-        estimates(record['/neighbors']), own, [*map(from_odometry, true_own)],
-        [*map(from_odometry, true_leader)], stamps, np.ones(len(stamps)), int(stamps[0]))
+    leader_states, follower_states = (
+        [*map(from_odometry, states)] for states in (true_leader, true_own))
+    table = compared(estimates(record['/neighbors']), own, follower_states, leader_states,
+                     stamps, np.ones(len(stamps)), int(stamps[0]))
     # The bag's clock relative to the monotonic one of the logs.
     origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
     with np.load(out / 'autopilot.npz') as file:
@@ -184,11 +179,15 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
     flown, sent = ((log[name] >= received[0]) & (log[name] <= received[-1])
                    for name in ('state_time', 'setpoint_time'))
     return FlightRecord(
-        duration=float(table['time'][-1]), params=params, table=table, leader=leader,
-        follower=follower, distance=table['true_distance'][np.isfinite(table['true_distance'])],
+        duration=float(table['time'][-1]), params=params, table=table,
+        paths={'leader': _positions(leader_states, stamps),
+               'follower': _positions(follower_states, stamps)},
+        # Its path means nothing in the bag.
+        speeds={REPLAYED: (log['state_time'][flown] - origin,
+                           np.linalg.norm(log['velocity'][flown], axis=1))},
+        distance=table['true_distance'][np.isfinite(table['true_distance'])],
         setpoint_times=log['setpoint_time'][sent] - origin,
         setpoints=log['setpoint_acceleration'][sent],
-        velocity_times=log['state_time'][flown] - origin, velocities=log['velocity'][flown],
         states=[(t - origin, m.data) for t, m in record['/planner/state']],
         diagnostics=[(t - origin, m) for t, m in record['/diagnostics']], command_times=ticks)
 
@@ -230,22 +229,28 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord
     record = read_record(out / _RECORD)
     if str(log['pose_source']):
         commands = record.get('/command/trajectory', [])
-        log['setpoint_time'] = np.array([command.time for command in commands])
+        log['setpoint_time'] = np.array([time for time, _ in commands])
         log['setpoint_acceleration'] = np.reshape(
-            [from_trajectory(command.message, 'odom').acceleration for command in commands],
+            [from_trajectory(message, 'odom').acceleration for _, message in commands],
             (-1, 3))
     sent = flown(log['setpoint_time'])
-    table, leader, follower = compared(
+    table = compared(
         estimates(record.get('/neighbors', [])), _states(log, 'odom', log['odom_stamp']),
         _states(log, 'follower', log['image_stamp']),
         _states(log, LEADER_NAME, log['image_stamp']),
         log['image_stamp'], log['image_usable'].astype(float), epoch)
+    times, hidden = table['time'], table['visible'] == 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
     return LiveRecord(
-        duration=ended - began, params=scenario.flight.planner(True), table=table, leader=leader,
-        follower=follower, distance=log['distance'][flown(log['distance_time'])],
+        duration=ended - began, params=scenario.flight.planner(True), table=table,
+        paths={name: log[f'{name}_position'] for name in (LEADER_NAME, 'follower')},
+        speeds={'follower': (log['state_time'] - began, np.linalg.norm(log['velocity'], axis=1)),
+                'leader': (times, np.linalg.norm(log['leader_velocity'], axis=1))},
+        blind=[(float(times[begin]), float(times[min(end, len(times) - 1)]))
+               for begin, end in zip(edges[::2], edges[1::2])],
+        distance=log['distance'][flown(log['distance_time'])],
         setpoint_times=log['setpoint_time'][sent] - began,
         setpoints=log['setpoint_acceleration'][sent],
-        velocity_times=log['state_time'] - began, velocities=log['velocity'],
         states=[(float(t) - began, str(s))
                 for t, s in zip(log['planner_time'], log['planner_state'])],
         diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
@@ -270,21 +275,21 @@ def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryStat
                 log[f'{name}_{what}'] for what in ('position', 'quaternion', 'velocity')))]
 
 
-def read_record(path: Path) -> dict[str, list[Received]]:
+def read_record(path: Path) -> dict[str, list[tuple[float, Any]]]:
     """
-    Return what the recorder wrote, by topic.
+    Return the messages that the recorder wrote, by topic, each with its monotonic time, s.
 
     :raises BagError: if it cannot be read.
     """
-    record: dict[str, list[Received]] = {}
+    record: dict[str, list[tuple[float, Any]]] = {}
     with open_bag(path) as bag:
         for m in bag.messages():
             record.setdefault(m.topic, []).append(
-                Received(m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
+                (m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
     return record
 
 
-def estimates(messages: Sequence[Received]) -> dict[int, dict[str, Estimate]]:
+def estimates(messages: Sequence[tuple[float, Any]]) -> dict[int, dict[str, Estimate]]:
     """
     Return the estimates that messages of ``neighbors`` hold, by stamp, ns, and name.
 
@@ -306,10 +311,9 @@ def estimates(messages: Sequence[Received]) -> dict[int, dict[str, Estimate]]:
 
 def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[OdometryState],
              true_own: Sequence[OdometryState], true_leader: Sequence[OdometryState],
-             stamps: NDArray[np.int64], visible: Array,
-             start: int) -> tuple[Table, Array, Array]:
+             stamps: NDArray[np.int64], visible: Array, start: int) -> Table:
     """
-    Return the table of ``frame_errors`` and the true positions (n, 3) of leader and follower.
+    Return the table of ``frame_errors``.
 
     The consistency of velocities is left unknown (NaN): the covariance in a message is of the
     twist in the leader's body, and holds the error of the leader's attitude, too.
@@ -320,15 +324,16 @@ def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[Odometry
     """
     errors = FrameErrors(
         [MarkedNeighbor(LEADER_NAME, ())], Transform(np.eye(3), np.zeros(3)), start)
-    for take, states in ((errors.odometry, own), (errors.true_odometry, true_own),
-                         (errors.true_neighbor, true_leader)):
-        for state in states:
-            take(state._replace(child=LEADER_NAME))
+    for state in own:
+        errors.odometry(state)
+    for true_state in true_own:
+        errors.truth(true_state, own=True)
+    for true_state in true_leader:
+        errors.truth(true_state._replace(child=LEADER_NAME))
     for stamp in stamps.tolist():
         errors.frame(stamp, found.get(stamp, {}), {})
-    table = {**errors.table(LEADER_NAME), 'visible': visible,
-             'nees_velocity': np.full(len(stamps), np.nan)}
-    return table, _positions(true_leader, stamps), _positions(true_own, stamps)
+    return {**errors.table(LEADER_NAME), 'visible': visible,
+            'nees_velocity': np.full(len(stamps), np.nan)}
 
 
 def _positions(states: Sequence[OdometryState], stamps: NDArray[np.int64]) -> Array:

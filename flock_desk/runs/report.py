@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
 from flock_desk.runs.summary import consistency, write_summary
-from flock_follower.whole_file import whole_file
+from flock_follower.files import whole_file
 
 #: The figures printed, beside all that have a bound; the others are in summary.json.
 SHOWN = (
@@ -242,7 +242,8 @@ def _bounds(judgements: Sequence[Judgement]) -> str:
     if not judgements:
         return ''
     rows = ''.join(
-        f'<tr><td>{escape(_path_name(bound.key))} <code>{escape(bound.key)}</code></td>'
+        f'<tr><td>{escape(": ".join(map(name, bound.key.split("."))))} '
+        f'<code>{escape(bound.key)}</code></td>'
         f'<td>{escape(text(figure))}</td><td>{bound}</td>'
         + ('<td class="failed">FAILED</td></tr>' if fault else '<td class="ok">ok</td></tr>')
         for bound, figure, fault in judgements)
@@ -264,17 +265,15 @@ def _illustration(illustration: Illustration) -> str:
     return f'<figure>{image}<figcaption>{escape(illustration.caption)}</figcaption></figure>'
 
 
-def _groups(summary: Mapping[str, Any]) -> list[str]:
-    """Return the figures on their own as one table, and one for each group of them."""
-    alone = {key: value for key, value in summary.items() if not isinstance(value, Mapping)}
-    groups = {key: value for key, value in summary.items() if isinstance(value, Mapping)}
-    return [_group('', alone), *(_group(key, group) for key, group in groups.items())]
-
-
-def _group(key: str, figures: Mapping[str, Any]) -> str:
-    title = f'<caption title="{escape(key)}">{escape(name(key))}</caption>' if key else ''
-    rows = ''.join(_rows(figures, f'{key}.' if key else ''))
-    return f'<table>{title}{rows or "<tr><td>none</td></tr>"}</table>'
+def _groups(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a table of the figures on their own, and one for each group of them."""
+    groups = {'': {key: value for key, value in summary.items()
+                   if not isinstance(value, Mapping)},
+              **{key: value for key, value in summary.items() if isinstance(value, Mapping)}}
+    for key, figures in groups.items():
+        title = f'<caption title="{escape(key)}">{escape(name(key))}</caption>' if key else ''
+        rows = ''.join(_rows(figures, f'{key}.' if key else ''))
+        yield f'<table>{title}{rows or "<tr><td>none</td></tr>"}</table>'
 
 
 def _rows(figures: Mapping[str, Any], prefix: str, part: bool = False) -> Iterator[str]:
@@ -285,19 +284,10 @@ def _rows(figures: Mapping[str, Any], prefix: str, part: bool = False) -> Iterat
             yield from _rows(value, f'{prefix}{key}.', True)
             continue
         indented = part or ('total' in figures and key != 'total')
+        shown = '<br>'.join(filter(None, [escape(text(value)), _verdict(key, value)]))
         yield (f'<tr{" class=part" if indented else ""} title="{escape(prefix + key)}">'
-               f'<td>{escape(name(key))}</td><td>{escape(text(value))}{_remark(key, value)}</td>'
-               '</tr>')
+               f'<td>{escape(name(key))}</td><td>{shown}</td></tr>')
 
-
-def _remark(key: str, value: Any) -> str:
-    verdict = _verdict(key, value)
-    return f'<br>{verdict}' if verdict else ''
-
-
-def _path_name(key: str) -> str:
-    """Return the title of a figure by its whole key: subject and quantity."""
-    return ': '.join(map(name, key.split('.')))
 
 def name(key: str) -> str:
     """Return the name of a figure by the last part of its key, with its unit."""

@@ -31,12 +31,12 @@ from typing import Any
 import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation, STATES
-from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.frame_errors import by_axis, STAGES, Table
 from flock_desk.runs.record import FlightRecord, LiveRecord
 from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
+from flock_follower.files import whole_file
 from flock_follower.geometry import Array
-from flock_follower.whole_file import whole_file
 
 #: Attitudes further than this from the truth count as wrong, rad.
 WRONG_ATTITUDE = math.radians(20.0)
@@ -64,7 +64,8 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])
     in_view = rows['visible'] == 1.0
     position, velocity = _errors(rows, 'position'), _errors(rows, 'velocity')
-    usable = _usable(rows, max_velocity_std)
+    sigmas = by_axis(rows, 'velocity_sigma')[np.isfinite(by_axis(rows, 'velocity')).all(axis=1)]
+    usable = np.sum(sigmas ** 2, axis=1) <= max_velocity_std ** 2
     distance_error = (rows['distance'] - rows['true_distance'])[found & known]
     return {
         'frames_in_view': int(np.count_nonzero(in_view)) if np.any(known) else None,
@@ -135,7 +136,7 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
         'check': {f'{level}s': [finding.line for finding in evaluation.findings
                                 if finding.level == level] for level in (ERROR, WARNING)},
         'neighbors': evaluation.names,
-        'frames': evaluation.images,
+        'frames': len(evaluation.frames),
         **sight_figures(tables, params.max_velocity_std),
         'own_speed_max_m_s': most(speed),
         'faster_than_v_max_share': mean(ticks[:, 3] > params.v_max),
@@ -187,7 +188,7 @@ def flight_figures(flight: FlightRecord,
             'sent': len(flight.setpoints),
             'rate_hz': rate(flight.setpoint_times),
             'acceleration_max_m_s2': most(np.linalg.norm(flight.setpoints, axis=1))},
-        'speed_max_m_s': most(np.linalg.norm(flight.velocities, axis=1)),
+        'speed_max_m_s': most(next(iter(flight.speeds.values()))[1]),
         'latency_ms': {f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
                        for p in (50, 95, 99)},
         'failed_processes': sum(code != 0 for code in exit_codes.values())}
@@ -228,6 +229,7 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
     :param cores: used by each process, empty if unknown.
     """
     params, table, log = flight.scenario.flight, flight.table, flight.log
+    times, leader_speeds = flight.speeds['leader']
     common = flight_figures(flight, exit_codes)
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
     return jsonable({
@@ -236,9 +238,9 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
         'time_in_band_share': flight.time_in_band_share,
         'longest_gap_in_view_s': _longest(
             table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
-        'leader_speed_max_m_s': most(flight.leader_speed),
+        'leader_speed_max_m_s': most(leader_speeds),
         'leader_faster_than_v_max': _longest(
-            table['time'], flight.leader_speed > 1.001 * params.v_max) >= OUTRUN,
+            times, leader_speeds > 1.001 * params.v_max) >= OUTRUN,
         'altitude_off_m': most(_altitude_off(flight)),
         'planner': {
             **common['planner'],
@@ -270,7 +272,7 @@ def _altitude_off(flight: LiveRecord) -> Array:
     times, hidden = flight.table['time'], flight.table['visible'] == 0.0
     begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf
     last_hidden = np.maximum.accumulate(np.where(hidden, times, begin))
-    off: Array = np.abs(flight.leader[:, 2] - flight.follower[:, 2])
+    off: Array = np.abs(flight.paths['leader'][:, 2] - flight.paths['follower'][:, 2])
     return off[times - last_hidden >= LEVEL_WITHIN]
 
 
@@ -366,15 +368,8 @@ def rate(times: Array) -> float:
 
 def _errors(rows: Table, kind: str) -> Array:
     """Return the errors (n, 3) of the images where they are known."""
-    errors = np.stack([rows[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)
+    errors = by_axis(rows, kind)
     return errors[np.isfinite(errors).all(axis=1)]
-
-
-def _usable(rows: Table, max_velocity_std: float) -> Any:
-    """Return which of the images with known errors have a velocity the planner would use."""
-    known = np.isfinite(rows['velocity_x'])
-    variance = sum(rows[f'velocity_sigma_{axis}'][known] ** 2 for axis in 'xyz')
-    return variance <= max_velocity_std ** 2
 
 
 def _finite(values: Array) -> Array:

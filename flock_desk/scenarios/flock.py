@@ -16,21 +16,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, MISSING
+from dataclasses import dataclass, fields, MISSING
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from flock_desk.scenarios.part import Part
 from flock_follower.geometry import Array
-from flock_follower.ranges import parameter, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 FORMATIONS = ('line', 'wedge', 'ring', 'grid')
 SIDES = ('front', 'left', 'right', 'back', 'up', 'down')
 LEADER = 'leader'
 ARM = 0.6  # rad between an arm of a wedge and straight behind the leader
 _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from its middle
+
+
+class Part(Checked):
+    """A part of a scenario, checked as it is made; one number is an interval of that number."""
+
+    def __post_init__(self) -> None:
+        intervals = [f.name for f in fields(self)  # type: ignore[arg-type]
+                     if f.type == 'Interval']
+        for name in intervals:
+            value = getattr(self, name)
+            if not isinstance(value, tuple):
+                object.__setattr__(self, name, (value, value))
+        super().__post_init__()
+        for name in intervals:
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f'{name} = {[low, high]}: must be [lowest, highest]')
 
 
 @dataclass(frozen=True)

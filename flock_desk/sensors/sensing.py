@@ -12,18 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Simulated detection in lock step: the field of view of a camera, and measurement noise."""
+"""Sensors in lock step: the field of view of a camera, its noise, radio messages and ranges."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_desk.scenarios.scenario import RangeErrors
 from flock_follower.geometry import Array
 
 #: Where cameras look, and markers, on the body (FLU).
@@ -118,3 +120,64 @@ def hidden(offsets: Array, present: Any, radius: float) -> Any:
     between = (along > 0.0) & (along < distance[..., None, :]) & (beside < radius ** 2)
     between &= ~np.eye(offsets.shape[-2], dtype=bool) & np.asarray(present)[..., :, None]
     return between.any(axis=-2)
+
+
+Message = TypeVar('Message')
+
+
+class Radio(Generic[Message]):
+    """
+    Messages within flocks of m vehicles; no flock receives messages of another.
+
+    :param company: m, the number of vehicles in each flock.
+    :param delay: time from sending to arrival, s.
+    :param loss: share of messages that do not arrive at one of the receivers.
+    :param generators: random generators, one for each follower, flock by flock.
+    """
+
+    def __init__(self, company: int, delay: float, loss: float,
+                 generators: Sequence[np.random.Generator]) -> None:
+        self._company, self._delay, self._loss = company, delay, loss
+        self._generators = generators
+        self._coming: deque[tuple[float, int, Message]] = deque()
+
+    def send(self, now: float, sender: int, messages: Sequence[Message]) -> None:
+        """Take messages that a follower, counted through all flocks, sends at a time, s."""
+        first = sender - sender % self._company
+        draws = self._generators[sender].random((len(messages), self._company))
+        for message, luck in zip(messages, draws.tolist()):
+            self._coming += [
+                (now + self._delay, first + k, message) for k, p in enumerate(luck)
+                if first + k != sender and p >= self._loss]
+
+    def arrived(self, now: float) -> list[tuple[int, Message]]:
+        """Return the messages that have arrived since the last call, each with its receiver."""
+        received = []
+        while self._coming and self._coming[0][0] <= now + 1e-9:
+            _, receiver, message = self._coming.popleft()
+            received.append((receiver, message))
+        return received
+
+
+class Radios:
+    """
+    Measure distances with the errors of a scenario.
+
+    :param generators: of the random numbers, one for each row.
+    """
+
+    def __init__(self, errors: RangeErrors, generators: Sequence[np.random.Generator]) -> None:
+        self._errors, self._generators = errors, generators
+        self._bias = errors.bias * np.array([g.standard_normal() for g in generators])
+        self._walk = errors.bias_walk * errors.rate ** -0.5
+
+    def measure(self, distance: Array) -> Array:
+        """Return measurements of true distances (n,), m, one period after the last."""
+        errors = self._errors
+        drawn = np.stack([g.standard_normal(2) for g in self._generators])
+        chance = np.stack([g.random(2) for g in self._generators])
+        self._bias = self._bias + self._walk * drawn[:, 0]
+        detour = np.where(chance[:, 0] < errors.outliers, errors.outlier * chance[:, 1], 0.0)
+        measured: Array = np.maximum(
+            distance + self._bias + errors.noise * drawn[:, 1] + detour, 0.0)
+        return measured

@@ -46,15 +46,12 @@ from flock_desk.vehicles.flight_controller import (
 from flock_desk.vehicles.profiles import ARDUCOPTER, LAND
 from flock_follower.geometry import Array
 
-POSITION_TIMEOUT: Final[float] = 7.1
 _CHECK_TIME: Final[float] = 0.8
-_FUSION_TIMEOUT: Final[float] = 14.5
 PREARM_PERIOD: Final[float] = 30.0
 _LANDED: Final[float] = 1.0  # s on the ground that count as a landing
 _BRAKE_ACCELERATION: Final[float] = 7.5  # m/s^2, BRAKE_MODE_DECEL_RATE
 _BRAKE_GAIN: Final[float] = 3.5  # 1/s
 _STOP_ACCELERATION: Final[float] = 2.5  # m/s^2, WPNAV_ACCEL
-_ALWAYS, _HORIZONTAL, _STANDING = 0x25, 0x31A, 0x82
 _POSITION_BITS, _VELOCITY_BITS, _ACCELERATION_BITS = 0b111, 0b111 << 3, 0b111 << 6
 #: Its words for a condition of arming that is not met.
 _REASONS: Final[Mapping[str, str]] = {
@@ -82,21 +79,6 @@ class ArduCopter(FlightController):
         """Return whether it is on its way to the take-off altitude, in GUIDED."""
         return bool(self.mode == 'GUIDED' and self._place is not None
                     and self.estimator.position[2] < self._place[2] - ARRIVED)
-
-    def position_known(self, now: float) -> bool:
-        """Return whether there is an estimate, and vision, where it needs it, not long gone."""
-        return (self.estimator.ready(now)
-                and self.estimator.vision_age(now) <= POSITION_TIMEOUT)
-
-    def reports_position(self, now: float) -> bool:
-        """Return whether it sends LOCAL_POSITION_NED: longer than it is valid."""
-        return self.estimator.ready(now) and self.estimator.vision_age(now) <= _FUSION_TIMEOUT
-
-    def estimator_flags(self, now: float) -> int:
-        """Return the flags of EKF_STATUS_REPORT."""
-        if self.position_known(now):
-            return _ALWAYS | _HORIZONTAL
-        return _ALWAYS if self.reports_position(now) else _ALWAYS | _STANDING
 
     def on_setpoint(self, message: Any, now: float) -> None:
         """Take an acceleration, in GUIDED only; whatever else comes stops it."""
@@ -168,7 +150,7 @@ class ArduCopter(FlightController):
         needs_position = ARDUCOPTER.modes[self.mode].needs or self._flies == LAND
         age = self.estimator.vision_age(now)
         if self.armed and needs_position and not self.in_failsafe and (
-                POSITION_TIMEOUT + _CHECK_TIME < age < math.inf):
+                ARDUCOPTER.position_timeout + _CHECK_TIME < age < math.inf):
             mode = 'ALT_HOLD' if self.parameters['FS_EKF_ACTION'] == 2 else 'LAND'
             self._send_text(f'EKF Failsafe: changed to {mode} Mode')
             self._enter(mode)
@@ -207,10 +189,6 @@ class ArduCopter(FlightController):
         estimate = self.estimator
         velocity = self._velocity + POSITION_GAIN * (self._position - estimate.position)
         return forward + VELOCITY_GAIN * (velocity - estimate.velocity)
-
-    @property
-    def _landing_speed(self) -> float:
-        return self.parameters['LAND_SPEED'] * 1e-2
 
     @property
     def _disarms_after(self) -> float:

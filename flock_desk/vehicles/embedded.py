@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The whole embedded autopilot without socket and clock: bytes in, bytes out.
+The whole embedded autopilot without socket and clock: MAVLink 2 bytes in, bytes out.
 
 Fly it in simulated time beside a bridge, in one process::
 
@@ -29,29 +29,47 @@ import math
 from types import MappingProxyType
 from typing import Any, Final
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk.vehicles.arducopter import ArduCopter
-from flock_desk.vehicles.autopilot_parameters import AutopilotParameters
-from flock_desk.vehicles.equipment import BarometerErrors, Equipment
-from flock_desk.vehicles.flight_controller import FlightController
+from flock_desk.vehicles.estimator import Barometer, GROUND_AMSL, pressure
+from flock_desk.vehicles.flight_controller import ACCEPTED, FlightController
 from flock_desk.vehicles.flight_log import FlightLog
-from flock_desk.vehicles.mavlink_vehicle import MavlinkVehicle, STEP
-from flock_desk.vehicles.profiles import PROFILES
+from flock_desk.vehicles.profiles import Parameters, PROFILES
 from flock_desk.vehicles.px4 import Px4
-from flock_desk.vehicles.vehicle import Quadrotor, VehicleParams
+from flock_desk.vehicles.quadrotor import Quadrotor, VehicleParams
+from flock_follower.geometry import (
+    Array,
+    enu_to_ned,
+    flu_to_frd,
+    quaternion_enu_flu_to_ned_frd,
+)
 from flock_follower.ranges import Range
 
+STEP: Final[float] = 0.01  # s
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')
 SYSTEM_IDS: Final[Range] = Range(1, 255, whole=True)
+#: PX4 sends CURRENT_MODE at the most every so many seconds where the mode stays.
+CURRENT_MODE_PERIOD: Final[float] = 0.5
+FORCE: Final[int] = 21196  # param2 that forces arming and disarming
+CAPACITY: Final[float] = 5.2  # Ah
+CURRENT: Final[float] = 18.0  # A in flight
+_LONGEST_WAY: Final[int] = 1_000_000_000  # ns from a TIMESYNC question to its answer
+_CELLS: Final[int] = 4
+_UNKNOWN_VOLTAGE: Final[int] = 65535
+LATITUDE, LONGITUDE = 47.397742, 8.545594  # degrees, of the local origin
+DEGREE: Final[float] = 111_320.0  # m along a meridian
 _NO_PARAMETERS: Final[Mapping[str, float]] = MappingProxyType({})
+_NAMES: Final[Mapping[int, str]] = {
+    number: message.msgname for number, message in mavlink.mavlink_map.items()}
 
 
 class EmbeddedAutopilot:
     """
     An autopilot with the personality of PX4 or ArduCopter.
 
-    :param now: monotonic time, s, of the start.
+    :param now: monotonic time, s, of the start; messages carry times since then.
     :param start: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
     :param altitude: m, of an airborne start.
     :param yaw: rad, ENU, at the start.
@@ -60,32 +78,31 @@ class EmbeddedAutopilot:
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, where the link is signed.
-    :param barometer: how it errs.
     :raises ValueError: for an unknown personality, start or parameter.
     """
 
     def __init__(self, personality: str = 'px4', *, now: float, start: str = 'airborne',
                  altitude: float = 2.0, yaw: float = 0.0, system_id: int = 1,
                  parameters: Mapping[str, float] = _NO_PARAMETERS, arming_denial: str = '',
-                 ready_after: float = 0.0, seed: int = 0, signing: Any = None,
-                 barometer: BarometerErrors | None = None) -> None:
+                 ready_after: float = 0.0, seed: int = 0, signing: Any = None) -> None:
         for name, value, valid in (('personality', personality, tuple(PROFILES)),
                                    ('start', start, STARTS)):
             if value not in valid:
                 raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
         SYSTEM_IDS.check('system_id', system_id)
-        profile = PROFILES[personality]
-        self._parameters = AutopilotParameters(profile)
+        self._profile = PROFILES[personality]
+        self._parameters = Parameters(self._profile)
         for name, number in parameters.items():
             self._parameters.set(name, number)
         self.log = FlightLog()
-        self._kind: type[FlightController] = Px4 if profile.px4 else ArduCopter
         self._start, self._steps = now, 0
         self._silent_until = -math.inf
         self._arming_denial, self._ready_after = arming_denial, ready_after
         self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
-                                 VehicleParams(tilt_max=profile.tilt_max))
-        self.equipment = Equipment(self.vehicle, seed, barometer)
+                                 VehicleParams(tilt_max=self._profile.tilt_max))
+        self.barometer = Barometer([np.random.default_rng([seed, 1])])
+        self.charge: float | None = 1.0
+        """Remaining charge of the battery, a share; None: unknown. A reboot keeps it."""
         self._codec = mavlink.MAVLink(
             None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._codec.robust_parsing = True
@@ -104,7 +121,7 @@ class EmbeddedAutopilot:
         for message in self._codec.parse_buffer(data) or []:
             if now >= self._silent_until:
                 self.log.received(message, now)
-                answers += self._packed(self._face.handle(message, now))
+                answers += self._packed(self._handle(message, now))
         return answers
 
     def step(self, now: float) -> list[bytes]:
@@ -115,8 +132,10 @@ class EmbeddedAutopilot:
         if now < self._silent_until:
             vehicle.step((0.0, 0.0, 0.0), vehicle.yaw, STEP, powered=False)
         else:
-            messages = self._face.step(now)
-        self.equipment.step(controller.armed, STEP)
+            controller.step(now)
+            messages = self._due_messages(now)
+        if controller.armed and self.charge is not None:
+            self.charge = max(0.0, self.charge - CURRENT / CAPACITY * STEP / 3600.0)
         self.log.moved(now, vehicle.position, vehicle.velocity, vehicle.acceleration, vehicle.yaw,
                        controller.armed, controller.mode)
         return self._packed(messages)
@@ -127,14 +146,19 @@ class EmbeddedAutopilot:
         self._boot(self._silent_until, armed=False)
 
     def _boot(self, now: float, *, armed: bool) -> None:
-        airborne = armed and not self.vehicle.landed
+        airborne, profile = armed and not self.vehicle.landed, self._profile
         #: The flight controller that runs; a reboot starts another.
-        self.controller = self._kind(
+        self.controller: FlightController = (Px4 if profile.px4 else ArduCopter)(
             self.vehicle, now, armed=armed, parameters=self._parameters,
             arming_denial=self._arming_denial,
             ready_at=-math.inf if airborne else now + self._ready_after)
-        self._face = MavlinkVehicle(self.controller, self.equipment, now,
-                                    system_id=self._codec.srcSystem)
+        self._booted = now
+        self._intervals = {message: 1.0 / rate if rate else math.inf
+                           for message, rate in profile.rates.items()}
+        self._due = {message: now if math.isfinite(interval) else math.inf
+                     for message, interval in self._intervals.items()}
+        self._mode_sent = self.controller.mode, now
+        self._clock_offset: float | None = None
         self._codec.seq = 0
 
     def _packed(self, messages: list[Any]) -> list[bytes]:
@@ -143,3 +167,210 @@ class EmbeddedAutopilot:
             packed.append(bytes(message.pack(self._codec)))
             self._codec.seq = (self._codec.seq + 1) % 256
         return packed
+
+    def _handle(self, message: Any, now: float) -> list[Any]:
+        """Take a message received at ``now`` and return the answers."""
+        controller = self.controller
+        if getattr(message, 'target_system', 0) not in (0, self._codec.srcSystem):
+            return []
+        match message.get_type():
+            case 'SET_POSITION_TARGET_LOCAL_NED':
+                controller.on_setpoint(message, now)
+            case 'ODOMETRY':
+                # Before the sender's clock is learnt it is new.
+                controller.estimator.on_odometry(
+                    message, now, 0.0 if self._clock_offset is None else
+                    now - self._booted - message.time_usec * 1e-6 - self._clock_offset)
+            case 'PARAM_REQUEST_READ' | 'PARAM_SET':
+                return self._parameters.answer(message)
+            case 'TIMESYNC':
+                return self._answer_timesync(message, now)
+            case 'SET_GPS_GLOBAL_ORIGIN':
+                controller.has_origin = True  # where on Earth does not matter here
+                return [mavlink.MAVLink_gps_global_origin_message(
+                    message.latitude, message.longitude, message.altitude,
+                    self._boot_ms(now) * 1000)]
+            case 'COMMAND_LONG':
+                return self._command(message, now)
+        return []
+
+    def _answer_timesync(self, message: Any, now: float) -> list[Any]:
+        # Zero would turn an answer into a request, and both ends would answer for ever.
+        nanoseconds = max(1, round((now - self._booted) * 1e9))
+        if message.tc1 == 0:
+            return [mavlink.MAVLink_timesync_message(nanoseconds, message.ts1)]
+        if 0 <= nanoseconds - message.ts1 < _LONGEST_WAY:
+            # The other end answered half way between request and answer.
+            self._clock_offset = (0.5 * (message.ts1 + nanoseconds) - message.tc1) * 1e-9
+        return []
+
+    def _due_messages(self, now: float) -> list[Any]:
+        messages = self._status_texts()
+        self._note_mode(now)
+        for message_id, due in self._due.items():
+            if now >= due - 0.5 * STEP:
+                messages += self._message(message_id, now)
+                # From the time it was due: the mean rate is exact.
+                interval = self._intervals[message_id]
+                self._due[message_id] = due + interval * max(1, (now - due) // interval)
+        return messages
+
+    def _note_mode(self, now: float) -> None:
+        """Send the message with the mode at each change, as PX4 1.16 and ArduCopter 4.7 do."""
+        mode, time = self._mode_sent
+        news = mode != self.controller.mode
+        if not self._profile.px4:
+            self._mode_sent = self.controller.mode, now
+            if news:
+                self._due[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = now
+            return
+        interval = self._intervals[mavlink.MAVLINK_MSG_ID_CURRENT_MODE]
+        due = time + (interval if news else max(interval, CURRENT_MODE_PERIOD))
+        if now >= due - 0.5 * STEP:
+            self._mode_sent = self.controller.mode, now
+        self._due[mavlink.MAVLINK_MSG_ID_CURRENT_MODE] = due
+
+    def _status_texts(self) -> list[Any]:
+        texts, self.controller.outbox = self.controller.outbox, []
+        return texts
+
+    def _command(self, message: Any, now: float) -> list[Any]:
+        results = self._obey(message, now)
+        reply = message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and results == [ACCEPTED]
+        return [*self._status_texts(), *(mavlink.MAVLink_command_ack_message(
+            message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
+            for result in results), *(self._message(int(message.param1), now) if reply else [])]
+
+    def _obey(self, message: Any, now: float) -> list[int]:
+        controller, command = self.controller, message.command
+        if command == mavlink.MAV_CMD_DO_SET_MODE:
+            return controller.command_mode((message.param1, message.param2, message.param3), now)
+        if command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+            return [controller.arm(message.param1 > 0.5, message.param2 == FORCE, now)]
+        if command == mavlink.MAV_CMD_NAV_TAKEOFF:
+            return [controller.take_off(message.param7, now)]
+        if command in self._profile.commands:
+            return [controller.change_mode(self._profile.commands[command], now)]
+        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            return [self._set_interval(message.param1, message.param2, now)]
+        if command == mavlink.MAV_CMD_REQUEST_MESSAGE and message.param1 in self._intervals:
+            return [ACCEPTED]
+        if command == mavlink.MAV_CMD_RUN_PREARM_CHECKS:
+            return [controller.run_checks(now)]
+        return [int(mavlink.MAV_RESULT_UNSUPPORTED)]
+
+    def _set_interval(self, message_id: float, microseconds: float, now: float) -> int:
+        # The HEARTBEAT of PX4 stays at 1 Hz.
+        fixed = self._profile.px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        if message_id not in self._intervals or math.isnan(microseconds) or fixed:
+            return self._profile.unknown_message
+        number, rate = int(message_id), self._profile.rates[int(message_id)]
+        interval = (1.0 / rate if rate else math.inf) if microseconds == 0 else (
+            max(microseconds * 1e-6, STEP) if microseconds > 0 else math.inf)
+        self._intervals[number] = interval
+        self._due[number] = now if math.isfinite(interval) else math.inf
+        return ACCEPTED
+
+    def _boot_ms(self, now: float) -> int:
+        return round((now - self._booted) * 1e3)
+
+    def _message(self, message_id: int, now: float) -> list[Any]:
+        """Return the message with an id; an empty list if it has no content."""
+        fields = self._status(_NAMES[message_id], now) or self._motion(_NAMES[message_id], now)
+        return [mavlink.mavlink_map[message_id](*fields)] if fields else []
+
+    def _motion(self, name: str, now: float) -> tuple[Any, ...]:
+        """Return the fields of a message about the motion; () if it is not known."""
+        controller, boot_ms = self.controller, self._boot_ms(now)
+        estimate, home, met = controller.estimator, controller.home, controller.conditions(now)
+        position, velocity = estimate.position, enu_to_ned(estimate.velocity)
+        match name:
+            case 'LOCAL_POSITION_NED' if met['reported']:
+                return boot_ms, *enu_to_ned(position).tolist(), *velocity.tolist()
+            case 'ATTITUDE_QUATERNION':
+                x, y, z, w = quaternion_enu_flu_to_ned_frd(estimate.quaternion).tolist()
+                return (boot_ms, w, x, y, z,
+                        *flu_to_frd(self.vehicle.angular_velocity).tolist())
+            case 'GLOBAL_POSITION_INT' if met['global']:
+                # Vision alone says nothing of where on Earth it is.
+                heading = round(math.degrees(math.pi / 2.0 - estimate.yaw) % 360.0 * 100.0) % 36000
+                return (boot_ms, *global_position(position),
+                        round(float(position[2] - home[2]) * 1e3),
+                        *(velocity * 100.0).round().astype(int).tolist(), heading)
+            case 'HOME_POSITION' if controller.has_origin:
+                attitude = [1.0, 0.0, 0.0, 0.0] if self._profile.px4 else [math.nan] * 4
+                return (*global_position(home), *enu_to_ned(home).tolist(), attitude,
+                        0.0, 0.0, 0.0, boot_ms * 1000)
+        return ()
+
+    def _status(self, name: str, now: float) -> tuple[Any, ...]:
+        """Return the fields of a message about the vehicle's state; () for others."""
+        controller, profile = self.controller, self._profile
+        estimator = controller.estimator
+        match name:
+            case 'HEARTBEAT':
+                armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if controller.armed else 0
+                return (mavlink.MAV_TYPE_QUADROTOR, profile.autopilot,
+                        mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
+                        profile.modes[controller.mode].number, controller.system_status, 3)
+            case 'TIMESYNC':
+                return 0, max(1, round((now - self._booted) * 1e9))
+            case 'EXTENDED_SYS_STATE':
+                return mavlink.MAV_VTOL_STATE_UNDEFINED, controller.landed_state
+            case 'SCALED_PRESSURE':
+                height = self.barometer.heights(self.vehicle.position[2:] + GROUND_AMSL, now)[0]
+                return self._boot_ms(now), pressure(height), 0.0, 1181
+            case 'AUTOPILOT_VERSION':
+                major, minor = profile.version
+                return (profile.encoding | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+                        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED,
+                        major << 24 | minor << 16 | 255, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8,
+                        0, 0, 0)
+            case 'EKF_STATUS_REPORT':
+                return self.estimator_flags(now), 0.0, 0.0, 0.0, 0.0, 0.0
+            case 'ESTIMATOR_STATUS':
+                # Measured: nothing is compared any more, and the accuracy grows from centimetres.
+                started, age = estimator.started(now), estimator.vision_age(now)
+                ratio, accuracy = (0.02, 0.03) if controller.conditions(now)['aided'] else (
+                    math.nan, min(0.022 * age**2, 100.0) if started else 100.0)
+                return (self._boot_ms(now) * 1000, self.estimator_flags(now), ratio, ratio,
+                        0.01, 0.02, 0.01, math.nan, accuracy, 0.1)
+            case 'CURRENT_MODE':
+                return 0, *(profile.modes[each].number
+                            for each in (controller.mode, controller.chosen))
+            case 'SYS_STATUS' | 'BATTERY_STATUS':
+                return self._power(name, now)
+        return ()
+
+    def estimator_flags(self, now: float) -> int:
+        """Return the flags of ESTIMATOR_STATUS, or of ArduPilot's EKF_STATUS_REPORT."""
+        met = self.controller.conditions(now)
+        return sum(bits for name, bits in self._profile.estimator_flags.items() if met[name])
+
+    def _power(self, name: str, now: float) -> tuple[Any, ...]:
+        """Return the fields of SYS_STATUS or BATTERY_STATUS."""
+        charge, controller = self.charge, self.controller
+        current = round(1e2 * (CURRENT if controller.armed else 0.5))  # cA
+        cell, percent = (_UNKNOWN_VOLTAGE, -1) if charge is None else (
+            round(1e3 * (3.5 + 0.7 * charge)), round(1e2 * charge))  # mV
+        if name == 'BATTERY_STATUS':
+            voltages = [cell] * _CELLS + [_UNKNOWN_VOLTAGE] * (10 - _CELLS)
+            return (0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767,
+                    voltages, current, round(1e3 * (1.0 - max(percent, 0) / 1e2) * CAPACITY), -1,
+                    percent)
+        checks, place = (mavlink.MAV_SYS_STATUS_PREARM_CHECK,
+                         mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL)
+        # PX4 neither has nor enables the check: only its health counts.
+        there = place | (0 if self._profile.px4 else checks)
+        well = ((place if controller.position_known(now) else 0)
+                | (0 if controller.unfit(now) else checks))
+        return (there, there, well, 250, cell if percent < 0 else _CELLS * cell, current, percent,
+                0, 0, 0, 0, 0, 0)
+
+
+def global_position(position: Array) -> tuple[int, int, int]:
+    """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a local position (3,)."""
+    east, north, up = position.tolist()
+    across = DEGREE * math.cos(math.radians(LATITUDE))
+    return (round((LATITUDE + north / DEGREE) * 1e7), round((LONGITUDE + east / across) * 1e7),
+            round((up + GROUND_AMSL) * 1e3))

@@ -13,15 +13,17 @@
 # limitations under the License.
 
 """
-Position estimator of the embedded autopilot: GPS, or external vision that can become stale.
+What the embedded autopilot measures: its position estimator, barometer and battery.
 
 With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
 they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
-velocity go on, and drift. ENU; the time is given.
+velocity go on, and drift. The barometer measures the standard atmosphere with white noise and a
+slow drift. ENU; the time is given.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Any, Final
 
@@ -29,7 +31,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk.vehicles.profiles import Profile
-from flock_desk.vehicles.vehicle import Quadrotor
+from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import (
     Array,
     frd_to_flu,
@@ -141,3 +143,44 @@ class Estimator:
         if VISION_TIMEOUT < self.vision_age(now) < math.inf:
             self._velocity_error = self._velocity_error + self._profile.drift * dt
             self._position_error = self._position_error + self._velocity_error * dt
+
+
+#: Height of the ground above the mean sea level, m.
+GROUND_AMSL: Final[float] = 488.0
+#: Pressure at the mean sea level, hPa.
+SEA_LEVEL: Final[float] = 1013.25
+_TEMPERATURE: Final[float] = 288.15  # K at the mean sea level ...
+_LAPSE: Final[float] = 0.0065  # ... and how much less 1 m higher
+_EXPONENT: Final[float] = 5.25588  # of the international standard atmosphere below 11 km
+#: Of a barometer: standard deviations, m, of the white noise of its height and of its drift,
+#: which is zero at the start, and the time constant of that, s.
+NOISE, DRIFT, DRIFT_TIME = 0.05, 0.1, 300.0
+
+
+class Barometer:
+    """
+    The barometers of n vehicles.
+
+    :param generators: of the random numbers, one for each vehicle.
+    """
+
+    def __init__(self, generators: Sequence[np.random.Generator]) -> None:
+        self.offset = 0.0
+        """Added to every height, m: a step of the pressure, for tests."""
+        self._generators = generators
+        self._drift: Array = np.zeros(len(generators))
+        self._time: float | None = None
+
+    def heights(self, true: Array, now: float) -> Array:
+        """Return the heights (n,), m, measured at a time, s, of true ones (n,), m."""
+        drawn = np.stack([g.standard_normal(2) for g in self._generators])
+        keep = 1.0 if self._time is None else math.exp(-(now - self._time) / DRIFT_TIME)
+        self._time = now
+        self._drift = keep * self._drift + DRIFT * math.sqrt(1.0 - keep ** 2) * drawn[:, 0]
+        measured: Array = true + self.offset + self._drift + NOISE * drawn[:, 1]
+        return measured
+
+
+def pressure(altitude: float) -> float:
+    """Return the pressure, hPa, of the standard atmosphere at an altitude above the sea, m."""
+    return float(SEA_LEVEL * (1.0 - _LAPSE * altitude / _TEMPERATURE) ** _EXPONENT)

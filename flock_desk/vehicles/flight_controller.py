@@ -1,17 +1,3 @@
-# Copyright 2026 The flock_follower developers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
 """
 Modes, arming and control of an embedded autopilot; PX4 and ArduCopter differ by their profiles.
 
@@ -28,10 +14,9 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.autopilot_parameters import AutopilotParameters
 from flock_desk.vehicles.estimator import Estimator
-from flock_desk.vehicles.profiles import HOLD, LAND, Profile, SETPOINTS
-from flock_desk.vehicles.vehicle import Quadrotor
+from flock_desk.vehicles.profiles import HOLD, LAND, Parameters, Profile, SETPOINTS
+from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import Array, GRAVITY, ned_to_enu, wrap_angle, yaw_ned_to_enu
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
@@ -40,6 +25,7 @@ _HOLD_SPEED_MAX: Final[float] = 2.0  # m/s
 _CAPTURE_SPEED: Final[float] = 0.2  # m/s; holding brakes to this, then keeps the place
 #: Vision older than this, s, keeps ArduCopter from arming.
 _VISION_HEALTHY: Final[float] = 0.3
+_AIDED: Final[float] = 0.55  # s without vision until PX4 compares its estimate with none
 ARRIVED: Final[float] = 0.1  # m below the take-off altitude
 #: The acceleration, m/s^2, for which motors idle.
 IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
@@ -85,13 +71,13 @@ class FlightController(ABC):
 
     PROFILE: ClassVar[Profile]
 
-    def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
-                 parameters: AutopilotParameters, arming_denial: str = '',
-                 ready_at: float = 0.0) -> None:
+    def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool, parameters: Parameters,
+                 arming_denial: str = '', ready_at: float = 0.0) -> None:
         self.vehicle, self.parameters, self.armed = vehicle, parameters, armed
         self.arming_denial = arming_denial
         airborne = not bool(vehicle.landed)
-        self.mode = self.PROFILE.starts[airborne]
+        self.mode = self.chosen = self.PROFILE.starts[airborne]
+        """The mode that is flown, and the one last requested: a failsafe may fly another."""
         self.in_failsafe = False
         self.outbox: list[Any] = []
         """Messages that it sends by itself."""
@@ -100,7 +86,8 @@ class FlightController(ABC):
         self.estimator = Estimator(vehicle, self.PROFILE, all(
             parameters[name] == value for name, value in self.PROFILE.vision.items()),
             now, ready_at)
-        self._origin_set = False
+        self.has_origin = not self.estimator.uses_vision
+        """Whether it has a global origin: by GPS, or by SET_GPS_GLOBAL_ORIGIN."""
         self._time = now
         self._yaw = vehicle.yaw
         self._place: Array | None = vehicle.position.copy()
@@ -109,23 +96,7 @@ class FlightController(ABC):
         self._flown = airborne
         self._landed_since = now
         self._climb_limit = math.inf  # m/s, for position and velocity setpoints
-        self._setpoint = TrackedSetpoint()
-        self._setpoint_time = -math.inf
-
-    @property
-    def custom_mode(self) -> int:
-        """Return the custom_mode of HEARTBEAT."""
-        return self.PROFILE.modes[self.mode].number
-
-    @property
-    def intended_mode(self) -> int:
-        """Return the custom_mode last requested; a failsafe may fly another."""
-        return self.custom_mode
-
-    @property
-    def has_origin(self) -> bool:
-        """Return whether it has a global origin: by GPS, or by SET_GPS_GLOBAL_ORIGIN."""
-        return self._origin_set or not self.estimator.uses_vision
+        self._setpoint, self._setpoint_time = TrackedSetpoint(), -math.inf
 
     @property
     def system_status(self) -> int:
@@ -159,28 +130,12 @@ class FlightController(ABC):
         """Return whether it climbs to the altitude of its take-off."""
 
     @abstractmethod
-    def position_known(self, now: float) -> bool:
-        """Return whether the estimate of the position is valid."""
-
-    @abstractmethod
-    def reports_position(self, now: float) -> bool:
-        """Return whether it sends LOCAL_POSITION_NED."""
-
-    @abstractmethod
-    def estimator_flags(self, now: float) -> int:
-        """Return the flags of ESTIMATOR_STATUS, or of ArduPilot's EKF_STATUS_REPORT."""
-
-    @abstractmethod
     def on_setpoint(self, message: Any, now: float) -> None:
         """Take a SET_POSITION_TARGET_LOCAL_NED."""
 
     @abstractmethod
     def take_off(self, altitude: float, now: float) -> int:
         """Obey MAV_CMD_NAV_TAKEOFF with its param7; return the MAV_RESULT."""
-
-    @abstractmethod
-    def run_checks(self, now: float) -> int:
-        """Obey MAV_CMD_RUN_PREARM_CHECKS: report failed checks; return the MAV_RESULT."""
 
     @abstractmethod
     def _supervise(self, now: float) -> None:
@@ -192,21 +147,30 @@ class FlightController(ABC):
 
     @property
     @abstractmethod
-    def _landing_speed(self) -> float:
-        """Return the speed of a landing, m/s."""
-
-    @property
-    @abstractmethod
     def _disarms_after(self) -> float:
         """Return after how long on the ground it disarms, s."""
 
+    def run_checks(self, now: float) -> int:
+        """Obey MAV_CMD_RUN_PREARM_CHECKS; return the MAV_RESULT."""
+        return ACCEPTED
+
+    def position_known(self, now: float) -> bool:
+        """Return whether there is an estimate, and vision, where it needs it, not long gone."""
+        timeout = self.PROFILE.position_timeout + 1e-6 * self.parameters.get('EKF2_NOAID_TOUT', 0)
+        return self.estimator.started(now) and self.estimator.vision_age(now) <= timeout
+
     def conditions(self, now: float) -> dict[str, bool]:
-        """Return which conditions of modes and arming are met."""
-        known = self.position_known(now)
+        """Return which conditions of modes, arming and reports are met."""
+        known, age = self.position_known(now), self.estimator.vision_age(now)
+        started = self.estimator.started(now)
+        reported, aided = (started and age <= t for t in (self.PROFILE.reports_for, _AIDED))
         return {'permission': self.armed or not self.arming_denial,
-                'vision': self.estimator.vision_age(now) <= _VISION_HEALTHY,
+                'vision': age <= _VISION_HEALTHY,
                 'armable': self.armed or self.PROFILE.modes[self.mode].arms,
-                'position': known, 'global': known and self.has_origin}
+                'position': known, 'global': known and self.has_origin,
+                'always': True, 'reported': reported, 'unreported': not reported,
+                'aided': aided, 'absolute': aided and self.has_origin,
+                'at rest': self.on_ground}
 
     def missing(self, mode: str, now: float, arming: tuple[str, ...] = ()) -> list[str]:
         """Return the conditions that a mode needs, and more, as far as they are not met."""
@@ -252,19 +216,12 @@ class FlightController(ABC):
             self._disarm(now)
         return ACCEPTED
 
-    def set_origin(self) -> None:
-        """Take SET_GPS_GLOBAL_ORIGIN; where on Earth it is said to be does not matter here."""
-        self._origin_set = True
-
     def pilot_switches(self, name: str, climb: float = 0.0) -> None:
         """
         Change the mode by remote control, which no check holds up.
 
         :param climb: how far the pilot then climbs, m, from where the vehicle is.
-        :raises ValueError: for an unknown mode.
         """
-        if name not in self.PROFILE.modes:
-            raise ValueError(f'mode = {name!r}: must be one of {", ".join(self.PROFILE.modes)}')
         self._enter(name)
         self.in_failsafe = False
         if climb:
@@ -310,17 +267,16 @@ class FlightController(ABC):
 
     def _control(self, now: float, dt: float) -> Array:
         """Return the wanted acceleration (3,), m/s^2, in the frame of the estimate."""
-        flies = self._flies
+        flies, (parameter, unit) = self._flies, self.PROFILE.landing_speed
         if flies == SETPOINTS:
             return self._fly_setpoints(now, dt)
-        if flies == LAND and self.position_known(now):
-            return self._track(TrackedSetpoint(
-                velocity=np.array([0.0, 0.0, -self._landing_speed])))
         if flies == HOLD:
             return self._hold()
+        descent = -self.parameters[parameter] * unit if flies == LAND else 0.0
+        if flies == LAND and self.position_known(now):
+            return self._track(TrackedSetpoint(velocity=np.array([0.0, 0.0, descent])))
         # Level; without a position it lands so, too.
-        climb = -self._landing_speed if flies == LAND else 0.0
-        return self._track(TrackedSetpoint(velocity=np.array([math.nan, math.nan, climb]),
+        return self._track(TrackedSetpoint(velocity=np.array([math.nan, math.nan, descent]),
                                            acceleration=np.array([0.0, 0.0, math.nan])))
 
     @property

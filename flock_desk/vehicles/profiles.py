@@ -16,19 +16,26 @@
 What distinguishes the embedded autopilots, as tables: measured, see docs/autopilots.md.
 
 Written out here, not taken from the bridge: a mistake there must not hide itself.
+
+PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself. A decoder that uses
+the wrong encoding reads 1 as 1.4e-45.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 from dataclasses import dataclass
 import math
-from typing import Final, NamedTuple
+import struct
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array
+from flock_follower.ranges import Range
 
 #: How a mode flies: it keeps its place, keeps level, lands, or obeys setpoints.
 HOLD, LEVEL, LAND, SETPOINTS = 'hold', 'level', 'land', 'setpoints'
@@ -74,6 +81,8 @@ class Profile:
     """Type and default by name."""
     encoding: int
     """MAV_PROTOCOL_CAPABILITY of integer parameters."""
+    landing_speed: tuple[str, float]
+    """Its parameter, and the unit of that, m/s."""
     rates: Mapping[int, float]
     """Hz, by message id; 0: once it is asked for."""
     arming: tuple[str, ...]
@@ -88,6 +97,12 @@ class Profile:
     """The frames of ODOMETRY that it takes."""
     oldest_vision: float
     """s; older odometry, by the estimated clock offset, is not used."""
+    position_timeout: float
+    """s without vision after which the position is not valid, besides EKF2_NOAID_TOUT ..."""
+    reports_for: float
+    """... and after which LOCAL_POSITION_NED is no longer sent."""
+    estimator_flags: Mapping[str, int]
+    """Bits of ESTIMATOR_STATUS or EKF_STATUS_REPORT, by condition."""
     drift: Array
     """Acceleration (3,), m/s^2, by which its estimate drifts without vision."""
     tilt_max: float
@@ -150,6 +165,7 @@ PX4: Final = Profile(
         'NAV_RCL_ACT': (INT32, 2),            # without a transmitter; 1: Hold, 2: Return, 3: Land
     },
     encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    landing_speed=('MPC_LAND_SPEED', 1.0),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0,
@@ -158,7 +174,9 @@ PX4: Final = Profile(
     refused=mavlink.MAV_RESULT_TEMPORARILY_REJECTED, unknown_message=mavlink.MAV_RESULT_FAILED,
     vision={'EKF2_GPS_CTRL': 0},
     frames=(mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD),
-    oldest_vision=0.2,  # EKF2_DELAY_MAX
+    oldest_vision=0.2, position_timeout=0.2, reports_for=math.inf,  # EKF2_DELAY_MAX
+    estimator_flags={'always': 0x65, 'at rest': 0x80, 'position': 0xA, 'aided': 0x100,
+                     'absolute': 0x210},
     drift=np.array([0.1, -0.07, 0.0]),
     tilt_max=math.radians(45.0))  # MPC_TILTMAX_AIR
 
@@ -202,12 +220,61 @@ ARDUCOPTER: Final = Profile(
         'WPNAV_SPEED': (FLOAT, 1000.0),       # cm/s, not applied to acceleration setpoints
     },
     encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
+    landing_speed=('LAND_SPEED', 1e-2),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
            mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.0},
     arming=('permission', 'vision', 'armable'),
     refused=mavlink.MAV_RESULT_FAILED, unknown_message=mavlink.MAV_RESULT_DENIED,
     vision={'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6},
-    frames=(mavlink.MAV_FRAME_LOCAL_FRD,), oldest_vision=math.inf,
+    frames=(mavlink.MAV_FRAME_LOCAL_FRD,),
+    oldest_vision=math.inf, position_timeout=7.1, reports_for=14.5,
+    estimator_flags={'always': 0x25, 'position': 0x31A, 'unreported': 0x82},
     drift=np.array([0.012, -0.01, 0.0]),
     tilt_max=math.radians(30.0))  # ANGLE_MAX
 PROFILES: Final[Mapping[str, Profile]] = {'px4': PX4, 'arducopter': ARDUCOPTER}
+_LIMITS: Final[Mapping[int, int]] = {INT8: 2**7, INT16: 2**15, INT32: 2**31}
+_UNKNOWN_INDEX: Final[int] = 65535
+
+
+class Parameters(dict[str, float]):
+    """The parameters of an autopilot by name, and their MAVLink protocol."""
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__({name: float(value) for name, (_, value) in profile.parameters.items()})
+        self._types = {name: kind for name, (kind, _) in profile.parameters.items()}
+        self._bytewise = profile.px4
+
+    def set(self, name: str, value: float) -> None:
+        """
+        Set a value.
+
+        :raises ValueError: for an unknown name, or a value that its type cannot hold.
+        """
+        if name not in self:
+            raise ValueError(f'{name}: must be one of {", ".join(self)}')
+        limit = _LIMITS.get(self._types[name])
+        if limit is None:
+            Range().check(name, value)
+        else:
+            Range(-limit, limit - 1, whole=True).check(
+                name, int(value) if float(value).is_integer() else value)
+        self[name] = float(value)
+
+    def answer(self, message: Any) -> list[Any]:
+        """Answer PARAM_REQUEST_READ by name and PARAM_SET; unknown names silently."""
+        name = str(message.param_id)
+        if name not in self:
+            return []
+        bytewise = self._bytewise and self._types[name] != FLOAT
+        if message.get_type() == 'PARAM_SET':
+            sent = message.param_value
+            with contextlib.suppress(ValueError):  # the answer then has the old value
+                self.set(name, struct.unpack('<i', struct.pack('<f', sent))[0] if bytewise
+                         else sent)
+        value = self[name]
+        return [mavlink.MAVLink_param_value_message(
+            name.encode(),
+            struct.unpack('<f', struct.pack('<i', int(value)))[0] if bytewise else value,
+            self._types[name], len(self),
+            # ArduPilot does not look up the index of a parameter asked for by its name.
+            list(self).index(name) if self._bytewise else _UNKNOWN_INDEX)]

@@ -33,13 +33,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-import struct
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.estimator import GROUND_AMSL
 from flock_desk.vehicles.flight_controller import (
     ACCEPTED,
     ARRIVED,
@@ -52,9 +50,7 @@ from flock_desk.vehicles.profiles import LAND, PX4
 from flock_follower.geometry import Array, GRAVITY
 
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
-FUSION_TIMEOUT: Final[float] = 0.55
 _SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
-_ALWAYS, _HORIZONTAL, _AIDED, _ABSOLUTE, _AT_REST = 0x65, 0xA, 0x100, 0x210, 0x80
 #: Modes after the loss of the stream, by COM_OBL_RC_ACT: the first possible one.
 _LOST_STREAM: Final[Mapping[int, tuple[str, ...]]] = {
     4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
@@ -63,41 +59,6 @@ _RAMP_START: Final[float] = -GRAVITY / 4.0
 _DESCENT: Final[float] = 0.275  # m/s; a faster commanded descent counts as a landing
 _FLYING_THRUST: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
 _LANDING_TIME: Final[float] = 1.0  # s, LNDMC_TRIG_TIME
-REPORT_PERIOD: Final[float] = 2.0  # s between reports of changes, at least
-_EVENT, _EVENT_CRC = 410, 160
-_LAYOUT: Final[struct.Struct] = struct.Struct('<IIHBBB40s')
-_BEGIN, _END, _PROTOCOL = 0xA893E0, 0x1D3727, 8
-
-
-class Check(NamedTuple):
-    """How the EVENTs of arming checks report a condition that is not met."""
-
-    number: int
-    """Hash of the name, as captured."""
-    component: int
-    level: int
-    """MAV_SEVERITY."""
-    modes: int
-    """The modes that it concerns, bits of PX4's navigation states."""
-
-
-CHECKS: Final[Mapping[str, Check]] = {
-    'permission': Check(0x570AA1, 20, 3, 0xFFFFFFFF), 'armable': Check(0x1C8F61, 20, 6, 0x3C3020),
-    'position': Check(0xD31BB9, 17, 3, 0x7E007C), 'global': Check(0x98C273, 24, 3, 0x38),
-    'stream': Check(0x2F1DC7, 20, 3, 0x4000), 'sticks': Check(0x06ED29, 7, 4, 0xFFFFFFFF)}
-
-
-class Event(mavlink.MAVLink_message):  # type: ignore[misc]
-    """EVENT (410), which pymavlink does not define; a broadcast of the autopilot itself."""
-
-    def __init__(self, number: int, level: int, arguments: bytes) -> None:
-        super().__init__(_EVENT, 'EVENT')
-        self._payload_bytes = _LAYOUT.pack(
-            number | 1 << 24, 0, 0, 0, 0, level << 4 | level, arguments)
-
-    def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
-        """Return the bytes that ``mav`` sends for it."""
-        return self._pack(mav, _EVENT_CRC, self._payload_bytes, force_mavlink1)
 
 
 class Px4(FlightController):
@@ -109,20 +70,13 @@ class Px4(FlightController):
         super().__init__(*arguments, **options)
         if self.estimator.uses_vision and not self.vehicle.landed:
             self.mode = TAKEOFF  # without an origin there is no Hold
-        self._chosen = self._after_disarming = self.mode
+        self.chosen = self._after_disarming = self.mode
         self._sticks = False
         self._landed = bool(self.vehicle.landed)
         self._resting_for = self._armed_for = 0.0
         # Of the take-off ramp: below 0 the motors idle, at 1 it is over.
         self._ramp = -1.0 if self._landed else 1.0
         self._descends = False
-        self._reported: list[str] | None = None
-        self._report_time = -math.inf
-
-    @property
-    def intended_mode(self) -> int:
-        """Return the custom_mode of the mode last requested; a failsafe may fly another."""
-        return PX4.modes[self._chosen].number
 
     @property
     def on_ground(self) -> bool:
@@ -133,24 +87,6 @@ class Px4(FlightController):
     def taking_off(self) -> bool:
         """Return whether the mode is that of the take-off."""
         return self.mode == TAKEOFF
-
-    def position_known(self, now: float) -> bool:
-        """Return whether the position is valid: EKF2_NOAID_TOUT without vision it is not."""
-        patience = self.parameters['EKF2_NOAID_TOUT'] * 1e-6 + PX4.oldest_vision
-        return self.estimator.ready(now) and self.estimator.vision_age(now) <= patience
-
-    def reports_position(self, now: float) -> bool:
-        """Return whether it sends LOCAL_POSITION_NED: valid or not."""
-        return self.estimator.started(now)
-
-    def estimator_flags(self, now: float) -> int:
-        """Return the flags of ESTIMATOR_STATUS."""
-        flags = _ALWAYS | (_AT_REST if self._landed else 0)
-        if self.position_known(now):
-            flags |= _HORIZONTAL
-        if self.estimator.ready(now) and self.estimator.vision_age(now) <= FUSION_TIMEOUT:
-            flags |= _AIDED | (_ABSOLUTE if self.has_origin else 0)
-        return flags
 
     def conditions(self, now: float) -> dict[str, bool]:
         """Return those of all autopilots, a setpoint that is not too old, and a transmitter."""
@@ -186,16 +122,6 @@ class Px4(FlightController):
         self._place = np.array([east, north, np.fmax(altitude - GROUND_AMSL, lowest)])
         return ACCEPTED
 
-    def run_checks(self, now: float) -> int:
-        """Report failed conditions: an EVENT for each, between two summaries."""
-        met = self.conditions(now)
-        self._reported = [name for name in CHECKS if not met[name]]
-        self._report_time = now
-        self.outbox += [Event(_BEGIN, _PROTOCOL, b''), *(
-            Event(check.number, check.level, struct.pack('<IB', check.modes, check.component))
-            for check in map(CHECKS.__getitem__, self._reported)), Event(_END, _PROTOCOL, b'')]
-        return ACCEPTED
-
     def pilot_switches(self, name: str, climb: float = 0.0) -> None:
         """Change the mode by remote control; from then on there is one."""
         super().pilot_switches(name, climb)
@@ -203,7 +129,7 @@ class Px4(FlightController):
         self._remember(name)
 
     def _remember(self, name: str) -> None:
-        self._chosen = name
+        self.chosen = name
         if name != LAND_MODE:
             self._after_disarming = name
 
@@ -216,24 +142,21 @@ class Px4(FlightController):
 
     def _disarm(self, now: float) -> None:
         super()._disarm(now)
-        self._chosen = self._after_disarming
+        self.chosen = self._after_disarming
         self._supervise(now)
 
     def _supervise(self, now: float) -> None:
-        """Fly the chosen mode where that is possible, else another; report changed checks."""
+        """Fly the chosen mode where that is possible, else another."""
         met = self.conditions(now)
-        if [name for name in CHECKS if not met[name]] != self._reported and (
-                now - self._report_time >= REPORT_PERIOD):
-            self.run_checks(now)
-        names: tuple[str, ...] = (self._chosen,)
-        if self.armed and self._chosen == OFFBOARD and not met['stream']:
+        names: tuple[str, ...] = (self.chosen,)
+        if self.armed and self.chosen == OFFBOARD and not met['stream']:
             names = _LOST_STREAM.get(int(self.parameters['COM_OBL_RC_ACT']), ('POSCTL', 'ALTCTL'))
         elif self.armed:
-            names = (self._chosen, 'ALTCTL' if self._chosen == 'POSCTL' else LAND_MODE)
+            names = (self.chosen, 'ALTCTL' if self.chosen == 'POSCTL' else LAND_MODE)
         # Sticks are not looked for: a pilot's mode without them descends.
         mode = next((name for name in names if not {'position', 'global'}.intersection(
             self.missing(name, now))), names[-1])
-        self.in_failsafe = mode != self._chosen
+        self.in_failsafe = mode != self.chosen
         if mode != self.mode:
             self._enter(mode)
         if mode == TAKEOFF and self.armed and self._place is not None and (
@@ -292,10 +215,6 @@ class Px4(FlightController):
     @property
     def _rests(self) -> bool:
         return self._landed
-
-    @property
-    def _landing_speed(self) -> float:
-        return self.parameters['MPC_LAND_SPEED']
 
     @property
     def _disarms_after(self) -> float:

@@ -32,7 +32,7 @@ from flock_follower.bags.recording import NAME
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import LAST
-from flock_follower.whole_file import whole_file
+from flock_follower.files import whole_file
 
 PACKAGES: Final[tuple[str, ...]] = (
     'flock_follower', 'numpy', 'opencv-python-headless', 'opencv-python', 'pymavlink', 'rosbags',

@@ -61,14 +61,8 @@ def check_connections(seen: Observations) -> Iterator[Finding]:
         yield from _nodes(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
         yield _needed(seen, name)
-    if seen.live:
-        yield from _voices(seen)
-        yield from _misfits(seen)
-        yield from _wiring(seen)
-        yield from _files(seen)
-        yield _network(seen)
-    else:
-        yield from _recording(seen)
+    for check in (_voices, _misfits, _wiring, _files, _network) if seen.live else (_recording,):
+        yield from check(seen)
 
 
 def _nodes(seen: Observations) -> Iterator[Finding]:
@@ -190,14 +184,14 @@ def _files(seen: Observations) -> Iterator[Finding]:
                         'section named as the node is, namespace and all?')
 
 
-def _network(seen: Observations) -> Finding:
+def _network(seen: Observations) -> Iterator[Finding]:
     """Report nodes that other computers can command."""
     nodes = ', '.join(seen.machine.open_nodes)
-    return judged(False, bool(nodes), 'network', f'everybody on it can command: {nodes} started '
-                  'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' if nodes else
-                  'ROS stays on this computer, or with named peers',
-                  'the network does not reach the nodes',
-                  'start every node with it, see docs/deploy.md')
+    yield judged(False, bool(nodes), 'network', f'everybody on it can command: {nodes} started '
+                 'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' if nodes else
+                 'ROS stays on this computer, or with named peers',
+                 'the network does not reach the nodes',
+                 'start every node with it, see docs/deploy.md')
 
 
 def _recording(seen: Observations) -> Iterator[Finding]:

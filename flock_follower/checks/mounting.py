@@ -22,7 +22,15 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import Finding, judged, ok, unmeasured
+from flock_follower.checks.findings import (
+    ERROR,
+    Finding,
+    first,
+    OK,
+    UNMEASURED,
+    unmeasured,
+    WARNING,
+)
 from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
@@ -57,18 +65,17 @@ def check_mounting(estimates: Sequence[tuple[Array, Array]], rpy: Sequence[float
     wrong = np.abs(turn) > np.maximum(LOOKS, margin)
     unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
                         if not bad and by > LOOKS)
-    if not wrong.any():
-        return unmeasured(
-            WHAT, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', MOUNTED) if (
-                unknown) else ok(
-                    WHAT, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', MOUNTED)
     looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
                       for way, angle, bad in zip(_WAYS, turn.tolist(), wrong) if bad)
     fitting = ','.join(str(round(angle, 3) + 0.0) for angle in rpy_from_matrix(
         rotation_vector_to_matrix(np.where(wrong, turn, 0.0))
         @ quaternion_to_matrix(quaternion_from_rpy(*rpy))).tolist())
-    return judged(
-        float(np.abs(turn[wrong]).max()) > BAD_LOOKS, True, WHAT,
-        f'camera {looks} than configured{f"; {unknown} unknown" if unknown else ""}', MOUNTED,
-        f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose of the '
-        'odometry on the body (odom_child_rpy) wrong?')
+    measured = f'camera {looks} than configured{f"; {unknown} unknown" if unknown else ""}'
+    advice = (f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose '
+              'of the odometry on the body (odom_child_rpy) wrong?')
+    return first(
+        WHAT, MOUNTED,
+        (np.any(wrong & (np.abs(turn) > BAD_LOOKS)), ERROR, measured, advice),
+        (wrong.any(), WARNING, measured, advice),
+        (unknown, UNMEASURED, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', ''),
+        (True, OK, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', ''))

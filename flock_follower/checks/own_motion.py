@@ -106,8 +106,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     yield from _positions(motion.source.twist, motion.states)
     yield _twist(motion)
     yield from _lacking(motion)
-    x, y, z, w = np.array([state.quaternion for state in motion.states]).T
-    up = np.mean([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], 1)
+    up = np.mean([state.twist_rotation[2] for state in motion.states], axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
     fit = _fit(seen, motion.states, up if lean >= LYING else None)

@@ -128,18 +128,17 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
             (True, WARNING, f'not in sight in {len(pictures)} images',
              'hold the leader before the camera; is the print flat, its margin white?'))
     share, side = sum(map(bool, found)) / len(pictures), float(np.median(sides))
+    measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
     seldom = side >= SMALL and share < SELDOM
     return first(
         what, f'{wanted}, most of the time' if seldom else wanted,
-        *((holds, level, f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images', advice)
-          for holds, level, advice in (
-              (side < TINY, ERROR,
-               'come nearer, print it larger, or use a longer lens or a finer image'),
-              (side < SMALL, WARNING,
-               'come nearer, or print the marker larger: a small marker is lost easily'),
-              (seldom, WARNING,
-               'keep the marker in sight; check light, blur and the white margin'),
-              (True, OK, ''))))
+        (side < TINY, ERROR, measured,
+         'come nearer, print it larger, or use a longer lens or a finer image'),
+        (side < SMALL, WARNING, measured,
+         'come nearer, or print the marker larger: a small marker is lost easily'),
+        (seldom, WARNING, measured,
+         'keep the marker in sight; check light, blur and the white margin'),
+        (True, OK, measured, ''))
 
 
 def _duplicates(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:

@@ -33,6 +33,7 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
@@ -40,7 +41,6 @@ from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
-from flock_follower.resources import resource
 
 #: s: of a longer bag only the beginning is checked, and the diagnostics of the last LAST ns.
 LONGEST: Final = 300.0

@@ -129,7 +129,7 @@ class FrameAlignment:
         """Return the own-frame position (3,) of a position, and the frame's share (3, 3) in it."""
         frame = self.frames[name]
         lever = frame.lever(position)
-        H = _lever_matrix(lever)
+        H = _lever_matrix(lever)[:3]
         return frame.place + lever, H.dot(self.covariance(name)).dot(H.T)
 
     def drop(self, name: str) -> None:
@@ -199,44 +199,32 @@ class FrameAlignment:
 
         :param first: the frame and the track point in it.
         """
-        columns: list[int] = []
-        parts: list[Array] = []
-        gap: Array = np.zeros(3)
-        noise: Array = np.zeros((3, 3))
-        yaw_gap, yaw_noise = 0.0, 0.0
+        H = np.zeros((_SIZE, len(self._covariance)))
+        gap, noise = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))  # of position and yaw
         for sign, (name, there) in ((1.0, first), (-1.0, second)):
-            frame, part = self.frames[name], self._part(name)
-            lever, rotation = frame.lever(there.position), frame.rotation
-            columns += range(part.start, part.stop)
-            parts.append(sign * np.vstack([_lever_matrix(lever), [1.0, 0.0, 0.0, 0.0]]))
-            gap = gap + sign * (frame.place + lever)
-            noise = noise + rotation.dot(there.covariance).dot(rotation.T)
-            yaw_gap = yaw_gap + sign * (there.yaw + frame.yaw)
-            yaw_noise = yaw_noise + there.yaw_variance
-        H = np.hstack(parts)
-        known = self._covariance[np.ix_(columns, columns)]
-        spread = H.dot(known).dot(H.T)
-        S = spread[:3, :3] + noise
-        doubt = float(gap.dot(np.linalg.solve(S, gap))) / GATE
+            frame, rotation = self.frames[name], self.frames[name].rotation
+            lever = frame.lever(there.position)
+            H[:, self._part(name)] = sign * _lever_matrix(lever)
+            gap += sign * np.append(frame.place + lever, there.yaw + frame.yaw)
+            noise[:3, :3] += rotation.dot(there.covariance).dot(rotation.T)
+            noise[3, 3] += there.yaw_variance
+        gap[3] = wrap_angle(float(gap[3]))
+        across = self._covariance.dot(H.T)
+        variance = float(H[3].dot(across[:, 3]))
+        S = H.dot(across) + noise
+        doubt = float(gap[:3].dot(np.linalg.solve(S[:3, :3], gap[:3]))) / GATE
         if not doubt <= 1.0:  # NaN is refused
             return doubt
-        innovation: Array = gap
-        rows = 3
         # Attitudes err by how markers are mounted, always alike: no average is better than that.
-        variance = float(spread[3, 3])
-        if (math.isfinite(yaw_noise) and variance > ATTITUDE_NOISE ** 2
-                and wrap_angle(yaw_gap) ** 2 <= YAW_GATE * (variance + yaw_noise)):
-            innovation, rows = np.append(gap, wrap_angle(yaw_gap)), 4
-            S = spread.copy()
-            S[:3, :3] += noise
-            S[3, 3] += yaw_noise
-        across = self._covariance[:, columns].dot(H[:rows].T)
-        gain = np.linalg.solve(S, across.T)  # (rows, 4 n), symmetric S
+        turned_alike = (math.isfinite(S[3, 3]) and variance > ATTITUDE_NOISE ** 2
+                        and gap[3] ** 2 <= YAW_GATE * S[3, 3])
+        rows = slice(4 if turned_alike else 3)
+        gain = np.linalg.solve(S[rows, rows], across[:, rows].T)  # (rows, 4 n), symmetric S
         for frame, (yaw, *place) in zip(self.frames.values(),
-                                        -innovation.dot(gain).reshape(-1, _SIZE)):
+                                        -gap[rows].dot(gain).reshape(-1, _SIZE)):
             frame.yaw = wrap_angle(frame.yaw + float(yaw))
             frame.place = frame.place + place
-        P = self._covariance - across.dot(gain)
+        P = self._covariance - across[:, rows].dot(gain)
         self._covariance = 0.5 * (P + P.T)
         return doubt
 
@@ -246,14 +234,14 @@ class FrameAlignment:
 
 
 def _lever_matrix(lever: Array) -> Array:
-    """Return the Jacobian (3, 4) of a point's position at a lever (3,), m, to yaw and place."""
-    H = np.zeros((3, _SIZE))
-    H[:, 0], H[:, 1:] = sideways(lever), np.eye(3)
+    """Return the Jacobian (4, 4) of position and yaw at a lever (3,), m, to yaw and place."""
+    H = np.zeros((_SIZE, _SIZE))
+    H[:3, 0], H[:3, 1:], H[3, 0] = sideways(lever), np.eye(3), 1.0
     return H
 
 
-#: Pairs kept, and for how long, ns: drift makes older ones worthless.
-MOST, LONGEST = 100, 20 * NANOSECONDS
+#: Pairs kept, and for how long, s: drift makes older ones worthless.
+MOST, LONGEST = 100, 20.0
 FEWEST = 5
 #: Errors of sightings are correlated in time: factor on the variances of a fit.
 WARINESS = 4.0
@@ -263,23 +251,28 @@ START_YAW = 0.35
 OUTLIER, AGREEING = 25.0, 0.7
 
 
-Pair = tuple[TrackPoint, TrackPoint]
-"""One vehicle in two frames, at one stamp."""
-
-
 class PairedFrames:
-    """Collects the common vehicles of two frames until the first fit."""
+    """
+    Collects the common vehicles of two frames until the first fit.
+
+    A row (10,) holds a stamp, s; the positions in both frames (3, 3), m, and their variance, m^2;
+    the difference of the yaws, rad, and its variance, infinite if a yaw is unknown.
+    """
 
     def __init__(self) -> None:
-        self._pairs: deque[Pair] = deque(maxlen=MOST)
+        self._rows: deque[Array] = deque(maxlen=MOST)
         self.yaw_std = math.pi
         """Standard deviation of the yaw between the frames, rad, at the last fit."""
 
     def add(self, one: TrackPoint, other: TrackPoint) -> None:
         """Add the track points of one vehicle in both frames, at one stamp."""
-        while self._pairs and one.stamp - self._pairs[0][0].stamp > LONGEST:
-            self._pairs.popleft()
-        self._pairs.append((one, other))
+        stamp = one.stamp / NANOSECONDS
+        while self._rows and stamp - self._rows[0][0] > LONGEST:
+            self._rows.popleft()
+        self._rows.append(np.array([
+            stamp, *one.position, *other.position,
+            (one.covariance + other.covariance).trace() / 3.0, one.yaw - other.yaw,
+            one.yaw_variance + other.yaw_variance]))
 
     def first_fit(self, swapped: bool = False) -> tuple[Frame, Array] | None:
         """
@@ -287,66 +280,52 @@ class PairedFrames:
 
         :param swapped: the first in the second.
         """
-        if len(self._pairs) < FEWEST:
+        if len(self._rows) < FEWEST:
             return None
-        pairs = [(other, one) if swapped else (one, other) for one, other in self._pairs]
-        found, covariance = _fit(pairs)
-        agreeing = [pair for pair, chi2 in zip(pairs, _misfit(pairs, found)) if chi2 < OUTLIER]
-        if len(agreeing) < max(FEWEST, AGREEING * len(pairs)):
-            if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
-                for _ in range(len(pairs) // 2):
-                    self._pairs.popleft()
+        rows = np.array(self._rows)
+        if swapped:
+            rows[:, 1:7], rows[:, 8] = rows[:, [4, 5, 6, 1, 2, 3]], -rows[:, 8]
+        found, covariance = _fit(rows)
+        agreeing = rows[_misfit(rows, found) < OUTLIER]
+        if len(agreeing) < max(FEWEST, AGREEING * len(rows)):
+            if len(rows) > 4 * FEWEST:  # the older ones may be wrong
+                for _ in range(len(rows) // 2):
+                    self._rows.popleft()
             return None
-        if len(agreeing) < len(pairs):
+        if len(agreeing) < len(rows):
             found, covariance = _fit(agreeing)
         self.yaw_std = math.sqrt(min(covariance[0, 0], math.pi ** 2))
         return (found, covariance) if self.yaw_std <= START_YAW else None
 
 
-def _variances(pairs: list[Pair]) -> Array:
+def _variances(rows: Array) -> Array:
     """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
-    age = (pairs[-1][0].stamp - np.array([one.stamp for one, _ in pairs])) / NANOSECONDS
-    return np.array([float((one.covariance + other.covariance).trace()) / 3.0
-                     for one, other in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
+    variances: Array = rows[:, 7] + 2.0 * POSITION_DRIFT ** 2 * (rows[-1, 0] - rows[:, 0])
+    return variances
 
 
-def _positions(pairs: list[Pair]) -> tuple[Array, Array]:
-    """Return the positions in both frames, (n, 3) each, m."""
-    return np.array([one.position for one, _ in pairs]), np.array([
-        other.position for _, other in pairs])
-
-
-def _fit(pairs: list[Pair]) -> tuple[Frame, Array]:
-    weights = 1.0 / _variances(pairs)
+def _fit(rows: Array) -> tuple[Frame, Array]:
+    one, other, turns = rows[:, 1:4], rows[:, 4:7], rows[:, 8]
+    weights, sure = 1.0 / _variances(rows), 1.0 / rows[:, 9]
     total = float(weights.sum())
-    one, other = _positions(pairs)
     place, anchor = weights @ one / total, weights @ other / total
     x, y = (one - place)[:, :2], (other - anchor)[:, :2]
-    along = float(weights @ (y * x).sum(axis=1))
-    across = float(weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]))
+    # A marker is always mounted alike: no number of attitudes is worth more than one.
+    sure *= min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / max(float(sure.sum()), 1e-9))
+    along = weights @ (y * x).sum(axis=1) + sure @ np.cos(turns)
+    across = weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]) + sure @ np.sin(turns)
     # Noise alone spreads points by their variance on two axes.
-    known = max(0.0, float(weights @ (y * y).sum(axis=1)) - 2.0 * (len(pairs) - 1))
-    turns = [(a.yaw - b.yaw, 1.0 / (a.yaw_variance + b.yaw_variance)) for a, b in pairs
-             if a.yaw_variance + b.yaw_variance < math.inf]
-    if turns:
-        # A marker is always mounted alike: no number of attitudes is worth more than one.
-        sure = sum(weight for _, weight in turns)
-        share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
-        along += share * sum(weight * math.cos(turn) for turn, weight in turns)
-        across += share * sum(weight * math.sin(turn) for turn, weight in turns)
-        known += share * sure
+    known = sure.sum() + max(0.0, weights @ (y * y).sum(axis=1) - 2.0 * (len(rows) - 1))
     covariance = np.diag([WARINESS / max(known, 1e-6),
                           *[WARINESS / total + SIGHTING_NOISE ** 2] * 3])
     return Frame(math.atan2(across, along), place, anchor), covariance
 
 
-def _misfit(pairs: list[Pair], fit: Frame) -> Array:
+def _misfit(rows: Array, fit: Frame) -> Array:
     """Return chi^2 (n,) of the distance and attitudes of each pair from a fit."""
-    one, other = _positions(pairs)
-    gap = one - fit.place - (other - fit.anchor) @ fit.rotation.T
-    turns = np.array([wrap_angle(a.yaw - b.yaw - fit.yaw) ** 2 / (a.yaw_variance + b.yaw_variance)
-                      for a, b in pairs])
-    return np.maximum((gap * gap).sum(axis=1) / _variances(pairs), turns)
+    gap = rows[:, 1:4] - fit.place - (rows[:, 4:7] - fit.anchor) @ fit.rotation.T
+    turns = (rows[:, 8] - fit.yaw + math.pi) % (2.0 * math.pi) - math.pi
+    return np.maximum((gap * gap).sum(axis=1) / _variances(rows), turns ** 2 / rows[:, 9])
 
 
 #: Of a received velocity without covariance, m/s.

@@ -28,7 +28,7 @@ sender repeatedly do not fit, its frame has changed and is aligned again.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 import math
 
 from flock_follower.flock.alignment import FrameAlignment, in_own_frame, PairedFrames
@@ -50,6 +50,7 @@ from flock_follower.flock.peers import (
     sender_of,
     SENDERS_MAX,
     SenderStatus,
+    TOO_FAST,
     too_fast,
     Track,
     track_point,
@@ -93,7 +94,8 @@ class Sharing:
         self.senders: dict[str, Sender] = {}
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
-        self._tracks: dict[tuple[str, str], Track] = {}  # by frame and vehicle
+        # By frame and vehicle.
+        self._tracks: dict[str, dict[str, Track]] = defaultdict(lambda: defaultdict(Track))
         self._pairs: dict[tuple[str, str], PairedFrames] = {}
         self._related: dict[tuple[str, str, str], int] = {}
         self._last_round: int | None = None
@@ -105,81 +107,78 @@ class Sharing:
 
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
-        if problem := too_fast(state):
-            return self._refuse(f'own odometry {problem[0]}', problem[1])
-        before = self._own
+        fast, before = too_fast(state), self._own
+        if self._refused((fast, f'own odometry {TOO_FAST}', fast)):
+            return
         if before is not None:
             back = before.stamp - state.stamp
             if 0 <= back <= STALE:
-                return None  # repeated, or out of order
+                return  # repeated, or out of order
             leap = 'in time' if back > 0 else leapt(before, state)
             if before.frame != state.frame:
                 leap = f'from frame {before.frame!r} to {state.frame!r}'
-            if leap:
-                self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
+            if self._refused((leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
                 self._align_all_anew(forget_senders=back > 0)
         self._own = state
-        self._remember(self.name, self.name, track_point(state, True))
-        return None
+        self._tracks[self.name][self.name].add(track_point(state, True))
 
     def take_seen(self, state: OdometryState) -> None:
         """Take an own sighting of another vehicle, as on ``neighbors``."""
-        own, name = self._own, state.child
-        if DUPLICATE in name:
-            return None  # a print is no vehicle
-        if own is None:
-            return self._refuse('sighting before own odometry', name)
-        problem = too_fast(state)
-        if problem or name == self.name or state.frame != own.frame:
-            return self._refuse('unusable sighting', problem[1] if problem else (
-                f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
-        before = self._seen.get(name)
-        if before is not None and 0 <= before.stamp - state.stamp <= STALE:
-            return None
-        if before is None and len(self._seen) >= SEEN_MAX:
-            return self._refuse('too many vehicles', name)
-        if not is_covariance(state.pose_covariance[:3, :3]):
-            return self._refuse('sighting without a covariance', name)
+        name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
+        frame = None if self._own is None else self._own.frame
+        # A second print of a marker is no vehicle.
+        if DUPLICATE in name or self._refused(
+                (frame is None, 'sighting before own odometry', name),
+                (fast, 'unusable sighting', fast),
+                (name == self.name or state.frame != frame, 'unusable sighting',
+                 f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')):
+            return
         doubt = float(position_covariance(state, False).trace())
-        if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
-            return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
+        if (before is not None and 0 <= before.stamp - state.stamp <= STALE) or self._refused(
+                (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
+                (not is_covariance(state.pose_covariance[:3, :3]), 'sighting without a covariance',
+                 name),
+                # It is known by its ranges alone, for a while.
+                (doubt > POSITION_STD_MAX ** 2, 'known too vaguely',
+                 f'{name}: to {math.sqrt(max(doubt, 0.0)):.2f} m')):
+            return
         self._seen[name] = state
         self._relate(self.name, name, track_point(state, False))
-        return None
 
     def take_message(self, state: OdometryState, received: int) -> None:
         """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
         name = sender_of(state.frame)
-        if not name:
-            return self._refuse(
-                'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
-                f'NAME{FRAME}, where NAME is the sending vehicle')
-        if name == self.name:
-            if _key(state) not in self._echoes:  # else an own message that came back
-                self._refuse('another vehicle uses this name',
-                             f'{name} sends {state.child[:70]!r}')
-            return None
-        sender = self.senders.get(name)
+        known = name in self.senders
+        # An own message may come back.
+        if self._refused(
+                (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
+                 f'NAME{FRAME}, where NAME is the sending vehicle'),
+                (name == self.name and _key(state) not in self._echoes,
+                 'another vehicle uses this name', f'{name} sends {state.child[:70]!r}')) or (
+                     name == self.name):
+            return
         if refused := refusal(state, received):
-            if refused[0] == FUTURE and sender is not None:
-                sender.ban(received, 'has a clock that is ahead')
-            return self._refuse(*refused)
-        if sender is None:
-            if len(self.senders) >= SENDERS_MAX:
-                return self._refuse('too many senders', name)
-            sender = self.senders[name] = Sender(name)
+            if refused[0] == FUTURE and known:
+                self.senders[name].ban(received, 'has a clock that is ahead')
+            self._refuse(*refused)
+            return
+        if self._refused((not known and len(self.senders) >= SENDERS_MAX, 'too many senders',
+                          name)):
+            return
+        sender = self.senders.setdefault(name, Sender(name))
         sender.received = received
-        if why := sender.banned(received):
-            return self._refuse('ignored for a while', f'{name} {why}')
-        return self._take_from(sender, state, received)
+        why = sender.banned(received)
+        if not self._refused((why, 'ignored for a while', f'{name} {why}')):
+            self._take_from(sender, state, received)
 
     def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:
         """Take a valid message of a sender."""
         of_itself, before = state.child == sender.name, sender.states.get(state.child)
-        if before is not None and state.stamp <= before.stamp:
-            return self._refuse('message out of order', f'{sender.name} sends {state.child}')
-        if before is None and len(sender.states) >= SEEN_MAX:
-            return self._refuse('too many vehicles', f'{sender.name} sends {state.child}')
+        what = f'{sender.name} sends {state.child}'
+        if self._refused(
+                (before is not None and state.stamp <= before.stamp, 'message out of order', what),
+                (before is None and len(sender.states) >= SEEN_MAX, 'too many vehicles', what)):
+            return
         leap = '' if before is None else leapt(before, state)
         if of_itself:
             if leap:
@@ -194,9 +193,8 @@ class Sharing:
             sender.doubted.add(state.child)
         else:
             sender.doubted.discard(state.child)
-        if why := self.unusable(sender):
-            self._refuse(f'not aligned with {sender.name}', why)
-        return None
+        why = self.unusable(sender)
+        self._refused((why, f'not aligned with {sender.name}', why))
 
     # Relations between frames.
 
@@ -215,12 +213,9 @@ class Sharing:
         return (f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
                 f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
 
-    def _remember(self, frame: str, vehicle: str, point: TrackPoint) -> None:
-        self._tracks.setdefault((frame, vehicle), Track()).add(point)
-
     def _relate(self, frame: str, vehicle: str, point: TrackPoint) -> bool:
         """Remember a vehicle in a frame, relate that to another; return whether that fits."""
-        self._remember(frame, vehicle, point)
+        self._tracks[frame][vehicle].add(point)
         other = self._other_frame(frame, vehicle, point.stamp)
         if other is None or self._own is None:
             return True
@@ -251,19 +246,15 @@ class Sharing:
 
         The own frame is best, then the vehicle's, then the most certain; only one counts.
         """
-        best: tuple[float, str, TrackPoint] | None = None
-        for name in (self.name, *self.senders):
-            if name == frame or (name, vehicle) not in self._tracks:
-                continue
-            doubt = self.frames.stds(name)[0]
-            if name == self.name or (name == vehicle and name in self.frames):
-                doubt = -2.0 if name == self.name else -1.0
-            if best is not None and doubt >= best[0]:
-                continue
-            point = self._tracks[name, vehicle].at(stamp)
+        names = [name for name in (self.name, *self.senders)
+                 if name != frame and vehicle in self._tracks[name]]
+        for name in sorted(names, key=lambda name: (
+                name != self.name, name != vehicle or name not in self.frames,
+                self.frames.stds(name)[0])):
+            point = self._tracks[name][vehicle].at(stamp)
             if point is not None:
-                best = doubt, name, point
-        return None if best is None else best[1:]
+                return name, point
+        return None
 
     def _begin(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> None:
         """Collect a relation of an unknown frame, and start its estimate if that is possible."""
@@ -292,7 +283,7 @@ class Sharing:
 
     def _forget_frame(self, name: str) -> None:
         self.frames.drop(name)
-        self._tracks = {key: each for key, each in self._tracks.items() if key[0] != name}
+        self._tracks.pop(name, None)
         self._pairs = {names: each for names, each in self._pairs.items() if name not in names}
         self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
 
@@ -302,11 +293,11 @@ class Sharing:
         self._seen.clear()
         self._pairs.clear()
         self._related.clear()
-        self._tracks = {key: each for key, each in self._tracks.items()
-                        if key[0] != self.name and not forget_senders}
+        self._tracks.pop(self.name, None)
         for sender in self.senders.values():
             sender.refused = 0
         if forget_senders:
+            self._tracks.clear()
             self.senders.clear()
 
     # Out.
@@ -391,6 +382,18 @@ class Sharing:
             return 'no other sender'
         return '' if any(not s.why for s in active) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in active)
+
+    def _refused(self, *cases: tuple[object, str, str]) -> bool:
+        """
+        Report the first case that holds; return whether one does.
+
+        :param cases: whether it holds, the reason, and the detail.
+        """
+        for holds, reason, detail in cases:
+            if holds:
+                self._refuse(reason, detail)
+                return True
+        return False
 
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:

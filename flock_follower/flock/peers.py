@@ -179,6 +179,7 @@ VAGUE = 25.0
 #: Messages whose ages are kept, and the least age, s, that is reported.
 AGES, SLOW = 50, 0.25
 Refusal = tuple[str, str]
+TOO_FAST = 'not finite, or too fast'
 #: Refusal after which a sender is ignored for a while: all its stamps are wrong.
 FUTURE = 'message from the future'
 
@@ -189,11 +190,10 @@ def sender_of(frame: str) -> str:
     return name if name != frame and NAME.fullmatch(name) else ''
 
 
-def too_fast(state: OdometryState) -> Refusal | None:
-    """Return whether a state is faster than any vehicle, or None; messages are finite."""
+def too_fast(state: OdometryState) -> str:
+    """Return the speed of a state that is faster than any vehicle, else ''."""
     speed = math.hypot(*state.velocity.tolist())
-    return None if speed <= FASTEST else (
-        'not finite, or too fast', f'{state.child}: {speed:.3g} m/s')
+    return '' if speed <= FASTEST else f'{state.child}: {speed:.3g} m/s'  # NaN is too fast
 
 
 def is_covariance(matrix: Array) -> bool:
@@ -210,17 +210,18 @@ def is_covariance(matrix: Array) -> bool:
 def refusal(state: OdometryState, received: int) -> Refusal | None:
     """Return why a message of another vehicle, received at a time, ns, is refused, or None."""
     sender, age = sender_of(state.frame), (received - state.stamp) / NANOSECONDS
-    if not NAME.fullmatch(state.child):
-        return 'message of an unnamed vehicle', f'{sender}: child_frame_id {state.child[:70]!r}'
-    if problem := too_fast(state):
-        return f'message {problem[0]}', f'{sender}: {problem[1]}'
-    if age < -CLOCK_TOLERANCE:
-        return FUTURE, (
-            f'{sender}: stamped {-age:.3f} s in the future: its clock is ahead by at least that')
-    if age > MESSAGE_AGE_MAX:
-        return 'message too old', f'{sender}: {age:.2f} s: its clock is behind, or the way is slow'
     known = state.child == sender or is_covariance(state.pose_covariance[:3, :3])
-    return None if known else ('message without a covariance', f'{sender} sends {state.child}')
+    fast = too_fast(state)
+    return next(((reason, detail) for holds, reason, detail in (
+        (not NAME.fullmatch(state.child), 'message of an unnamed vehicle',
+         f'{sender}: child_frame_id {state.child[:70]!r}'),
+        (fast, f'message {TOO_FAST}', f'{sender}: {fast}'),
+        (age < -CLOCK_TOLERANCE, FUTURE,
+         f'{sender}: stamped {-age:.3f} s in the future: its clock is ahead by at least that'),
+        (age > MESSAGE_AGE_MAX, 'message too old',
+         f'{sender}: {age:.2f} s: its clock is behind, or the way is slow'),
+        (not known, 'message without a covariance', f'{sender} sends {state.child}')) if holds),
+        None)
 
 
 #: Odometry that is further from its prediction than this, m or rad, has jumped ...

@@ -35,15 +35,10 @@ from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD, LAND
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
-from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import (
-    EndRequested,
-    FELL_SILENT,
-    NO_AUTOPILOT,
-    Restarted,
-)
+from flock_follower.mavlink.permission import FELL_SILENT, NO_AUTOPILOT
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -227,8 +222,8 @@ class Bridge:
             self._look(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
-        self.gate.distrust(self.distrusted(now), now)
-        setpoint, accepted = self.gate.decide(now, self.telemetry.silence(now), self.withheld())
+        setpoint, accepted = self.gate.decide(
+            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
         if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
@@ -252,7 +247,7 @@ class Bridge:
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
-                               self.link.target_system, self.link.target_component)
+                               self.link.target_system, AUTOPILOT_COMPONENT)
 
     def _boot_time(self, now: float) -> int:
         """Return the ``time_boot_ms`` of messages sent at ``now``, s: ms since the start."""
@@ -315,7 +310,7 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.gate.permit(EndRequested('the bridge is stopping'))
+        self.gate.permit(self.gate.permission.ended('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
@@ -336,7 +331,8 @@ class Bridge:
             self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
         if self.withheld():
             return
-        setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
+        setpoint, _ = self.gate.decide(
+            now, self.telemetry.silence(now), distrusted=self.distrusted(now))
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 
@@ -346,6 +342,6 @@ class Bridge:
         if before != self._vehicle:
             if before[1] != self._vehicle[1] and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
-            self.gate.permit(Restarted('the autopilot rebooted' if before[0] != self._vehicle[0]
-                                       else _OTHER_VEHICLE))
+            self.gate.permit(self.gate.permission.restarted(
+                'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
         self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

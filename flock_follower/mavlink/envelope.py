@@ -131,9 +131,6 @@ class Location(NamedTuple):
     """(2,), m, horizontally from where it became ACTIVE; None before."""
 
 
-NOWHERE: Final[Location] = Location()
-
-
 def approach_speed(distance: float, deceleration: float) -> float:
     """
     Return the largest speed, m/s, towards a bound from which the vehicle still stops before it.
@@ -151,17 +148,18 @@ def approach_speed(distance: float, deceleration: float) -> float:
 
 
 def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offset: float,
-                   horizon: float) -> tuple[float, float]:
+                   horizon: float, a_max: float) -> tuple[float, float]:
     """
     Return the least and the greatest vertical acceleration, m/s^2, by the heights.
 
     :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
     :param offset: upward acceleration, m/s^2, by which setpoints offset an error of the thrust.
     :param horizon: time in which the speed is to be reached, s.
+    :param a_max: largest magnitude of the acceleration, m/s^2.
     """
     if place.height is None:
         return -math.inf, math.inf
-    braking = BRAKING_SHARE * limits.a_max
+    braking = BRAKING_SHARE * a_max
     falling = approach_speed(place.height - limits.height_min, braking)
     rising = approach_speed(limits.height_max - place.height, braking)
     lowest, highest = sorted((climb_rate, place.climb_rate))

@@ -167,17 +167,14 @@ class Arrivals:
             while now - times[0] > RECENT and now - times[1] > RECENT:
                 times.popleft()
 
-    def _recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
+    def recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
+        """Return when a message came within ``window``, s, at most ``RECENT``."""
         # A copy: other threads read too.
         return [time for time in self._times[message_id].copy() if now - time < window]
 
-    def count(self, message_id: int, now: float, window: float) -> int:
-        """Return how often a message came within ``window``, s, at most ``RECENT``."""
-        return len(self._recent(message_id, now, window))
-
     def rate(self, message_id: int, now: float) -> float:
         """Return how often a message comes, Hz; 0 if the last is half of RECENT ago."""
-        times = self._recent(message_id, now)
+        times = self.recent(message_id, now)
         if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
             return 0.0
         return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
@@ -192,7 +189,7 @@ class Arrivals:
         """Return whether the rate of a message is well below the requested one, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
-        return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window
+        return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
 
 
 class AskAgain:
@@ -206,13 +203,21 @@ class AskAgain:
     def __init__(self) -> None:
         self._asked = self._low = -math.inf
         self._vain = 0
+        self._absent = False
 
     def asked(self, now: float) -> None:
         """Begin afresh: everything was asked for at ``now``, s."""
         self._asked, self._vain = now, 0
 
-    def due(self, low: bool, now: float) -> bool:
-        """Return whether to ask at ``now``, s, where messages come too seldom (``low``) or not."""
+    def due(self, low: bool, now: float, comes: bool = True) -> bool:
+        """
+        Return whether to ask at ``now``, s.
+
+        :param low: whether messages come too seldom; ``comes``: whether any comes.
+        """
+        if comes and self._absent:
+            self.asked(now)  # in vain before, since there was no estimate to send
+        self._absent = not comes
         if not low:
             if now - max(self._low, self._asked) >= SHORTEST_WAIT:
                 self._vain = 0

@@ -117,10 +117,9 @@ class FlightEnd:
 
     def battery_low(self, now: float) -> str:
         """Return that the battery has been low for long enough, or ''."""
-        if now - self._low_since < BATTERY_TIME:
-            return ''
-        return (f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
-                f'{100.0 * self.params.battery_low:.0f} %')
+        return '' if now - self._low_since < BATTERY_TIME else (
+            f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
+            f'{100.0 * self.params.battery_low:.0f} %')
 
     def battery_unknown(self, now: float) -> bool:
         """Return whether ``battery_low`` cannot act, because the battery is not known."""

@@ -31,15 +31,7 @@ from flock_follower.geometry import Array
 from flock_follower.mavlink import envelope, setpoint_rules, velocity_check
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
-from flock_follower.mavlink.permission import (
-    Blinded,
-    Event,
-    Landed,
-    next_permission,
-    Permission,
-    Phase,
-    Seen,
-)
+from flock_follower.mavlink.permission import Permission, Phase
 from flock_follower.mavlink.relative_flight import RelativeFlight
 from flock_follower.mavlink.setpoint_rules import (
     AcceptedCommand,
@@ -124,10 +116,9 @@ class Gate:
         self._commanded = False  # whether the last setpoint was a command
         self._last_yaw: float | None = None
 
-    def permit(self, event: Event) -> None:
-        """Update the permission by a request, or by its result."""
-        before, self.permission = self.permission, next_permission(self.permission, event)
-        phase = self.permission.phase
+    def permit(self, after: Permission) -> None:
+        """Take the permission after an event, such as ``permission.requested(now)``."""
+        before, self.permission, phase = self.permission, after, after.phase
         self._was_active = phase is Phase.ACTIVE or (
             self._was_active and phase is Phase.GIVING_BACK)
         if (before.phase is Phase.ACTIVE) != (phase is Phase.ACTIVE):
@@ -140,7 +131,7 @@ class Gate:
         :param airborne: whether the autopilot reports that it flies; None if it does not report.
         """
         self._status, self._airborne = status, airborne
-        self.permit(Seen(status, received, airborne))
+        self.permit(self.permission.seen(status, received, airborne))
 
     @property
     def flies(self) -> bool:
@@ -221,10 +212,6 @@ class Gate:
         """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
         return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
-    def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity of the autopilot is invalid, or ''."""
-        self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
-
     def update_yaw(self, source: str, yaw: float, time: float) -> None:
         """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
         self._sources[source].take_yaw(yaw, time)
@@ -303,7 +290,7 @@ class Gate:
         ) or envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, setpoint_rules.HANDOVER_TIME)
 
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, s, and the command it comes from, if any.
@@ -313,9 +300,11 @@ class Gate:
 
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
+        :param distrusted: why the velocity of the autopilot is invalid, or ''.
         """
         self.new_command = False
         self._notice_landing(now)
+        self._distrusted_since = min(self._distrusted_since, now) if distrusted else math.inf
         active = self.permission.phase is Phase.ACTIVE
         self.active_since = min(self.active_since, now) if active else math.inf
         status, withheld = self._status, withheld or self.withheld
@@ -350,7 +339,7 @@ class Gate:
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
         self._commanded = setpoint.kind == setpoint_rules.COMMAND
         if not sends and not withheld and known.blind(self.limits):
-            self.permit(Blinded(setpoint.reason))
+            self.permit(self.permission.blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:
             return setpoint, None
         self._held, self._last_yaw = None, setpoint.yaw
@@ -361,7 +350,7 @@ class Gate:
         down = self._airborne is False and (height is None or height < LANDED_HEIGHT)
         self._landed_since = min(self._landed_since, now) if down else math.inf
         if now - self._landed_since >= LANDED_TIME:
-            self.permit(Landed())
+            self.permit(self.permission.landed())
 
     def _source(self) -> str:
         if self.velocity_source != 'auto':

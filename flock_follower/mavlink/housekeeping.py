@@ -120,11 +120,6 @@ class TimeSync:
         """Return the best of the recent answers, None without one."""
         return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
 
-    def forget(self) -> None:
-        """Drop all samples: the autopilot's clock has restarted."""
-        self._samples.clear()
-        self._asked.clear()
-
 
 #: Telemetry is requested again after this, s, until the vehicle reports whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
@@ -134,7 +129,6 @@ ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
 #: The rates of the other messages wanted from any autopilot, Hz.
 RATES: Final[Mapping[int, float]] = MappingProxyType({
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
     mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
@@ -166,6 +160,7 @@ WHY_WAIT: Final[float] = 3.0
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
     return {dialect.mode_message: dialect.mode_rate, dialect.estimator_status: 5.0,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
             **dict.fromkeys(ESTIMATE.values(), estimate_rate), **RATES}
 
 
@@ -197,7 +192,6 @@ class Housekeeping:
         self._reboots = 0
         self._was_alive = False
         self._request_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
-        self._absent: set[int] = set()
         self._watched_since = math.inf
 
     def take_timesync(self, message: Any, now: float) -> None:
@@ -216,7 +210,7 @@ class Housekeeping:
         reboots = self._link.telemetry.reboots
         if reboots != self._reboots or (alive and not self._was_alive):
             self._reboots = reboots
-            self.timesync.forget()
+            self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._streams_requested, self.parameters = -math.inf, self._new_check()
             self._watched_since = now
             self.alive_since = min(self.alive_since, now)
@@ -281,15 +275,14 @@ class Housekeeping:
                 'set signing_key_file')
 
     def _request_streams(self, now: float) -> None:
-        telemetry = self._link.telemetry
-        dialect = telemetry.dialect
+        telemetry, dialect = self._link.telemetry, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
         # These must not come less often, Hz: what braking and the pilot's switch rest on.
-        watched = {message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status)} | {
-                dialect.mode_message: dialect.least_mode_rate}
+        watched = {**{message_id: wanted[message_id] for message_id in (
+            *ESTIMATE.values(), dialect.estimator_status)},
+            dialect.mode_message: dialect.least_mode_rate}
         unreported = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
@@ -299,16 +292,12 @@ class Housekeeping:
             for message_id in watched:
                 self._request_again[message_id].asked(now)
             return
-        arrivals, due = telemetry.arrivals, {}
-        for message_id, least in watched.items():
-            again = self._request_again[message_id]
-            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
-            if comes and message_id in self._absent:
-                again.asked(now)  # in vain before, since there was no estimate to send
-            (self._absent.discard if comes else self._absent.add)(message_id)
-            if again.due(arrivals.too_seldom(message_id, least, now), now):
-                due[message_id] = wanted[message_id]
-        self._link.request_streams(due)
+        arrivals = telemetry.arrivals
+        self._link.request_streams({
+            message_id: wanted[message_id] for message_id, least in watched.items()
+            if self._request_again[message_id].due(
+                arrivals.too_seldom(message_id, least, now), now,
+                bool(arrivals.recent(message_id, now, STREAM_REQUEST_PERIOD)))})
 
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin

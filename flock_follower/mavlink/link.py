@@ -41,7 +41,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink.dialects import AUTO, describe, dialect_of, is_autopilot
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
-from flock_follower.ranges import Range
+from flock_follower.ranges import first_reason, Range
 
 _MARKERS: Final[tuple[int, int]] = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 _SIGNED: Final[int] = mavlink.MAVLINK_IFLAG_SIGNED
@@ -50,17 +50,39 @@ _SIGNED: Final[int] = mavlink.MAVLINK_IFLAG_SIGNED
 MOST_FALSE_STARTS: Final[int] = 64
 UNDECODABLE: Final[str] = 'undecodable'
 WRONG_SIGNATURE: Final[str] = 'wrong signature'
+OLDER_TIMESTAMP: Final[str] = 'older timestamp'
+FUTURE_TIMESTAMP: Final[str] = 'future timestamp'
 UNKNOWN_MESSAGE: Final[str] = 'unknown message'
+
+
+class Codec(mavlink.MAVLink):  # type: ignore[misc]
+    """Decodes the messages of one sender, and refuses forged ones and those of another time."""
+
+    latest = 0
+    """The latest timestamp to accept."""
+    refusal = ''
+    """Why the newest refused signature was refused."""
+
+    def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
+        # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
+        # from the future would lock the real vehicle out.
+        digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
+        self.refusal = first_reason(
+            (not hmac.compare_digest(digest[:6], bytes(msgbuf[-6:])), WRONG_SIGNATURE),
+            (int.from_bytes(msgbuf[-12:-6], 'little') > self.latest, FUTURE_TIMESTAMP))
+        if not self.refusal and not super().check_signature(msgbuf, *source):
+            self.refusal = OLDER_TIMESTAMP
+        return not self.refusal
 
 
 class Framer:
     """
     Takes the bytes of one sender as they arrive.
 
-    :param codec: a ``mavlink.MAVLink`` that decodes, and checks signatures.
+    :param codec: decodes, and checks signatures.
     """
 
-    def __init__(self, codec: Any) -> None:
+    def __init__(self, codec: Codec) -> None:
         self.codec = codec
         self._waiting = bytearray()
         self.looks = 0
@@ -75,39 +97,42 @@ class Framer:
         buffer = self._waiting + data
         messages: list[Any] = []
         unused: Counter[str] = Counter()
-        start, incomplete = 0, -1
-        self.looks = 0
+        start, rest, whole, self.looks = 0, len(buffer), 0, 0
         while (start := _next_marker(buffer, start)) >= 0:
-            false_starts = self.looks - len(messages) - unused[WRONG_SIGNATURE]
-            if self.looks >= most or false_starts > MOST_FALSE_STARTS:
-                incomplete = -1
+            if self.looks >= most or self.looks - whole > MOST_FALSE_STARTS:
+                rest = len(buffer)
                 break
             self.looks += 1
             end = start + frame_length(buffer, start)
             if end > len(buffer):
                 # Either the rest has not arrived yet, or this byte was no start. Look on: a whole
                 # message behind it shows that it was none.
-                incomplete = start if incomplete < 0 else incomplete
-                start += 1
+                rest, start = min(rest, start), start + 1
                 continue
-            try:
-                message = self.codec.decode(buffer[start:end])
-                # Another dialect's, or garbage: an unknown kind has no checksum.
-                fault = UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
-            except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
-                fault = WRONG_SIGNATURE if 'signature' in str(error).lower() else UNDECODABLE
+            message, fault = self._decode(buffer[start:end])
             if fault:
                 unused[fault] += 1
             else:
                 messages.append(message)
-            if fault in ('', WRONG_SIGNATURE):
-                start, incomplete = end, -1
-            else:
+            if fault in (UNDECODABLE, UNKNOWN_MESSAGE):
                 start += 1
-        if not messages and not unused and incomplete < 0:
-            unused[UNDECODABLE] += bool(buffer)
-        self._waiting = buffer[incomplete:] if incomplete >= 0 else bytearray()
+            else:
+                start, rest, whole = end, len(buffer), whole + 1
+        self._waiting = buffer[rest:]
+        if buffer and not messages and not unused and not self._waiting:
+            unused[UNDECODABLE] += 1
         return messages, unused
+
+    def _decode(self, data: bytearray) -> tuple[Any, str]:
+        """Return a message, and why it cannot be used, or ''."""
+        self.codec.refusal = WRONG_SIGNATURE  # of a message without a signature
+        try:
+            message = self.codec.decode(data)
+        except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
+            signed = 'signature' in str(error).lower()
+            return None, self.codec.refusal if signed else UNDECODABLE
+        # Another dialect's, or garbage: an unknown kind has no checksum.
+        return message, UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
 
 
 def frame_length(buffer: bytearray, start: int) -> int:
@@ -138,8 +163,6 @@ _SIGNING_TICKS: Final[float] = 1e5
 _MOST_PEERS: Final[int] = 16
 #: Of messages and pieces of garbage taken in one call; what a flood brings beyond is dropped.
 MOST_PIECES: Final[int] = 300
-OLDER_TIMESTAMP: Final[str] = 'older timestamp'
-FUTURE_TIMESTAMP: Final[str] = 'future timestamp'
 #: What arrives although nothing of it is used, by the reason.
 _UNUSABLE: Final[dict[str, str]] = {
     OLDER_TIMESTAMP: (
@@ -203,32 +226,9 @@ class Signing:
         return cls(data, unix_time)
 
 
-class _Codec(mavlink.MAVLink):  # type: ignore[misc]
-    latest = 0
-    """The latest timestamp to accept."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.untimely: Counter[str] = Counter()
-        """Rightly signed messages that were refused for their timestamp, by reason."""
-
-    def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
-        # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
-        # from the future would lock the real vehicle out.
-        digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
-        if not hmac.compare_digest(digest[:6], bytes(msgbuf[-6:])):
-            return False
-        if int.from_bytes(msgbuf[-12:-6], 'little') > self.latest:
-            self.untimely[FUTURE_TIMESTAMP] += 1
-            return False
-        timely = bool(super().check_signature(msgbuf, *source))
-        self.untimely[OLDER_TIMESTAMP] += not timely
-        return timely
-
-
 class Link:
     """
-    A link over a transport to the autopilot ``target_system``, ``target_component``.
+    A link over a transport to the autopilot of ``target_system``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
     :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
@@ -237,12 +237,10 @@ class Link:
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
-                 target_component: int = AUTOPILOT_COMPONENT, source_component: int = COMPONENT,
-                 autopilot: str = AUTO, signing: Signing | None = None,
-                 announce_as_gcs: bool = False) -> None:
+                 source_component: int = COMPONENT, autopilot: str = AUTO,
+                 signing: Signing | None = None, announce_as_gcs: bool = False) -> None:
         self.transport = transport
         self.target_system = target_system
-        self.target_component = target_component
         self.source_system = source_system
         self.source_component = source_component
         self.autopilot = autopilot
@@ -262,12 +260,11 @@ class Link:
         self.bytes_received = 0
         self.bytes_sent = 0
         self.signing = signing
-        self._parsers: dict[Any, Framer] = {}
+        self._framers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
-    def _codec(self) -> Any:
-        codec = _Codec(None, srcSystem=self.source_system,
-                       srcComponent=self.source_component)
+    def _codec(self) -> Codec:
+        codec = Codec(None, srcSystem=self.source_system, srcComponent=self.source_component)
         if self.signing is not None:
             codec.signing = self.signing.state
         return codec
@@ -284,8 +281,10 @@ class Link:
             if budgets[ours] <= 0:
                 self.ignored['flood'] += 1
                 continue
-            parsed, pieces = self._parse(data, peer, budgets[ours], now)
-            budgets[ours] -= pieces
+            framer = self._framer(peer, now)
+            parsed, unused = framer.feed(data, budgets[ours])
+            self.ignored.update(unused)
+            budgets[ours] -= 1 + framer.looks
             for message in parsed:
                 if unfit := self._unfit(message, peer, now):
                     self.ignored[unfit] += 1
@@ -295,28 +294,21 @@ class Link:
                 messages.append(message)
         return messages
 
-    def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
-        """Return the messages in a piece of data, and the cost of parsing."""
-        # A parser for each sender, so that garbage from one cannot cut into another's messages.
-        if peer not in self._parsers:
-            if len(self._parsers) >= _MOST_PEERS:
-                del self._parsers[next(iter(self._parsers))]
-            self._parsers[peer] = Framer(self._codec())
-        framer = self._parsers[peer]
+    def _framer(self, peer: Any, now: float) -> Framer:
+        # One for each sender, so that garbage from one cannot cut into another's messages.
+        if peer not in self._framers:
+            if len(self._framers) >= _MOST_PEERS:
+                del self._framers[next(iter(self._framers))]
+            self._framers[peer] = Framer(self._codec())
         if self.signing is not None:
-            framer.codec.latest = self.signing.latest(now)
-        messages, unused = framer.feed(data, most)
-        untimely = framer.codec.untimely
-        self.ignored.update(
-            unused + untimely - Counter({WRONG_SIGNATURE: untimely.total()}))
-        untimely.clear()
-        return messages, 1 + framer.looks
+            self._framers[peer].codec.latest = self.signing.latest(now)
+        return self._framers[peer]
 
     def _unfit(self, message: Any, peer: Any, now: float) -> str:
         """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
         kind = message.get_type()
         system = message.get_srcSystem()
-        vehicle = (message.get_srcComponent() == self.target_component
+        vehicle = (message.get_srcComponent() == AUTOPILOT_COMPONENT
                    and (kind != 'HEARTBEAT' or is_autopilot(message)))
         if system != self.target_system:
             self.other_autopilots[system] += kind == 'HEARTBEAT' and vehicle
@@ -355,7 +347,7 @@ class Link:
     def send_command(self, command: int, params: tuple[float, ...], confirmation: int = 0) -> bool:
         """Send COMMAND_LONG with up to seven parameters, the rest zero."""
         return self.send(mavlink.MAVLink_command_long_message(
-            self.target_system, self.target_component, command, confirmation,
+            self.target_system, AUTOPILOT_COMPONENT, command, confirmation,
             *params, *(0.0,) * (7 - len(params))))
 
     def request_streams(self, rates: Mapping[int, float]) -> None:
@@ -366,7 +358,7 @@ class Link:
     def request_parameter(self, name: str) -> bool:
         """Send PARAM_REQUEST_READ for a parameter by its name."""
         return self.send(mavlink.MAVLink_param_request_read_message(
-            self.target_system, self.target_component, name.encode('ascii'), -1))
+            self.target_system, AUTOPILOT_COMPONENT, name.encode('ascii'), -1))
 
     def silence(self) -> str:
         """Return a text that names the messages received instead of the autopilot's."""
@@ -377,7 +369,7 @@ class Link:
             return (f'received system id {", ".join(map(str, others))}, '
                     f'not target_system {self.target_system}')
         none = (f'received MAVLink, but no autopilot with system id {self.target_system} '
-                f'and component {self.target_component}')
+                f'and component {AUTOPILOT_COMPONENT}')
         texts = {**_UNUSABLE, 'other system': none, 'other component': none,
                  UNDECODABLE: 'received bytes are not MAVLink'}
         return next((text for why, text in texts.items() if ignored[why]), 'nothing arrives')

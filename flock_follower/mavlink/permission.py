@@ -64,7 +64,7 @@ class Phase(enum.Enum):
 
 @dataclass(frozen=True)
 class Permission:
-    """The state of the machine."""
+    """The state of the machine, and its transitions: pure functions of an event."""
 
     phase: Phase = Phase.INACTIVE
     reason: str = NOT_REQUESTED
@@ -97,119 +97,68 @@ class Permission:
         """Return the text of ``mavlink_bridge/state`` while the autopilot is connected."""
         return ': '.join(filter(None, [self.phase.value, self.reason]))
 
+    # The permission after an event.
 
-@dataclass(frozen=True)
-class OffboardRequested:
-    """Someone called ``mavlink_bridge/offboard`` with true, at a time, s, and it may be tried."""
+    def requested(self, time: float) -> Permission:
+        """Permit to try offboard, requested at a time, s."""
+        return self if self.phase is Phase.ACTIVE else Permission(
+            Phase.READY, 'waiting for offboard mode', time)
 
-    time: float
+    def failed(self, why: str, asked: bool = True) -> Permission:
+        """End what the vehicle did not do, or not in time, or was not even ``asked``."""
+        # Should the mode come late, nothing is to follow from it.
+        ends = self.streams if not asked else self.phase is Phase.READY and not self.obeyed
+        return Permission(reason=why) if ends else self
 
-
-@dataclass(frozen=True)
-class OffboardFailed:
-    """The vehicle did not take the mode, or not in time, or was not asked; ``why`` in words."""
-
-    why: str
-    asked: bool = True
-
-
-@dataclass(frozen=True)
-class EndRequested:
-    """Hold, land, disarm or the end of the bridge was asked for; ``why`` in words."""
-
-    why: str
-
-
-@dataclass(frozen=True)
-class SecondCommander:
-    """Two nodes give commands at once; ``who`` in words."""
-
-    who: str
-
-
-@dataclass(frozen=True)
-class Blinded:
-    """No valid velocity for too long: only silence starts the autopilot's failsafe."""
-
-    why: str
-
-
-@dataclass(frozen=True)
-class Landed:
-    """The vehicle has been on the ground for long enough."""
-
-
-@dataclass(frozen=True)
-class Restarted:
-    """The autopilot rebooted, or was replaced: it has received no request."""
-
-    why: str
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What HEARTBEAT or CURRENT_MODE, which came at the time ``received``, s, shows."""
-
-    status: VehicleStatus
-    received: float
-    airborne: bool | None
-    """Whether it reports that it flies: on the ground setpoints could start a take-off. None: it
-    does not report, which permits nothing."""
-
-
-Event = (OffboardRequested | OffboardFailed | EndRequested | SecondCommander | Blinded | Landed
-         | Restarted | Seen)
-
-
-def next_permission(now: Permission, event: Event) -> Permission:
-    """Return the permission after an event; a pure function."""
-    phase = now.phase
-    match event:
-        case OffboardRequested(time):
-            return now if phase is Phase.ACTIVE else Permission(
-                Phase.READY, 'waiting for offboard mode', time)
-        case OffboardFailed(why, asked):
-            if not asked and now.streams:
-                return Permission(reason=why)
-            # Should the mode come late, nothing is to follow from it.
-            return Permission(reason=why) if phase is Phase.READY and not now.obeyed else now
-        case EndRequested(why):
-            if phase is Phase.READY and not now.obeyed:
-                return Permission(reason=why)
-            return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
-        case SecondCommander(who):
-            return replace(now, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}') if (
-                phase is Phase.ACTIVE) else now
-        case Blinded(why):
-            # Setpoints alone would end the failsafe of PX4, should a velocity come back.
-            return Permission(reason=f'{FELL_SILENT}: {why}') if now.streams else now
-        case Landed():
-            return Permission(reason=ON_GROUND) if now.streams else now
-        case Restarted(why):
+    def ended(self, why: str) -> Permission:
+        """Brake after a request for hold, land, disarm or the end of the bridge."""
+        if self.phase is Phase.READY and not self.obeyed:
             return Permission(reason=why)
-    return _seen(now, event)
+        return replace(self, phase=Phase.GIVING_BACK, reason=why) if self.streams else self
 
+    def contested(self, who: str) -> Permission:
+        """Brake, because two nodes give commands at once."""
+        return self if self.phase is not Phase.ACTIVE else replace(
+            self, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}')
 
-def _seen(now: Permission, seen: Seen) -> Permission:
-    if not now.streams or seen.received <= now.since:
-        return now
-    status, silence = seen.status, seen.received - now.received
-    now = replace(now, received=seen.received)
-    if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
-        return replace(now, phase=Phase.GIVING_BACK,
-                       reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
-                              'over')
-    if now.phase is Phase.GIVING_BACK:
-        if status.offboard and status.armed:
-            return replace(now, obeyed=True)
-        return Permission(reason=f'given back ({now.reason})')
-    if now.phase is Phase.READY and (not status.armed or seen.airborne is False):
-        return Permission(reason=ON_GROUND if status.armed else 'disarmed')
-    if not status.offboard:
-        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
-                          received=seen.received) if now.obeyed else now
-    if now.phase is Phase.ACTIVE:
-        return now if status.armed else Permission(reason='disarmed')
-    if seen.airborne is None:
-        return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
-    return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)
+    def blinded(self, why: str) -> Permission:
+        """Fall silent without a valid velocity: only silence starts the failsafe."""
+        # Setpoints alone would end the failsafe of PX4, should a velocity come back.
+        return Permission(reason=f'{FELL_SILENT}: {why}') if self.streams else self
+
+    def landed(self) -> Permission:
+        """End a flight that has been on the ground for long enough."""
+        return Permission(reason=ON_GROUND) if self.streams else self
+
+    def restarted(self, why: str) -> Permission:
+        """Forget a request that the autopilot, rebooted or replaced, has not received."""
+        return Permission(reason=why)
+
+    def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
+        """
+        Follow a HEARTBEAT or CURRENT_MODE that came at the time ``received``, s.
+
+        :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
+            start a take-off. None: it does not report, which permits nothing.
+        """
+        if not self.streams or received <= self.since:
+            return self
+        now, silence = replace(self, received=received), received - self.received
+        if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
+            return replace(now, phase=Phase.GIVING_BACK,
+                           reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
+                                  'over')
+        if now.phase is Phase.GIVING_BACK:
+            if status.offboard and status.armed:
+                return replace(now, obeyed=True)
+            return Permission(reason=f'given back ({now.reason})')
+        if now.phase is Phase.READY and (not status.armed or airborne is False):
+            return Permission(reason=ON_GROUND if status.armed else 'disarmed')
+        if not status.offboard:
+            return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
+                              received=received) if now.obeyed else now
+        if now.phase is Phase.ACTIVE:
+            return now if status.armed else Permission(reason='disarmed')
+        if airborne is None:
+            return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
+        return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)

@@ -59,9 +59,6 @@ class Relative(NamedTuple):
     """Age of the image that the command rests on, s."""
 
 
-FORBIDDEN: Final[Relative] = Relative()
-
-
 class Reckoning:
     """Position and velocity (3,), m and m/s, from where and when it began."""
 

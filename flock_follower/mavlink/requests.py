@@ -43,12 +43,7 @@ from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.permission import (
-    EndRequested,
-    OffboardFailed,
-    OffboardRequested,
-    Phase,
-)
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.ranges import first_reason
 
@@ -148,7 +143,7 @@ class Requests:
                     self._housekeeping.parameters.values))
         if request.goal is OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
-            self._gate.permit(OffboardFailed(request.outcome.message))
+            self._gate.permit(self._gate.permission.failed(request.outcome.message))
 
     def _status(self, now: float) -> VehicleStatus | None:
         return self._link.telemetry.current(now, self._gate.limits.link_timeout)
@@ -207,7 +202,7 @@ class Requests:
              'no LOCAL_POSITION_NED: the height reached would be unknown'),
             (name and name not in values,
              f'{name} is not known yet: {climbs} that high at least'),
-            (height < least - TOLERANCE,
+            (not height >= least - TOLERANCE,
              f'{climbs} to {name} = {least:g} m, above takeoff_height = {height:g} m'),
             (reached < limits.height_min, f'{above}height_min = {limits.height_min:g} m'),
             (reached > limits.height_max, f'{above}height_max = {limits.height_max:g} m'))
@@ -219,7 +214,7 @@ class Requests:
         :param obstacle: why it is refused at once, or ''.
         :param why: why the bridge itself requests it; '' for a request by a person.
         """
-        permit, pending, superseded = self._gate.permit, self.pending, None
+        gate, pending, superseded = self._gate, self.pending, None
         obstacle = first_reason(
             # Nor is it known how to ask.
             (goal.ends_flight and self._link.telemetry.dialect is None, NOT_RECEIVED),
@@ -229,14 +224,14 @@ class Requests:
              f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
             # From here on only braking goes out, even if the autopilot refuses.
-            permit(EndRequested(why or f'{goal.name} requested'))
+            gate.permit(gate.permission.ended(why or f'{goal.name} requested'))
             if pending is not None:
                 superseded = pending.refuse(f'superseded by {goal.name}').goal
         if obstacle:
             return Request(goal, now).refuse(obstacle)
         self.newest = request = Request(goal, now, superseded, own=bool(why))
         if goal is OFFBOARD:
-            permit(OffboardRequested(now))
+            gate.permit(gate.permission.requested(now))
         return request
 
     def _ended_here(self, request: Request, now: float) -> bool:
@@ -252,7 +247,7 @@ class Requests:
         if reason and not (waits and now - request.begun < STREAM_TIMEOUT):
             request.refuse(reason)
             if permission.since >= request.begun:  # else it was flying before
-                self._gate.permit(OffboardFailed(reason, asked=False))
+                self._gate.permit(permission.failed(reason, asked=False))
         return bool(reason)
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:

@@ -47,8 +47,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
-from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
-from flock_follower.mavlink.relative_flight import FORBIDDEN, Relative
+from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
@@ -175,6 +175,8 @@ class DisturbanceObserver:
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'
+#: Without odometry only a slow barometer shows the climb: heights are kept from so far inside, m.
+HEIGHT_MARGIN: Final[float] = 0.5
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
@@ -215,14 +217,10 @@ class Held(NamedTuple):
     """m."""
 
 
-NOT_HELD: Final[Held] = Held()
-
-
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, armed: bool, airborne: bool = True,
-           withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
-           held: Held = NOT_HELD, relative: Relative = FORBIDDEN,
-           wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
+           command_age: float, link_age: float, armed: bool, airborne: bool, withheld: str,
+           place: Location, unplaced: str, held: Held, relative: Relative, wind: ArrayLike,
+           offset: float) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
@@ -311,15 +309,26 @@ def _relative(full: GateLimits, command: Command, against: Array, place: Locatio
     """
     Return the setpoint of a command that rests on the marker alone.
 
-    Heights go first, then the limit of the whole acceleration; the speed is not known.
+    Heights go first, then the limit of the acceleration; the speed is not known. The offset of an
+    error of the thrust does not count for RELATIVE_MAX: it moves nothing.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
-    least, most = envelope.vertical_range(
-        full, place, place.climb_rate, _bounded(offset), full.speed_horizon)
+    a_max = full.a_max * SENT_INSIDE
     strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
+    own, bias = _bounded(offset), _bounded(command.thrust_bias)
+    margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
+    height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
+    assert height is not None  # else it is refused
+    # Of two offsets that differ the one counts that leads away from the bound.
+    least, _ = envelope.vertical_range(
+        full, Location(height - margin, climb), climb, max(own, bias), horizon, strongest)
+    _, most = envelope.vertical_range(
+        full, Location(height + margin, climb), climb, min(own, bias), horizon, strongest)
     within = min(max(float(wanted[2]), least), most)
-    up = min(max(within, -strongest), strongest)
-    level = limit_norm(wanted[:2], math.sqrt(strongest ** 2 - up ** 2))
+    lowest, highest = min(bias, 0.0) - strongest, max(bias, 0.0) + strongest
+    up = min(max(within, lowest, -a_max), highest, a_max)
+    rest = min(strongest ** 2 - (up - bias) ** 2, a_max ** 2 - up ** 2)
+    level = limit_norm(wanted[:2], math.sqrt(max(rest, 0.0)))
     limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
     if within != wanted[2]:
         limits.append(ENVELOPE)
@@ -354,7 +363,8 @@ def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Veloc
                               axis)
         safe = total._replace(reason=safe.reason or total.reason)
     a = safe.acceleration
-    least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
+    least, most = envelope.vertical_range(
+        limits, place, float(v[2]), _bounded(offset), horizon, limits.a_max)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
     bounds = [] if inward is None else [inward]

@@ -186,7 +186,9 @@ class ArmingChecks:
             return _MEANINGS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
             modes, part = struct.unpack_from('<IB', arguments)
-            self._coming.append(Failure(_meaning(name, message.number, part), modes, level))
+            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ') or (
+                f'{_PARTS.get(part, f"part {part}")}: event {message.number % 2**24}')
+            self._coming.append(Failure(text, modes, level))
         return ''
 
     def against(self, mode: str) -> list[str]:
@@ -197,11 +199,6 @@ class ArmingChecks:
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which keeps it from the pilot's.
                      or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
-
-
-def _meaning(name: str, number: int, part: int) -> str:
-    return _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ') or (
-        f'{_PARTS.get(part, f"part {part}")}: event {number % 2**24}')
 
 
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.

@@ -241,7 +241,8 @@ class TcpTransport(_Line):
             connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
-            connection.connect_ex(self._address)
+            with contextlib.suppress(BlockingIOError):  # under way
+                connection.connect(self._address)
             return connection.detach()
 
 
@@ -254,29 +255,28 @@ DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'
 
 
-class UdpTransport:
+class UdpTransport(_Line):
     """
-    A UDP socket.
+    A UDP socket, which is never lost.
 
     A listening one answers only the ``peer`` its owner sets, not everyone who ever sent to it:
     a setpoint must not reach a second vehicle by accident.
     """
 
-    fault = ''
-    capacity = 0.0
-    delivers_late = False
+    _backlog = math.inf  # datagrams do not wait for one another here
 
     def __init__(self, url: str, *, bind: tuple[str, int] | None = None,
                  peer: tuple[str, int] | None = None) -> None:
-        self.url = url
-        self.peer: Any = peer
+        super().__init__(url)
+        self.peer = peer
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._fd = self._socket.fileno()
         try:
             if bind is not None:
                 self._socket.bind(bind)
         except OSError as error:
-            self._socket.close()
+            self.close()
             raise OSError(f'connection = {url!r}: cannot listen there: {error.strerror}') from None
 
     @property
@@ -284,13 +284,6 @@ class UdpTransport:
         """Return the local address."""
         host, port = self._socket.getsockname()
         return str(host), int(port)
-
-    def fileno(self) -> int:
-        """Return the descriptor to select on."""
-        return self._socket.fileno()
-
-    def reopen(self, now: float) -> None:
-        """Do nothing: a UDP socket is never lost."""
 
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the datagrams that have arrived, with their senders."""
@@ -312,13 +305,10 @@ class UdpTransport:
             return False
         return True
 
-    def congested(self) -> bool:
-        """Return False: datagrams do not wait for one another here."""
-        return False
-
     def close(self) -> None:
         """Release the port."""
         self._socket.close()
+        self._fd = -1
 
 
 #: A non-blocking pipe. ``peer`` is the receiver of ``write``, None while unknown. ``fault`` says

@@ -154,8 +154,8 @@ class KnownMotion:
         mine, own = self.odom.fresh_velocity(limits), self.autopilot.fresh_velocity(limits)
         if self.source != ODOM or mine is None or own is None:
             return None
-        with np.errstate(over='ignore'):
-            return mine.vector - own.vector
+        # Of finite velocities even the difference may be beyond every number.
+        return np.clip(mine.vector, -SANE, SANE) - np.clip(own.vector, -SANE, SANE)
 
 
 def fresh(age: float, timeout: float) -> bool:
@@ -210,8 +210,7 @@ class VelocityComparison:
             first = math.isinf(self._time)
             step = 0.0 if first else min(now - self._time, LONGEST_STEP)
             share = 1.0 - math.exp(-step / AVERAGING_TIME)
-            # Of finite velocities even the difference may be beyond every number.
-            difference = limit_norm(np.clip(difference, -SANE, SANE), LARGEST * tolerance)
+            difference = limit_norm(difference, LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
             self._time = now
             if self.difference > tolerance:

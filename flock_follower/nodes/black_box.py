@@ -24,6 +24,7 @@ low priority. A thread of its own writes to the disk within a second, see
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 import os
 import sys
@@ -32,19 +33,19 @@ import time
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from flock_follower.bags.bag import deserialize, serialize
 from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.checks.observations import OURS
-from flock_follower.checks.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, TYPES
+from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.diagnostics import ERROR, Problem
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
+from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory_for_images,
     IMAGES_BUFFER,
@@ -88,9 +89,9 @@ RECORDED: Final = {
     PARAMETER_EVENTS: 'rcl_interfaces/msg/ParameterEvent',
 }
 # All that arrives at 1000 Hz while the disk or the processor is busy for a second.
-QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+QOS = best_effort(1000)
 LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-IMAGE_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+IMAGE_QOS = best_effort(10)
 
 
 class _Subscribed(NamedTuple):
@@ -99,7 +100,7 @@ class _Subscribed(NamedTuple):
     topic: RecordedTopic
     handle: Any
     message_class: Any
-    change: Callable[[bytes], bytes] | None
+    change: Callable[[bytes], bytes]
 
 
 class BlackBox(FlockNode):
@@ -113,35 +114,32 @@ class BlackBox(FlockNode):
         self._limits = Limits(values['disk_used'], values['disk_free'])
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._recording: FlightRecording | None = None
+        # One thread takes, one writes, and the executor's notes: none needs a lock.
         self._notes: dict[str, str] = {}
-        self._taken: list[TakenMessage] = []
+        self._noted: dict[str, str] = {}
+        self._taken: deque[TakenMessage] = deque()
+        self._bytes_taken = self._bytes_written = 0
         self._last: dict[RecordedTopic, int] = {}
-        self._waiting = 0
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
-        self._guard = threading.Lock()
         self._inputs: list[_Subscribed] = []
         for name, msgtype in RECORDED.items():
             self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)
         for camera in cameras(values):
             self._subscribe(camera.camera_info, INFO, QOS)
-            images = camera.images(values['image_transport'])
-            if values['record_images'] == 'none':
-                continue
-            if values['image_transport'] == 'compressed':
-                self._subscribe(images, COMPRESSED, IMAGE_QOS)
-            else:
-                self._subscribe(images, IMAGE, IMAGE_QOS, change=self._compressed,
-                                recorded=f'{images}/{COMPRESSED_IMAGES.rpartition("/")[2]}')
+            if values['record_images'] != 'none':
+                raw = values['image_transport'] == 'raw'
+                self._subscribe(camera.images(values['image_transport']),
+                                IMAGE if raw else COMPRESSED, IMAGE_QOS,
+                                camera.images('compressed'), self._compressed if raw else bytes)
         # rosbags takes tenths of a second for each type the first time: now, not in flight.
         for msgtype in {each.topic.msgtype for each in self._inputs}:
             definition(msgtype)
             type_hash(msgtype)
         for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
             deserialize(serialize(empty(msgtype), msgtype), msgtype)
-        self._flown = FlownParameters(self, OURS, self._note)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
+        self._flown = FlownParameters(self, OURS, self._notes.__setitem__)
+        self.create_timer(ASK_PERIOD, self._flown.ask, clock=STEADY)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
         if shares_memory():
@@ -164,13 +162,13 @@ class BlackBox(FlockNode):
         return 0
 
     def _subscribe(self, name: str, msgtype: str, qos: QoSProfile, recorded: str = '',
-                   change: Callable[[bytes], bytes] | None = None) -> None:
-        """Subscribe; record under another name, and compressed, if they are given."""
+                   change: Callable[[bytes], bytes] = bytes) -> None:
+        """Subscribe; record under another name, and changed to a compressed image, if given."""
         kind = message_class(msgtype)
         handle = self.create_subscription(
             kind, name, lambda _: None, qos, callback_group=Waiting(), raw=True).handle
         topic = RecordedTopic(
-            f'/{(recorded or name).strip("/")}', COMPRESSED if change else msgtype,
+            f'/{(recorded or name).strip("/")}', COMPRESSED if recorded else msgtype,
             qos is LATCHED_QOS, self.resolve_topic_name(name))
         self._inputs.append(_Subscribed(topic, handle, kind, change))
 
@@ -202,26 +200,22 @@ class BlackBox(FlockNode):
         """Take the messages that have arrived."""
         if self._simulated and not self.get_clock().now().nanoseconds:
             return  # without the time they wait
-        taken: list[TakenMessage] = []
         for topic, handle, kind, change in self._inputs:
             while (received := handle.take_message(kind, True)) is not None:
                 data, info = received
                 try:
-                    data = change(data) if change is not None else data
+                    data = change(data)
                 except ValueError as error:
                     self.diagnostics.reject(f'invalid {topic.source}', str(error))
                     continue
                 if topic.name == PARAMETER_EVENTS:
                     self._flown.changed(deserialize(data, topic.msgtype).node)
-                stamp = self._arrival(topic, info['received_timestamp'])
-                taken.append(TakenMessage(topic, stamp, data))
-        with self._guard:
-            for message in taken:
-                if self._waiting + len(message.data) > WAITING_MAX:
+                if self._bytes_taken - self._bytes_written + len(data) > WAITING_MAX:
                     self.diagnostics.reject('disk too slow')
                     continue
-                self._waiting += len(message.data)
-                self._taken.append(message)
+                self._bytes_taken += len(data)
+                self._taken.append(TakenMessage(
+                    topic, self._arrival(topic, info['received_timestamp']), data))
 
     def _arrival(self, topic: RecordedTopic, received: int) -> int:
         """Return the time at which a message arrived, ns of this node's clock."""
@@ -235,10 +229,6 @@ class BlackBox(FlockNode):
             stamp = last  # simulated time comes in steps
         self._last[topic] = stamp
         return stamp
-
-    def _note(self, name: str, text: str) -> None:
-        with self._guard:
-            self._notes[name] = text
 
     def _write_on(self) -> None:
         """Write until the end, and finish the recording."""
@@ -255,18 +245,18 @@ class BlackBox(FlockNode):
 
     def _write(self) -> None:
         """Write the messages taken to the disk."""
-        with self._guard:
-            taken, self._taken, self._waiting = self._taken, [], 0
-            notes, self._notes = self._notes, {}
+        taken = [self._taken.popleft() for _ in range(len(self._taken))]
+        self._bytes_written += sum(len(message.data) for message in taken)
         now = time.monotonic()
         try:
             if now < self._retry:
                 raise OSError(0, self._fault)
             if self._recording is None:
                 self._recording = FlightRecording(self._folder, self._limits, now, time.time())
-            for name in list(notes):
-                self._recording.note(name, notes[name])
-                del notes[name]
+            for name, text in list(self._notes.items()):
+                if self._noted.get(name) != text:
+                    self._recording.note(name, text)
+                    self._noted[name] = text
             self._recording.write(taken, now)
             self._fault = ''
             self.diagnostics.rate('written').tick(now)
@@ -275,8 +265,6 @@ class BlackBox(FlockNode):
             if now >= self._retry:
                 self._fault, self._retry = error.strerror or str(error), now + RETRY_PERIOD
             self.diagnostics.counters['not recorded'] += len(taken)
-            with self._guard:
-                self._notes = {**notes, **self._notes}
         except Exception as error:  # of one batch; the next one may do better
             self.diagnostics.internal_error('on writing', error)
 

@@ -109,14 +109,12 @@ class SharingNode(FlockNode):
 
     def _sender_problem(self, now: float) -> Problem | None:
         """Show the frame of every sender; return which clocks are implausible."""
-        values, odd = self.diagnostics.values, []
-        for key in [key for key in values if key.startswith('frame of ')]:
-            del values[key]
-        for status in self._sharing.status(self._now()):
-            values[f'frame of {status.name}'] = status.why or (
-                f'known to {status.position_std:.3f} m, {status.yaw_std:.3f} rad')
-            if status.slow:
-                odd.append(f'{status.name}: {status.slow}')
+        senders = self._sharing.status(self._now())
+        self.diagnostics.parts['senders'] = {
+            f'frame of {sender.name}': sender.why or (
+                f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
+            for sender in senders}
+        odd = [f'{sender.name}: {sender.slow}' for sender in senders if sender.slow]
         return (WARN, '; '.join(odd)) if odd else None
 
     def _rivals(self, now: float) -> Problem | None:

@@ -47,7 +47,6 @@ from typing import Any
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from sensor_msgs.msg import Range
 from std_msgs.msg import String
@@ -63,7 +62,7 @@ from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.permission import Phase, SecondCommander
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.mavlink.velocity_check import ODOM
@@ -74,8 +73,13 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
-from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
-from flock_follower.nodes.support.diagnostics import internal_error, listed, publishers
+from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.diagnostics import (
+    internal_error,
+    listed,
+    publishers,
+    STEADY,
+)
 from flock_follower.nodes.support.inputs import (
     best_effort,
     EvenClock,
@@ -83,7 +87,6 @@ from flock_follower.nodes.support.inputs import (
     OwnOdometry,
 )
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
-from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
@@ -91,7 +94,6 @@ from flock_follower.parameters.spec import filled
 
 # Not only the newest: a second commanding node would otherwise stay undetected.
 COMMANDS_QOS = best_effort(10)
-PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
 UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
@@ -172,8 +174,6 @@ class MavlinkBridge(FlockNode):
 
     def _connect(self, values: Mapping[str, Any]) -> None:
         """Create the subscriptions, timers and services."""
-        self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
-        self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._sources = CommandSources()
         self._numbered = True
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command,
@@ -182,7 +182,7 @@ class MavlinkBridge(FlockNode):
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
         self.create_timer(1.0 / rate, self._hand_over_odom,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+                          clock=STEADY)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for name, kind in SERVICES.items():
@@ -239,7 +239,8 @@ class MavlinkBridge(FlockNode):
         if self._sources.another(number, now - waited) and self._flying():
             topic = self.resolve_topic_name('command/trajectory')
             who = f'{listed(publishers(self, topic))} on {topic}'
-            self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
+            gate = self._bridge.gate
+            self._stream.submit(lambda: gate.permit(gate.permission.contested(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""

@@ -50,8 +50,10 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
 from flock_follower.nodes.support.parameters import RemoteParameters
@@ -61,7 +63,6 @@ from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import files_in, given, shared, unheeded
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
-from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
@@ -97,16 +98,18 @@ class Observer(Node):
         self._remote: dict[str, RemoteParameters] = {}
         self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
+        self.create_timer(POLL_PERIOD, self._ask_nodes, clock=STEADY)
+        self.create_timer(POLL_PERIOD, self._subscribe, clock=STEADY)
 
     def observe(self) -> Observations:
         """Listen, and return the observations."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         try:
-            self._until(executor, DISCOVERY)
+            self._until(executor, time.monotonic() + DISCOVERY)
             before, self._listening = PROCESSORS.read_text(), True
             began = time.monotonic()
-            self._until(executor, self._seconds)
+            self._until(executor, began + self._seconds)
             self.seen.duration = time.monotonic() - began
             self._listening = False
             idle = idle_share(before, PROCESSORS.read_text())
@@ -129,15 +132,9 @@ class Observer(Node):
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
 
-    def _until(self, executor: SingleThreadedExecutor, seconds: float) -> None:
-        """Spin for some seconds, and search for new topics from time to time."""
-        end, look = time.monotonic() + seconds, 0.0
+    def _until(self, executor: SingleThreadedExecutor, end: float) -> None:
         while rclpy.ok() and (now := time.monotonic()) < end:
-            if now >= look:
-                look = now + POLL_PERIOD
-                self._ask_nodes()
-                self._subscribe()
-            executor.spin_once(timeout_sec=min(POLL_PERIOD, end - now))
+            executor.spin_once(timeout_sec=end - now)
 
     def _ask_nodes(self) -> None:
         """Ask our nodes for their parameters, and relative_pose for its topics."""
@@ -161,22 +158,18 @@ class Observer(Node):
                 self.seen.names[ours] = topic
 
     def _take_values(self, node: str, values: dict[str, Any]) -> None:
+        """Keep the parameters of a node; of several cameras those of the one to observe."""
         if NAMES in values:
-            values = self._of_camera(values)
+            try:
+                camera, values = alone(values, self._camera)
+            except ValueError as error:
+                self._fault = str(error)
+            else:
+                topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}
+                self.seen.names.update({
+                    ours: full_name(topic, self.seen.namespace)
+                    for ours, topic in topics.items() if ours not in self._remaps})
         self.seen.parameters[node] = values
-
-    def _of_camera(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Use the topics of the camera to observe; return its values as those of a single one."""
-        try:
-            camera, values = alone(values, self._camera)
-        except ValueError as error:
-            self._fault = str(error)
-            return values
-        if camera.name:
-            for ours, topic in topics_of_camera(camera.image, camera.camera_info).items():
-                if ours not in self._remaps:
-                    self.seen.names[ours] = full_name(topic, self.seen.namespace)
-        return values
 
     def _nodes(self) -> list[str]:
         return sorted(f'{namespace.rstrip("/")}/{name}'

@@ -15,7 +15,7 @@
 """
 The node of the command ``follow``: keys and reports in, service calls and a live line out.
 
-``flock_follower.flight_steps`` decides which call is due. The node subscribes ``/diagnostics``,
+``nodes.flight_steps`` decides which call is due. The node subscribes ``/diagnostics``,
 ``mavlink_bridge/state``, ``planner/distance`` and ``mavlink/battery``, and calls the services of
 ``planner`` and ``mavlink_bridge``. SIGINT, SIGTERM, SIGHUP and a closed terminal brake and hand
 over: the node handles the signals itself, so that ROS runs until the services have answered.
@@ -42,10 +42,17 @@ from sensor_msgs.msg import BatteryState, Range
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.checks.observations import Observations
-from flock_follower.flight_steps import DISCOVERY, Flight, INTERRUPTED, loopback, Reports, SERVICES
-from flock_follower.live_line import LiveLine
 from flock_follower.nodes.call import patience
+from flock_follower.nodes.flight_steps import (
+    DISCOVERY,
+    Flight,
+    INTERRUPTED,
+    loopback,
+    Reports,
+    SERVICES,
+)
 from flock_follower.nodes.observer import Observer
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS

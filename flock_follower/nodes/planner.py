@@ -288,15 +288,13 @@ class Planner(FlockNode):
         self._given_up = self._loop.memory.given_up
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
-        values = self.diagnostics.values
-        for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
-            del values[key]
-        values.update({'state': decision.state.value, 'reason': decision.reason,
-                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
-                       'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
-                       'guarded_commands': self._guarded, 'limits': decision.limits,
-                       'warnings': '; '.join(decision.warnings),
-                       'edges': ', '.join(decision.edges), 'known': len(decision.known)})
+        values = {'state': decision.state.value, 'reason': decision.reason,
+                  'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
+                  'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
+                  'guarded_commands': self._guarded, 'limits': decision.limits,
+                  'warnings': '; '.join(decision.warnings),
+                  'edges': ', '.join(decision.edges), 'known': len(decision.known)}
+        self.diagnostics.parts['tick'] = values
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
         if self._bridge is not None:

@@ -34,7 +34,6 @@ from typing import Any
 
 from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
@@ -49,7 +48,7 @@ from flock_follower.messages import (
     read_stamp,
 )
 from flock_follower.nodes.support.conversions import make
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
@@ -119,7 +118,7 @@ class RelativePose(FlockNode):
         parameters = self.declare(SPECS, build)
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
-        now, steady = time.monotonic(), Clock(clock_type=ClockType.STEADY_TIME)
+        now = time.monotonic()
         self._processed = now
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
@@ -131,7 +130,7 @@ class RelativePose(FlockNode):
                                     awaited=self._awaited)
         self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
                                       required=False, awaited=self._awaited)
-        self.create_timer(POLL_PERIOD, self.poll_odom, clock=steady)
+        self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
         self._accelerations = self.create_publisher(
@@ -142,7 +141,7 @@ class RelativePose(FlockNode):
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
-            clock=steady)
+            clock=STEADY)
         self._overdue.cancel()
 
     def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:

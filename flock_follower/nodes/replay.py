@@ -41,8 +41,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.bags.schedule import NANOSECONDS, progress, published_names, section, Timeline
-from flock_follower.live_line import LiveLine
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec

@@ -17,7 +17,7 @@ The visualizer node: the flight as markers and transforms for RViz and Foxglove.
 
 Publishes ``visualizer/markers`` (leader, band, command, field of view, guard), and, if tf2_msgs is
 installed, ``odom -> base_link -> camera`` and ``odom -> leader`` on ``/tf``. It works only while a
-viewer subscribes, and no other node waits for it. ``flock_follower.visualization`` has the shapes;
+viewer subscribes, and no other node waits for it. ``nodes.shapes`` has the shapes;
 the band and the cameras are parameters of planner and relative_pose.
 """
 
@@ -33,7 +33,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -53,8 +52,17 @@ from flock_follower.messages import (
     set_stamp,
     set_vector,
 )
+from flock_follower.nodes.shapes import (
+    Band,
+    CameraSight,
+    image_corners,
+    PlannerReport,
+    Shape,
+    shapes,
+    Snapshot,
+)
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
-from flock_follower.nodes.support.diagnostics import publishers
+from flock_follower.nodes.support.diagnostics import publishers, STEADY
 from flock_follower.nodes.support.inputs import (
     BASE,
     best_effort,
@@ -68,15 +76,6 @@ from flock_follower.nodes.support.runtime import FlockNode, run, Waiting
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras, CameraValues
 from flock_follower.parameters.spec import check_values, NAMES, Spec
 from flock_follower.ranges import Range
-from flock_follower.visualization import (
-    Band,
-    CameraSight,
-    image_corners,
-    PlannerReport,
-    Shape,
-    shapes,
-    Snapshot,
-)
 
 MARKERS_TOPIC = 'visualizer/markers'
 TF = '/tf'
@@ -130,8 +129,7 @@ class Visualizer(FlockNode):
         self._static = StaticChild(self)
         self._transforms = TransformBroadcaster(self, self._static, values['odom_tf'])
         self._markers = self.create_publisher(MarkerArray, MARKERS_TOPIC, 1)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=steady)
+        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=STEADY)
 
     def _take_odom(self, message: Odometry) -> None:
         self._own = from_odometry(message)

@@ -289,19 +289,16 @@ class TwistFrame:
     @property
     def describe(self) -> str:
         """Return the result as text."""
+        if self.wanted == AUTO:
+            return {'': 'auto: not known yet, read as REP-105 says (child) where it does not '
+                    'matter, else derived from the positions',
+                    NONE: 'auto: none, the velocity comes from the positions: that of the '
+                    f'messages is off by {self.contradiction:.2f} m/s'}.get(
+                        self.found, f'auto: {self.found}, found by the positions')
         if self.wanted == NONE:
             return 'none: the velocity comes from the positions'
-        if self.wanted != AUTO:
-            doubt = {'': '', self.wanted: ' (the positions agree)'}.get(
-                self.found, f' as configured, but the positions say {self.found}')
-            return self.wanted + doubt
-        if not self.found:
-            return ('auto: not known yet, read as REP-105 says (child) where it does not matter, '
-                    'else derived from the positions')
-        if self.found == NONE:
-            return ('auto: none, the velocity comes from the positions: that of the messages '
-                    f'is off by {self.contradiction:.2f} m/s')
-        return f'auto: {self.found}, found by the positions'
+        return self.wanted + {'': '', self.wanted: ' (the positions agree)'}.get(
+            self.found, f' as configured, but the positions say {self.found}')
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""

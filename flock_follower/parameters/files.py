@@ -71,13 +71,18 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
     :raises ValueError: naming the file, and the parameter, its value and the valid range.
     :raises OSError: if the file cannot be read.
     """
+    document = _read(path)
     try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
         return parse_parameters(document, table)
-    except yaml.YAMLError as error:
-        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    except ValueError as error:  # a UnicodeDecodeError is one
+    except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
+
+
+def _read(path: str | Path) -> Any:
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
 
 
 def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | None:
@@ -190,8 +195,8 @@ def unheeded(path: str | Path, node: str) -> str:
     :raises OSError: if the file cannot be read.
     """
     try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (yaml.YAMLError, UnicodeDecodeError):
+        document = _read(path)
+    except ValueError:
         return ''  # rcl has read it, and reports the fault
     sections = [section for section, _ in _contents('', document)]
     matching = [section for section in sections if _means(section, node)]
@@ -218,12 +223,8 @@ def given(path: str | Path, node: str, exact: bool = False) -> dict[str, Any]:
     :raises ValueError: if it is not valid YAML.
     :raises OSError: if the file cannot be read.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     found: dict[str, Any] = {}
-    for section, parameters in _contents('', document):
+    for section, parameters in _contents('', _read(path)):
         if _means(section, node) and (not exact or _last(section) == _last(node)):
             found.update(_flat('', parameters))
     return found

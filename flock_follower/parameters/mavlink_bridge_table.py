@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from flock_follower.files import resource
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
 from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
@@ -26,7 +27,6 @@ from flock_follower.mavlink.parameter_check import read_recommendations, Recomme
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
 from flock_follower.ranges import Range
-from flock_follower.resources import resource
 
 ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
           'height': Range(-10_000.0, 10_000.0, 'm')}

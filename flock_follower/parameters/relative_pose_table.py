@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from flock_follower.files import resource
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.spec import filled, Spec, specs_of
@@ -27,7 +28,6 @@ from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MOST, MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.ranges import Range
-from flock_follower.resources import resource
 
 SPECS = [
     Spec('neighbors_file', '',

@@ -54,16 +54,20 @@ from flock_follower.planner.limits import (
     COHESION,
     constrained,
     FENCE,
+    limit_command,
+    limit_horizontal,
     LimitedCommand,
     SEPARATION,
 )
 from flock_follower.planner.memory import Loss, Memory
+from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import Neighborhood
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.75  # m: nearer than this the climb gets what backing off leaves
+DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is made up for
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
@@ -166,9 +170,16 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
-    """Return how far it may move out of the way of one that it no longer sees, m."""
+    """
+    Return how far it may move out of the way of one that it no longer sees, m.
+
+    One lost beyond the band has a longer way: the retreat is as much shorter.
+    """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
-    return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
+    distance = lost.free - float(lost.towards @ lost.origin)
+    beyond = max(distance - math.sqrt(params.law.d1), 0.0) if math.isfinite(distance) else 0.0
+    return max(params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond,
+               0.0)
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
@@ -203,17 +214,60 @@ def beside(velocity: Array, offset: Array) -> Array:
     return math.copysign(1.0, float(across @ offset)) * across
 
 
-def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-              neighbors: Neighborhood, view: View, blinded: bool,
+def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, state: State,
+              blinded: bool, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
               params: PlannerParams) -> LimitedCommand:
     """
-    Return the nearest command within all bounds.
+    Return the nearest command within all limits and bounds.
 
-    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
-
+    :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
+    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
+    :param blinded: whether no images are processed.
     :param velocity: own velocity when the command acts (3,), m/s.
     :param neighbors: the neighbors at hand in TRACK, else none.
-    :param blinded: whether no images are processed.
+    """
+    # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
+    lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
+    limits = lowered if state in (State.TRACK, State.COAST) else start
+    more = _lost_to_drag(memory, velocity, params)
+    rising = max(abs(float(me.velocity[2])), abs(climb))
+    command = limit_horizontal(nominal, vertical, velocity, limits[0], limits[1] + more,
+                               params.period, rising)
+    if params.guard and (state is not State.SEARCH or memory.flock):
+        bounds = _bounds(memory, me, velocity, neighbors, view, blinded, params)
+        allowed = constrained(command.acceleration, velocity, bounds, params.a_max,
+                              params.v_max + more, params.period)
+        if start != lowered:
+            clear = constrained(allowed.acceleration, velocity, [
+                each for each in bounds if each.reason in (SEPARATION, FENCE)],
+                params.strongest, params.fastest + more, params.period)
+            allowed = clear if clear.reason else allowed
+        if allowed.reason:
+            command = allowed._replace(reason=', '.join(filter(None, [
+                command.reason, allowed.reason])))
+    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
+    if SEPARATION in command.reason or FENCE in command.reason:
+        limits = start
+    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
+                          command.separation_axis)
+    reason = command.reason if final.reason in command.reason else ', '.join(
+        filter(None, [final.reason, command.reason]))
+    return command._replace(acceleration=final.acceleration, reason=reason)
+
+
+def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> float:
+    """Return the speed, m/s, by which the one predicted is too high, because of drag."""
+    speed = math.hypot(*velocity.tolist())
+    slower = params.response_time * float(memory.drag @ velocity) / speed if speed > 0.0 else 0.0
+    return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
+
+
+def _bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
+            blinded: bool, params: PlannerParams) -> list[Bound]:
+    """
+    Return all bounds in their order.
+
+    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
     """
     near = list[Bound]()
     for name, n in memory.ranged.items():
@@ -223,20 +277,8 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (blinded and not n.received)):
             near += _neighbor_bounds(n, memory, me, velocity, neighbors, here, params)
-    bounds = ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
-                     _sight_bounds(memory, me, velocity, neighbors, view, params))
-    allowed = constrained(command.acceleration, velocity, bounds, params.a_max, params.v_max,
-                          params.period)
-    if (params.strongest, params.fastest) != (params.a_max, params.v_max):
-        # Limits lowered in flight bind the nominal command, and nothing that keeps clear.
-        clear = constrained(allowed.acceleration, velocity, [
-            each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
-            params.fastest, params.period)
-        allowed = clear if clear.reason else allowed
-    if not allowed.reason:
-        return command
-    reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
-    return LimitedCommand(allowed.acceleration, reasons, allowed.separation_axis)
+    return ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
+                   _sight_bounds(memory, me, velocity, neighbors, view, params))
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
@@ -278,12 +320,10 @@ def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
     """Return what to expect of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
-    if not n.received:  # errors of own sightings are part of the guard's margin
-        return expected(n, memory.motions[n.name].acceleration, age, params)
-    it = expected(n, np.zeros(3), age, params)  # an acceleration from late messages is outdated
+    it = expected(n, memory.acceleration(n), age, params)
     offset = it.position - me.position
     distance = math.hypot(*offset.tolist())
-    if distance == 0.0:
+    if not n.received or distance == 0.0:  # errors of own sightings are part of the margin
         return it
     along = offset / distance
     variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along

@@ -83,6 +83,7 @@ def observed(motions: Mapping[str, SmoothedMotion],
     return updated
 
 
+DRAG_TIME = 1.0  # s over which drag is observed
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
 NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
 
@@ -156,6 +157,8 @@ class Memory(NamedTuple):
     """Acceleration last commanded, m/s^2; None if the last step commanded nothing."""
     pending: Array = np.zeros(3)
     """Velocity that has been commanded and not yet been flown (3,), m/s."""
+    drag: Array = np.zeros(3)
+    """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
     params: PlannerParams | None = None
     """Parameters with which the law was followed in the last step; None if it was not."""
     fading: tuple[Array, float] | None = None
@@ -171,6 +174,11 @@ class Memory(NamedTuple):
     """See ``relative.Disturbance``."""
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
+
+    def acceleration(self, n: Neighbor) -> Array:
+        """Return a neighbor's acceleration (3,), m/s^2; of a received one it is outdated: zero."""
+        motion = self.motions.get(n.name)
+        return np.zeros(3) if n.received or motion is None else motion.acceleration
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""
@@ -208,6 +216,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 jumped = own.stamp
                 memory = memory._replace(neighbors={}, flock={}, ranged={}, met={}, altitude=None,
                                          home=None, lost=None)
+            if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
+                memory = memory._replace(drag=_drag(memory, me, own, params))
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
@@ -237,6 +247,13 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
               if name not in kept or n.stamp > kept[name].stamp}
     return memory._replace(now=now, own=me, neighbors=kept, ranged=ranged,
                            jumped=jumped), tuple(rejected)
+
+
+def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams) -> Array:
+    """Return what the velocity lacks of the acceleration flown (3,), m/s^2, smoothed."""
+    elapsed = own.stamp - before.stamp
+    lacking = memory.pending / params.response_time - (own.velocity - before.velocity) / elapsed
+    return memory.drag + min(elapsed / DRAG_TIME, 1.0) * (lacking - memory.drag)
 
 
 def longest(n: Neighbor, params: PlannerParams) -> float:

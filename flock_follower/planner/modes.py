@@ -48,11 +48,6 @@ Its text is a state and, after a colon, the reason::
 
 The bridge sends it at each change, and at 2 Hz: otherwise ``ACTIVE`` of a dead bridge would stay
 on the latched topic. Nothing here reads a clock.
-
-Stamps and ages are corrected if the system clock is set, for example by NTP.
-
-A message's stamp is of the system clock, which may jump; the monotonic clock never does. The
-caller reads both clocks at the same time and passes both times.
 """
 
 from __future__ import annotations
@@ -62,7 +57,6 @@ import math
 import re
 from typing import NamedTuple
 
-from flock_follower.messages import NANOSECONDS, stamp_age
 from flock_follower.planner.inputs import overdue, OwnState, untimely
 from flock_follower.planner.params import PlannerParams
 
@@ -92,27 +86,24 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the faced neighbour is occluded.
     """
-    if not engaged:
-        return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
     lost = State.SEARCH if followed is None else State.HOLD
-    if given_up:
-        return State.IDLE if waiting else lost, (
-            f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
-            f'call planner/engage to follow again{f" ({fault})" if fault else ""}')
-    if waiting:
-        return State.IDLE, f'engaged, waiting for {waiting}'
-    if fault:
-        return lost, fault
-    if youngest is not None and youngest <= params.predict_timeout:
-        return State.TRACK, ''
-    if received is not None and received <= params.heard_timeout:
-        return State.TRACK, 'no neighbor in sight: follows received states'
-    if followed is None:
-        return State.SEARCH, 'no neighbor seen since engaging'
-    if occluded:
-        return State.HOLD, f'neighbor occluded, seen {followed:.1f} s ago'
-    reason = f'no neighbor seen for {followed:.1f} s'
-    return State.COAST if followed <= params.coast_timeout else State.HOLD, reason
+    unseen = 0.0 if followed is None else followed
+    in_sight = youngest is not None and youngest <= params.predict_timeout
+    heard = received is not None and received <= params.heard_timeout
+    rules = (  # the first that applies counts
+        (not engaged, State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'),
+        (given_up, State.IDLE if waiting else lost,
+         f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
+         f'call planner/engage to follow again{f" ({fault})" if fault else ""}'),
+        (bool(waiting), State.IDLE, f'engaged, waiting for {waiting}'),
+        (bool(fault), lost, fault),
+        (in_sight, State.TRACK, ''),
+        (heard, State.TRACK, 'no neighbor in sight: follows received states'),
+        (followed is None, State.SEARCH, 'no neighbor seen since engaging'),
+        (occluded, State.HOLD, f'neighbor occluded, seen {unseen:.1f} s ago'),
+        (unseen <= params.coast_timeout, State.COAST, f'no neighbor seen for {unseen:.1f} s'),
+        (True, State.HOLD, f'no neighbor seen for {unseen:.1f} s'))
+    return next((state, reason) for applies, state, reason in rules if applies)
 
 
 def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> str:
@@ -182,63 +173,3 @@ def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     if not age <= SILENCE:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
     return reported
-
-
-#: A smaller change, s, is slewing or a late reading, and followed as it is.
-LEAST_STEP = 0.1
-#: For so long after a step messages come that were stamped before it, s.
-ON_THE_WAY = 2.0
-BEFORE_STEP = 'stamped before the system clock was set'
-
-
-class ClockWatch:
-    """
-    Finds steps of the system clock, and messages that were stamped before the last one.
-
-    ``shift`` is the sum of all steps of the clock, ns: a stamp minus the shift is the time of a
-    clock without steps.
-    """
-
-    def __init__(self) -> None:
-        self.shift = 0
-        self._offset: int | None = None  # of the system clock from the monotonic one, ns
-        self._monotonic = -math.inf
-        self._stepped = -math.inf  # when the last step was found, by the monotonic clock, s
-        self._first = 0  # ns: the least stamp there can be since
-
-    def take(self, system: int, monotonic: float) -> float:
-        """
-        Take both clocks, read at the same time; return the step found, s, 0.0 if there was none.
-
-        :param system: system clock, ns; :param monotonic: monotonic clock, s.
-        """
-        before, self._offset = self._offset, system - round(monotonic * NANOSECONDS)
-        last, self._monotonic = self._monotonic, monotonic
-        step = 0 if before is None else self._offset - before
-        if abs(step) <= LEAST_STEP * NANOSECONDS:
-            return 0.0
-        self.shift += step
-        self._stepped, self._first = monotonic, system - round((monotonic - last) * NANOSECONDS)
-        return step / NANOSECONDS
-
-    def before_step(self, stamp: int) -> bool:
-        """Return whether a stamp, ns, was made before the last step; 0 is no stamp."""
-        if stamp <= 0 or self._offset is None or self._monotonic - self._stepped > ON_THE_WAY:
-            return False
-        now = self._offset + (self._monotonic + LEAST_STEP) * NANOSECONDS
-        return not self._first <= stamp <= now
-
-    def age(self, stamp: int, received: float, system: int, monotonic: float) -> float | None:
-        """
-        Return the age of a message, s: the larger of its stamp's and its reception's.
-
-        None if it was stamped before the last step, when its age is not known.
-
-        :param stamp: of the message, ns; 0: it has none.
-        :param received: when it was received, by the monotonic clock, s.
-        :param system: system clock, ns, and :param monotonic: monotonic clock, s: now.
-        """
-        self.take(system, monotonic)
-        if self.before_step(stamp):
-            return None
-        return max(stamp_age(stamp, system), monotonic - received)

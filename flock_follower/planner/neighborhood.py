@@ -41,8 +41,9 @@ from flock_follower.flock.neighbor_graph import graph_law, HELD
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
-from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.limits import brake, limit_norm
 from flock_follower.planner.memory import Memory, SmoothedMotion
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
 GAP_MIN = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
@@ -160,24 +161,22 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
     """
     Return the last estimate of the leader to look for, up to ``resume_timeout`` after it.
 
-    The search begins within ``coast_timeout``, if all other neighbors are only received: a vehicle
-    that has another one in view stays with that. The search ends when a leader is at hand again.
+    The search begins if no neighbor is in view: a vehicle that has another one in view stays with
+    that. The search ends when a leader is at hand again.
     """
     last = memory.leader
     if last is None or any(n.member.role == LEADER for n in neighbors.flock):
         return None
-    age = me.stamp - last.stamp
-    begins = age <= params.coast_timeout and all(n.received for n in neighbors.flock)
-    return last if (memory.looking or begins) and age <= params.resume_timeout else None
+    begins = all(n.received for n in neighbors.flock)
+    return last if (memory.looking or begins) and (
+        me.stamp - last.stamp <= params.resume_timeout) else None
 
 
 def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
-    """Return the newest estimate of a leader that it has seen and faced."""
-    faced, last = neighbors.faced, memory.leader
-    if faced is not None and not faced.received and faced.member.role == LEADER:
-        return faced
-    return next((n for n in neighbors.flock if last is not None and n.name == last.name
-                 and n.member.role == LEADER), last)
+    """Return the newest estimate of a leader, first of the faced one, then of the last one."""
+    names = [each.name for each in (neighbors.faced, memory.leader) if each]
+    return min((n for n in neighbors.flock if n.member.role == LEADER), default=memory.leader,
+               key=lambda n: names.index(n.name) if n.name in names else len(names))
 
 
 def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
@@ -197,9 +196,19 @@ def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
             ] if missing else []
 
 
-def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
-            params: PlannerParams) -> tuple[Array, tuple[Array, float] | None]:
-    """Return the command of the law (3,), m/s^2, or of the fade-in to it, and the fade-in."""
+def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
+            neighbors: Neighborhood, params: PlannerParams
+            ) -> tuple[Array, tuple[Array, float] | None]:
+    """
+    Return the acceleration (3,), m/s^2, without limits, and the fade-in to that of the law.
+
+    In TRACK it is that of the law, or of the fade-in; in COAST zero; else it brakes.
+
+    :param velocity: own velocity when the command acts (3,), m/s.
+    """
+    if state is not State.TRACK:
+        return (np.zeros(3) if state is State.COAST else brake(
+            velocity, params.strongest, params.brake_time_constant)), None
     flock = neighbors.flock
     offsets = np.array([_offset(n, me, params) for n in flock])
     differences = np.array([n.velocity - me.velocity for n in flock])

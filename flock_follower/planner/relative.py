@@ -40,7 +40,7 @@ from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, unti
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import AVOID, PlannerParams
-from flock_follower.planner.vertical_yaw import Altitude, facing, turning
+from flock_follower.planner.vertical_yaw import Altitude, facing, THRUST_BIAS_MAX, turning
 
 #: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
 #: leaves the rest of ``RELATIVE_MAX`` to the distance.
@@ -57,6 +57,9 @@ TIME = 0.6
 #: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
 #: PX4's tilt was seen to err by 1 m/s^2 for 10 s.
 BANDWIDTH, OFFSET_MAX = 0.8, 0.8
+#: So far beyond the band, m, an error of the tilt is larger than the acceleration that may offset
+#: it: the follower runs away, and commands nothing more.
+FARTHEST = 1.0
 #: Deviation of the gap to another neighbor that closes it no faster than this, s.
 CLOSING = 2.0
 
@@ -65,24 +68,25 @@ class Disturbance(NamedTuple):
     """Relative acceleration that is not commanded: by an error of the tilt, or the leader's."""
 
     velocity: Array | None = None
-    """Relative velocity, estimated (2,), m/s."""
-    response: Array = np.zeros(2)
-    """Acceleration commanded, as far as it is flown (2,), m/s^2."""
-    acceleration: Array = np.zeros(2)
-    """(2,), m/s^2."""
+    """Relative velocity, estimated (3,), m/s."""
+    response: Array = np.zeros(3)
+    """Acceleration commanded, as far as it is flown (3,), m/s^2."""
+    acceleration: Array = np.zeros(3)
+    """(3,), m/s^2."""
 
     def observed(self, velocity: Array, command: Array | None, elapsed: float,
                  response_time: float) -> Disturbance:
-        """Return it after a relative velocity (2,), m/s, was measured: a Luenberger observer."""
+        """Return it after a relative velocity (3,), m/s, was measured: a Luenberger observer."""
         if self.velocity is None or command is None:
             return self._replace(velocity=velocity)
-        response = self.response + (command[:2] - self.response) * -math.expm1(
+        response = self.response + (command - self.response) * -math.expm1(
             -elapsed / response_time)
         error = velocity - self.velocity
+        estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
+        up = min(max(float(estimate[2]), -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
         return Disturbance(
             self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
-            response,
-            limit_norm(self.acceleration + elapsed * BANDWIDTH ** 2 * error, OFFSET_MAX))
+            response, np.array([*limit_norm(estimate[:2], OFFSET_MAX), up]))
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
@@ -101,25 +105,29 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     if leader is None:
         return 'no odometry, and no neighbor in sight'
     me, there = at(own, now), at(leader, now)
+    gap, _ = _gap(there.position, me, leader, params)
+    if gap > math.sqrt(params.law.d1) + FARTHEST:
+        return f'no odometry, and {leader.name} is {gap:.1f} m away'
     altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
         lowest=-math.inf, highest=math.inf)
     rising = me.velocity
     if params.altitude_mode == 'follow':
         altitude = altitude._replace(held=float(there.position[2]) + params.altitude_offset)
         rising = me.velocity - [0.0, 0.0, there.velocity[2]]
-    altitude, vertical = altitude._replace(climb=0.0).controlled(
+    before = memory.disturbance or Disturbance(
+        acceleration=np.array([0.0, 0.0, -altitude.thrust_bias]))
+    disturbance = before.observed(
+        me.velocity - there.velocity, memory.command, elapsed, params.response_time)
+    bias = -disturbance.acceleration
+    up = float(bias[2])
+    altitude, vertical = altitude._replace(climb=0.0, thrust_bias=up).controlled(
         me._replace(velocity=rising), params, elapsed)
     others = [n for n in seen.values() if n is not leader]
-    disturbance = (memory.disturbance or Disturbance()).observed(
-        (me.velocity - there.velocity)[:2], memory.command, elapsed, params.response_time)
-    command = limited(
-        level(me, memory.pending, leader, others, params) - disturbance.acceleration, min(
-            max(vertical, altitude.thrust_bias - CLIMB_MAX), altitude.thrust_bias + CLIMB_MAX),
-        memory.command)
+    command = limited(level(me, memory.pending, leader, others, params) + bias[:2],
+                      min(max(vertical - up, -CLIMB_MAX), CLIMB_MAX), up, memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
-    bias = np.array([*-disturbance.acceleration, altitude.thrust_bias])
     return memory._replace(
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
         disturbance=disturbance,
@@ -162,15 +170,18 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     return distance - params.radius - n.member.radius, towards
 
 
-def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
+def limited(horizontal: Array, vertical: float, thrust_bias: float, last: Array | None) -> Array:
     """
     Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
 
+    :param thrust_bias: upward acceleration, m/s^2, that offsets an error of the thrust: it is
+        added beyond the limit, because it moves nothing.
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
     up = min(max(vertical, -RELATIVE_MAX), RELATIVE_MAX)
     flat = limit_norm(horizontal, math.sqrt(RELATIVE_MAX ** 2 - up * up))
-    return without_step(np.array([*flat, up]), last)
+    return without_step(np.array([*flat, up + thrust_bias]),
+                        np.array([0.0, 0.0, thrust_bias]) if last is None else last)
 
 
 def without_step(acceleration: Array, last: Array | None) -> Array:

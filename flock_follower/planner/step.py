@@ -44,15 +44,7 @@ from flock_follower.planner.inputs import (
     too_slow,
     TRUSTED_TIME,
 )
-from flock_follower.planner.limits import (
-    brake,
-    FENCE,
-    limit_command,
-    limit_horizontal,
-    LimitedCommand,
-    REASONS,
-    SEPARATION,
-)
+from flock_follower.planner.limits import REASONS, SEPARATION
 from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, observed, off
 from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.neighborhood import (
@@ -163,12 +155,20 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         lost=_loss(memory, flock, me, tracking, leader, params),
         home=me.position if memory.home is None else memory.home)
-    altitude, vertical = _altitude(memory, mode, me, neighbors, ground, coming, params, elapsed)
+    missed = leader or max((n for n in memory.flock.values() if n.member.role != AVOID and (
+        neighbors.faced is None)), key=lambda n: n.stamp, default=None)
+    altitude, vertical = _altitude(memory, mode, me, neighbors, missed, ground, coming, params,
+                                   elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
-    command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
-                               me.velocity + coming - bias * params.period * UP, params)
+    velocity = me.velocity + coming - bias * params.period * UP
+    wanted, fading = nominal(memory, mode.state, me, velocity, neighbors, params)
+    command = constrain(wanted, vertical, altitude.climb, memory, mode.state, mode.blinded, me,
+                        velocity, neighbors, view, params)
+    if me.stamp - memory.switched < relative.SETTLING:
+        command = command._replace(
+            acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, leader, params, elapsed)
+    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, missed, params, elapsed)
     stamp = mode.newest if tracking else (
         memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
     left = math.exp(-elapsed / params.response_time)
@@ -197,7 +197,8 @@ def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, 
     memory, leader, yaw, yaw_rate = flown
     return memory, Decision(
         State.RELATIVE, 'no odometry: flies by the marker alone', memory.command, yaw, yaw_rate,
-        stamp=leader.stamp, rejected=rejected, known=(leader,))
+        stamp=leader.stamp, rejected=rejected,
+        thrust_bias=-float(memory.disturbance.acceleration[2]), known=(leader,))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -263,16 +264,16 @@ def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
     return flock
 
 
-def _awaited(leader: Neighbor, now: float, params: PlannerParams) -> Neighbor:
-    """Return the leader to look for, predicted by at most ``coast_timeout``."""
-    return at(leader, leader.stamp + min(now - leader.stamp, params.coast_timeout))
+def _awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
+    """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
+    age = min(now - n.stamp, params.coast_timeout)
+    it = expected(n, memory.acceleration(n), age, params)
+    return n._replace(stamp=n.stamp + age, position=it.position, velocity=it.velocity)
 
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
           leader: Neighbor | None, params: PlannerParams) -> Loss | None:
     """Return the loss of the neighbor that it followed or looks for."""
-    if leader and me.stamp - leader.stamp <= params.coast_timeout:
-        leader = None  # until then it is kept clear of on all sides, as any other
     if (tracking and leader is None) or memory.followed is None:
         return None
     if memory.lost is not None:
@@ -284,29 +285,36 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
     if not near:
         return Loss(towards, me.position)
     n = min(near, key=lambda n: math.dist(n.position, me.position))
-    there = _awaited(leader, me.stamp, params) if leader else at(n, me.stamp)
+    there = _awaited(n, memory, me.stamp, params)
     x, y, _ = there.position - me.position
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    motion = memory.motions.get(n.name)
-    a = np.zeros(3) if n.received or motion is None else motion.acceleration
-    soon = expected(n, a, TRUSTED_TIME, params)
+    soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
     approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
     return Loss(towards, me.position, float(towards @ n.position), approach,
                 float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
 
 
 def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
-              ground: float | None, coming: Array, params: PlannerParams,
-              elapsed: float) -> tuple[Altitude, float]:
-    """Return the altitude to hold, and the vertical acceleration, m/s^2."""
+              missed: Neighbor | None, ground: float | None, coming: Array,
+              params: PlannerParams, elapsed: float) -> tuple[Altitude, float]:
+    """
+    Return the altitude to hold, and the vertical acceleration, m/s^2.
+
+    :param missed: the neighbor to look for; its height is followed as far as it is predicted.
+    """
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     follows = params.altitude_mode == 'follow'
+    level = neighbors.level
+    if level is None and missed is not None:
+        level = _awaited(missed, memory, me.stamp, params)
+        if level.stamp < me.stamp:
+            level = level._replace(velocity=np.zeros(3), acceleration=None)
     altitude = altitude.meeting(neighbors.peers, params, elapsed) if (
         follows and neighbors.peers) else altitude.following(
-        neighbors.level if follows else None, params, elapsed)
+        level if follows else None, params, elapsed)
     if not params.guard:
         return altitude.controlled(me, params, elapsed, coming=float(coming[2]))
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
@@ -321,60 +329,21 @@ def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood
     return controlled._replace(held=altitude.held), vertical
 
 
-def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood, view: View,
-             vertical: float, climb: float, velocity: Array, params: PlannerParams
-             ) -> tuple[LimitedCommand, tuple[Array, float] | None]:
-    """
-    Return the nominal acceleration within all limits and bounds, and its fading.
-
-    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param velocity: own velocity when the command acts (3,), m/s.
-    """
-    unlimited: Array = np.zeros(3)
-    fading = None
-    # Limits lowered in flight do not bind braking and keeping clear.
-    strongest = params.strongest, params.fastest
-    limits = params.a_max, params.v_max
-    if mode.state is State.TRACK:
-        unlimited, fading = nominal(memory, me, neighbors, params)
-    elif mode.state is not State.COAST:
-        limits = strongest
-        unlimited = brake(velocity, params.strongest, params.brake_time_constant)
-    rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(unlimited, vertical, velocity, *limits, params.period, rising)
-    if params.guard and (mode.state is not State.SEARCH or memory.flock):
-        command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
-    # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
-    if SEPARATION in command.reason or FENCE in command.reason:
-        limits = strongest
-    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
-                          command.separation_axis)
-    reason = command.reason if final.reason in command.reason else ', '.join(
-        filter(None, [final.reason, command.reason]))
-    a = final.acceleration
-    if me.stamp - memory.switched < relative.SETTLING:
-        a = relative.without_step(a, memory.command)
-    return command._replace(acceleration=a, reason=reason), fading
-
-
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
-         leader: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
+         missed: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw to command."""
     if params.yaw_mode != 'leader':
         return last
-    if leader is None and faced is not None:
+    if missed is not None:
+        since = me.stamp - missed.stamp - params.coast_timeout
+        there = _awaited(missed, memory, me.stamp, params)
+        return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
+            last, me, there, since, params, elapsed)
+    if faced is not None:
         return facing(last, me, faced, params, elapsed)
-    if leader is None and state is State.SEARCH:
-        # It looks round, anticlockwise.
+    if state is State.SEARCH:  # it looks round, anticlockwise
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
-    n = leader or max((n for n in memory.flock.values() if n.member.role != AVOID),
-                      key=lambda n: n.stamp, default=None)
-    if n is None:
-        return last
-    since = me.stamp - n.stamp - params.coast_timeout
-    there = _awaited(n, me.stamp, params)
-    return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
-        last, me, there, since, params, elapsed)
+    return last
 
 
 def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,

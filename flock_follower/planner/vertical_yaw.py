@@ -153,9 +153,11 @@ class Altitude(NamedTuple):
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
+        if clear != speed:  # then only the speed can show that the thrust is wrong
+            error = 2.0 * (clear - rate) / w
         nominal, within = (2.0 * w * (each - rate)
-                          for each in (speed, min(max(clear, -down), up)))
-        vertical = min(max(within, -strongest), strongest)
+                          for each in (clear, min(max(clear, -down), up)))
+        vertical = acceptable = min(max(within, -strongest), strongest)
         # An overshoot of the climb would be taken from backing off, which shares v_max with it.
         if most < math.inf:
             high = min(max(most, -down), up) - rate - coming
@@ -167,10 +169,10 @@ class Altitude(NamedTuple):
         below, above = self.lowest - z, z - self.highest
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
             BEYOND < above < FAR_BEYOND and rate > -RETURNING)
-        share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
+        share = INTEGRAL_SHARE_BEYOND if pressed or clear != speed else INTEGRAL_SHARE
         bias = self.thrust_bias + share * w ** 3 * error * elapsed
         # Anti-windup: a limited acceleration does not increase the integral.
-        if (vertical - nominal) * (bias - self.thrust_bias) < 0.0 and (
+        if (acceptable - nominal) * (bias - self.thrust_bias) < 0.0 and (
                 abs(bias) > abs(self.thrust_bias)):
             bias = self.thrust_bias
         bias = min(max(bias, -THRUST_BIAS_MAX), THRUST_BIAS_MAX)

@@ -52,6 +52,14 @@ def second(number: int, size: int = 40) -> list[TakenMessage]:
             for k in range(10)]
 
 
+def fill(box: FlightRecording, begin: float, *numbers: int, size: int = 40) -> Path:
+    """Write the messages of some seconds, the first at a time, s; return the recording."""
+    for number in numbers:
+        box.write(second(number, size), begin + number - numbers[0])
+    assert box.path is not None
+    return box.path
+
+
 def made(folder: Path, limits: Limits = LIMITS, now: float = 0.0) -> FlightRecording:
     return FlightRecording(folder, limits, now, clock=START / NANOSECONDS)
 
@@ -150,8 +158,7 @@ def test_an_old_file_that_may_not_be_deleted_stops_nothing(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = Limits(file_size=0.001, disk_used=0.002, disk_free=1.0, kept=0.0)
     box = made(tmp_path, small)
-    for number in range(4):
-        box.write(second(number, 200), float(number))
+    fill(box, 0.0, *range(4), size=200)
     box.close()
     old, delete = set(tmp_path.rglob('*.mcap')), Path.unlink
 
@@ -161,8 +168,7 @@ def test_an_old_file_that_may_not_be_deleted_stops_nothing(
         delete(path)
     monkeypatch.setattr(Path, 'unlink', refused)
     box = made(tmp_path, small, 100.0)
-    for number in range(100, 120, 6):
-        box.write(second(number), float(number))
+    fill(box, 100.0, *range(100, 120, 6))
     box.close()
     assert len(numbers(max(tmp_path.iterdir()))) > 0
 
@@ -170,10 +176,7 @@ def test_an_old_file_that_may_not_be_deleted_stops_nothing(
 def test_files_turn_over_and_each_has_what_is_latched(tmp_path: Path) -> None:
     box = made(tmp_path)
     box.write([TakenMessage(STATE, START, word(7))], 0.0)
-    for number in range(3):
-        box.write(second(2 * number, 60_000), 2.0 * number)
-        box.write(second(2 * number + 1, 60_000), 2.0 * number + 1.0)
-    path = place(box)
+    path = fill(box, 0.0, *range(6), size=60_000)
     box.close()
     files = sorted(path.glob('*.mcap'))
     assert len(files) == 3
@@ -189,9 +192,7 @@ def test_the_oldest_files_make_way_but_none_of_the_last_minutes(tmp_path: Path) 
     kill(earlier := made(tmp_path))
     earlier.write(second(0, 60_000), 0.0)
     box = made(tmp_path, now=1000.0)
-    for number in range(40):  # 0.6 MB each; a file has two of them
-        box.write(second(number, 60_000), 1000.0 + number)
-    path = place(box)
+    path = fill(box, 1000.0, *range(40), size=60_000)  # 0.6 MB each; a file has two of them
     box.close()
     assert [p.name[:4] for p in sorted(tmp_path.iterdir())] == ['0002']
     kept = sorted({n // 10 for n in numbers(path)})
@@ -200,10 +201,9 @@ def test_the_oldest_files_make_way_but_none_of_the_last_minutes(tmp_path: Path) 
     assert 8e6 < size < 14e6  # looked at every 5 s
     # What is not older than 10 s stays, however little is allowed.
     box = made(tmp_path / 'other', Limits(10.0, 10.0, 1.0, 1e6))
-    for number in range(40):
-        box.write(second(number, 60_000), number)
+    path = fill(box, 0.0, *range(40), size=60_000)
     box.close()
-    assert len(numbers(next((tmp_path / 'other').iterdir()))) == 400
+    assert len(numbers(path)) == 400
 
 
 def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
@@ -216,9 +216,7 @@ def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
 
     monkeypatch.setattr(recording, '_free', free)
     box = made(tmp_path, Limits(1000.0, 10.0, 1.0, 1e6))
-    for number in range(40):
-        box.write(second(number, 60_000), number)
-    path = place(box)
+    path = fill(box, 0.0, *range(40), size=60_000)
     kept = numbers(path)
     assert kept == list(range(kept[0], 400)) and 60 < len(kept) < 170
     used_by_others = 15e6  # nothing that could be deleted would help
@@ -250,9 +248,7 @@ def test_a_full_disk_keeps_what_was_written_and_recording_goes_on_when_there_is_
 
 def test_what_was_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
     box = made(tmp_path)
-    box.write(second(0), 0.0)
-    box.write(second(1), 0.5)
-    path = place(box)
+    path = fill(box, 0.0, 0, 1)
     file = next(path.glob('*.mcap'))
     whole = file.read_bytes()
     with file.open('ab') as torn:
@@ -268,9 +264,7 @@ def test_what_was_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
 
 def test_a_damaged_file_is_left_out_but_not_deleted(tmp_path: Path) -> None:
     box = made(tmp_path)
-    for number in range(6):
-        box.write(second(number, 60_000), number)
-    path = place(box)
+    path = fill(box, 0.0, *range(6), size=60_000)
     kill(box)
     first, second_file = sorted(path.glob('*.mcap'))[:2]
     damaged = bytearray(first.read_bytes())

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
+from flock_desk.scenarios.scenario import LeaderMotion, Leg
 from flock_desk.scenarios.scenario_file import load
 
 pytestmark = pytest.mark.slow

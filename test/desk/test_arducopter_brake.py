@@ -44,10 +44,3 @@ def test_brake_is_refused_without_a_position():
     assert flight.mode('BRAKE') == [mavlink.MAV_RESULT_FAILED]
     assert flight.texts()[-1] == 'Mode change to BRAKE failed: requires position'
     assert flight.mode('LAND') == [0]
-
-
-def test_brake_does_not_arm():
-    flight = Flight('arducopter', start='landed')
-    assert flight.mode('BRAKE') == [0]  # disarmed any mode may be chosen
-    assert flight.arm() == [mavlink.MAV_RESULT_FAILED]
-    assert flight.texts() == ['Arm: BRAKE mode not armable']

@@ -14,14 +14,12 @@
 
 """What the embedded autopilots learnt from the real ones, see docs/autopilots.md."""
 
-from captured import decoded
 from embedded_flight import BLIND, Flight, seen, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk import autopilot
-from flock_follower.mavlink.status_texts import ArmingChecks
 
 pytestmark = pytest.mark.slow
 ORIGIN = mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488000)
@@ -76,36 +74,6 @@ def test_px4_without_a_position_falls_back_until_something_can_be_flown():
     assert flight.controller.mode == 'AUTO.LAND'
 
 
-def events(messages):
-    """Return the checks that fail, as EVENTs tell them: number and arguments."""
-    return [(m.number, bytes(m.arguments)) for m in messages
-            if m.get_type() == 'EVENT' and m.log_levels & 0xF != 8]
-
-
-def test_px4_reports_failed_checks_by_the_events_of_the_real_one():
-    flight = Flight(start='landed', ready_after=60.0)
-    flight.fly(1.0)
-    real = events(m for t, m in decoded('px4_refusals') if 2.0 < t < 3.0)
-    ours = events(flight.messages)
-    # Neither a mission nor a ground station is looked for.
-    assert len(ours) == 4 and [event for event in real if event in ours] == ours
-
-
-def test_px4_reports_on_a_change_and_when_it_is_asked_to():
-    flight = Flight()
-    flight.fly(5.0)
-    checks = ArmingChecks()
-    assert flight.kinds().count('EVENT') == 4
-    flight.fly(0.5, setpoint())
-    assert flight.kinds().count('EVENT') == 7  # there is a stream: one less
-    assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [0]
-    assert flight.kinds().count('EVENT') == 10
-    for message in flight.messages:
-        if message.get_type() == 'EVENT':
-            checks.take(message)
-    assert checks.against('OFFBOARD') == []
-
-
 @pytest.mark.parametrize(('armed', 'result', 'said'), [
     (False, 0, ['PreArm: Compass not calibrated']), (True, 1, [])])
 def test_arducopter_says_what_its_checks_find(armed, result, said):
@@ -148,8 +116,8 @@ def test_the_recommended_parameters_can_be_set_from_their_file(personality, name
     file = 'config/px4.params' if personality == 'px4' else 'config/ardupilot.parm'
     options = autopilot.parser().parse_args([
         '--personality', personality, '--param-file', file, '--param', f'{name}=0.25'])
-    assert autopilot._parameters(options)[name] == 0.25
+    assert autopilot.settings(options)['parameters'][name] == 0.25
     options.param = []
-    parameters = autopilot._parameters(options)
+    parameters = autopilot.settings(options)['parameters']
     assert parameters[name] == value and 'EKF2_GPS_CTRL' not in parameters
     Flight(personality, parameters=parameters)

@@ -38,16 +38,6 @@ def test_the_pilot_climbs_so_long_after_the_first_setpoint(personality, mode):
     assert flight.vehicle.position[2] == pytest.approx(3.5, abs=0.05)
 
 
-def test_a_refused_command_is_refused_with_its_reason_and_later_not():
-    flight = Flight(start='landed', faults=[
-        Fault('refuse', 1.0, 1.0, command='COMPONENT_ARM_DISARM', reason='Not today')])
-    flight.fly(1.1)
-    assert flight.arm() == [2] and flight.texts() == ['Not today']
-    assert not flight.controller.armed
-    flight.fly(1.0)
-    assert flight.arm() == [0]
-
-
 @pytest.mark.parametrize(('personality', 'mode'), [
     ('px4', 'AUTO.LOITER'), ('arducopter', 'STABILIZE')])
 def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality, mode):
@@ -75,6 +65,10 @@ def test_a_reboot_in_the_air_brings_it_down():
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['--connect', '0.0.0.0:14540'], 'must be a loopback address'),
+    (['--connect', '8.8.8.8:1'], 'must be a loopback address'),
+    (['--connect', '14540'], 'must be HOST:PORT'),
+    (['--connect', '127.0.0.1:99999'], 'must be HOST:PORT'),
     (['--param', 'GUID_TIMEOUT'], "param = 'GUID_TIMEOUT': must be NAME=NUMBER"),
     (['--param', 'NO=1'], 'NO: must be one of COM_'),
     (['--signing-key-file', '/nowhere'], "signing_key_file = '/nowhere': No such file")])

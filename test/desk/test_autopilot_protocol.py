@@ -88,18 +88,6 @@ def test_the_landed_state_tells_a_flight(personality):
     assert changes == [1, 3, 2, 4, 1]
 
 
-def test_the_global_position_is_that_of_gps():
-    flight = Flight()
-    flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0)
-    position = flight.last('GLOBAL_POSITION_INT')
-    assert (position.alt - position.relative_alt, position.relative_alt) == (488000, 2000)
-    assert position.hdg == 9000
-    flight = Flight(parameters=BLIND['px4'])
-    flight.fly(0.5, seen(flight))
-    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0) == [0]
-    assert 'GLOBAL_POSITION_INT' not in flight.kinds()
-
-
 def test_px4_takes_the_altitude_as_above_sea_level_and_raises_what_is_too_low():
     flight = Flight(start='landed')
     flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0)

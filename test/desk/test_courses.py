@@ -22,8 +22,7 @@ import numpy as np
 import pytest
 
 from flock_desk.scenarios.courses import Course, course, STEP
-from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
-from flock_desk.scenarios.scenario import Scenario, Start
+from flock_desk.scenarios.scenario import LeaderMotion, Leg, Scenario, Start
 
 SHUTTLE = LeaderMotion('legs', legs=(Leg(6.0, (1.2, 0.0, 0.0)), Leg(6.0, (-1.2, 0.0, 0.0))),
                        repeat=True)

@@ -35,8 +35,7 @@ from flock_desk.scenarios.scenario_file import (
     ScenarioError,
     with_flock,
 )
-from flock_desk.sensors.radio import Radio
-from flock_desk.sensors.sensing import facing, hidden, in_view, PerceptionNoise
+from flock_desk.sensors.sensing import facing, hidden, in_view, PerceptionNoise, Radio
 
 LEVEL = np.eye(3)
 GOOD = """summary: a test

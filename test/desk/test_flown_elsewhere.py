@@ -20,8 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.closed_loop.flown_vehicle import ExternalVehicle
+from flock_desk.closed_loop.flown import ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     LATEST_NS,
     real_time_camera,
@@ -30,8 +29,7 @@ from flock_desk.closed_loop.real_time_flight import (
     STEP_NS,
 )
 from flock_desk.external.external_motion import ExternalMotion
-from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Scenario, Sensing, VioErrors
+from flock_desk.scenarios.scenario import LeaderMotion, Scenario, Sensing, VioErrors
 from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
 
 pytestmark = pytest.mark.slow

@@ -14,18 +14,13 @@
 
 """Who flies, and when: take-off, handover, take-over, and a bridge that starts again."""
 
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
-from flock_desk.closed_loop import simulated_follower
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure, summary
-from flock_desk.closed_loop.flights_log import STATES
+from flock_desk.closed_loop.metrics import measure, STATES, summary
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.planner.loop import PlannerLoop
 
 pytestmark = pytest.mark.slow
 RUNS = range(4)  # both autopilots, twice
@@ -65,12 +60,3 @@ def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called():
     after = flights.times > 40.0
     assert np.all(flights.obeying[:, after])
     assert np.all(flights.state[:, after] == STATES.index('TRACK'))
-
-
-def test_a_planner_that_does_not_wait_for_the_bridge_is_found_out(monkeypatch):
-    # As it was: engaged on the ground it held that altitude, and dived when offboard came.
-    monkeypatch.setattr(simulated_follower, 'PlannerLoop',
-                        partial(PlannerLoop, require_bridge=False))
-    found = summary(measure(fly(replace(load('handover'), duration=16.0), RUNS, True)))
-    # It would still, had it not the leader's altitude to follow.
-    assert found['handover_altitude_m'] > 0.15

@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 
 from flock_desk.scenarios.courses import Course, course, STEP, turn_rate
-from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Scenario
+from flock_desk.scenarios.scenario import LeaderMotion, Scenario
 from flock_desk.scenarios.scenario_file import load
 
 NAMES = ['spline', 'random_walk', 'stairs', 'approach']

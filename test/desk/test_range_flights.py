@@ -23,9 +23,8 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop import campaign
-from flock_desk.closed_loop.flight_metrics import measure
 from flock_desk.closed_loop.lookout import Lookout
-from flock_desk.closed_loop.world import World
+from flock_desk.closed_loop.metrics import measure
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
     RangeErrors,
@@ -33,7 +32,7 @@ from flock_desk.scenarios.scenario import (
     Sensing,
 )
 from flock_desk.scenarios.scenario_file import load
-from flock_desk.sensors.radio import Radios
+from flock_desk.sensors.sensing import Radios
 
 
 def generators(count: int) -> list[np.random.Generator]:
@@ -66,21 +65,18 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(
         monkeypatch: pytest.MonkeyPatch) -> None:
     errors: list[float] = []
 
-    class Watched(World):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            monkeypatch.setattr(self.lookout, 'arrived', self.watched)
-
-        def watched(self, now: float) -> Any:
-            arrived = Lookout.arrived(self.lookout, now)
+    class Watched(Lookout):
+        def arrived(self, now: float) -> Any:
+            arrived = super().arrived(now)
             if 16.0 < now < 20.0:
                 for row, (_, [reported]) in enumerate(arrived):
-                    assert reported.yaw is None and now - reported.stamp < 0.2  # by its ranges
-                    away = np.linalg.norm(reported.position - self._vio.position[row])
-                    errors.append(float(away - self.distances[row, 0]))
+                    estimate, world = reported.estimate, self._world
+                    assert reported.yaw is None and now - estimate.stamp < 0.2  # by its ranges
+                    away = np.linalg.norm(estimate.position - world.vio.position[row])
+                    errors.append(float(away - world.distances[row, 0]))
             return arrived
 
-    monkeypatch.setattr(campaign, 'World', Watched)
+    monkeypatch.setattr(campaign, 'Lookout', Watched)
     scenario = load('range_only_5s')
     # The course of the leader depends on how long it is.
     flights = campaign.fly(replace(scenario, outages=scenario.outages[:1]), range(100, 102), True)

@@ -21,9 +21,8 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.camera.leader import T_BODY_MARKER, T_BODY_OPTICAL
-from flock_desk.camera.renderer import Light
-from flock_desk.closed_loop.flown_vehicle import EmbeddedVehicle
+from flock_desk.camera.renderer import Light, T_BODY_MARKER, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import EmbeddedVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
     real_time_camera,
@@ -85,7 +84,7 @@ class Commanded:
             if controller.mode != 'OFFBOARD':
                 controller.change_mode('OFFBOARD', now)
                 controller.outbox.clear()
-            self.flight.before_step()
+            controller.wind = self.flight.scenario.wind(self.flight.time)
             self.flight.vehicle.autopilot.step(now)
             self.odometry += [(stamp, self.flight.time_ns, state)
                               for stamp, state in self.flight.after_step(engaged)]

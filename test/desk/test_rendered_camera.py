@@ -19,9 +19,16 @@ from marker_images import seen_corners
 import numpy as np
 import pytest
 
-from flock_desk.camera.leader import leader, marker_print, second_print, T_BODY_MARKER
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Light, Renderer, Sensor
+from flock_desk.camera.renderer import (
+    leader,
+    Light,
+    marker_print,
+    Renderer,
+    second_print,
+    Sensor,
+    T_BODY_MARKER,
+)
 from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect

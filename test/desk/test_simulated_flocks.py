@@ -24,11 +24,9 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import measure, of_runs
-from flock_desk.closed_loop.flights_log import STATES
+from flock_desk.closed_loop.metrics import measure, of_runs, STATES
 from flock_desk.scenarios.flock import Flock, FollowerFailure
-from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Outage, RangeErrors, Scenario
+from flock_desk.scenarios.scenario import LeaderMotion, Outage, RangeErrors, Scenario
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.planner.modes import State
 
@@ -92,6 +90,17 @@ def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
     assert np.isfinite(flights.nearest[[0, 2]]).all()
     assert of_runs(measure(flights), flights)['lost'].tolist() == [0.0]
     assert of_runs(measure(flights), flights)['min_separation'][0] > 1.0
+
+
+@pytest.mark.parametrize('run', [87_000, pytest.param(90_000, marks=pytest.mark.sweep)])
+def test_a_line_whose_first_follower_fails_finds_its_leader(run: int) -> None:
+    """In these runs the others turned to each other and drifted away, without the leader."""
+    line = load('flock_line')
+    assert line.flock is not None
+    flights = fly(replace(line, duration=50.0, flock=replace(
+        line.flock, fails=FollowerFailure(1, 12.0))), [run], True)
+    runs = of_runs(measure(flights), flights)
+    assert not runs['lost'].any() and runs['min_separation'].min() >= 0.9
 
 
 def test_a_flock_whose_leader_was_hidden_for_5_s_finds_it_again() -> None:

@@ -21,7 +21,7 @@ import pytest
 
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly
-from flock_desk.sensors.vio import Due, odometry, true_odometry, turned, Vio
+from flock_desk.sensors.vio import Due, odometry, true_odometry, Vio
 from flock_follower.geometry import (
     quaternion_conjugate,
     quaternion_multiply,
@@ -83,22 +83,6 @@ def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, r
     np.testing.assert_allclose(late[[0, 1, 2, 5]] / early[[0, 1, 2, 5]], 2.0, rtol=0.35)
     np.testing.assert_allclose(
         late[3:5], math.hypot(VioErrors().tilt, VioErrors().tilt_bias), rtol=0.25)
-
-
-def test_many_runs_drift_with_the_root_of_time_and_know_their_velocity():
-    n, period, errors = 200, 1.0 / 60.0, VioErrors(height_walk=0.05)
-    position = np.zeros((n, 3))
-    vio = Vio(position, position, [np.random.default_rng(k) for k in range(n)], errors, period)
-    velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
-    for _ in range(960):
-        position = position + period * velocity
-        vio.step(position, velocity)
-    drift = vio.position - position
-    assert drift[:, 2].std() == pytest.approx(4.0 * errors.height_walk, rel=0.15)
-    assert drift[:, 0].std() == pytest.approx(4.0 * errors.position_walk, rel=0.15)
-    assert vio.yaw_error.std() == pytest.approx(4.0 * errors.yaw_walk, rel=0.15)
-    error = vio.velocity - turned(velocity, vio.yaw_error)
-    assert error.std() == pytest.approx(np.hypot(errors.velocity, errors.velocity_white), rel=0.1)
 
 
 def test_a_run_does_not_depend_on_those_beside_it():

@@ -24,10 +24,14 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.autopilot import Endpoint
-from flock_desk.external import external_autopilot, external_vehicles
-from flock_desk.external.external_autopilot import ExternalAutopilot
+from flock_desk.external import external_autopilot
+from flock_desk.external.external_autopilot import (
+    ExternalAutopilot,
+    ExternalVehicles,
+    FORWARDED,
+    LATE,
+)
 from flock_desk.external.external_motion import LONGEST_GAP
-from flock_desk.external.external_vehicles import ExternalVehicles, FORWARDED, LATE
 from flock_desk.runs.processes import free_udp_port
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 
@@ -75,7 +79,7 @@ class Report:
 @pytest.fixture
 def two(monkeypatch):
     monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.3)
-    monkeypatch.setattr(external_vehicles, 'POSE_TIMEOUT', 1.0)
+    monkeypatch.setattr(external_autopilot, 'POSE_TIMEOUT', 1.0)
     both = [Report(), Report(2, 'leader_truth_connection')]
     yield both
     for reported in both:

@@ -34,6 +34,8 @@ from flock_follower.geometry import Array, quaternion_from_yaw, wrap_angle
 from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
 
 STEP = 1.0 / 30.0
+#: Steps between two looks, and from an image to its sighting.
+LOOKS, LATE = 2, 2
 #: ns at which flights begin: as real clocks, too large for a float to hold exactly.
 EPOCH = 1_700_000_000 * NANOSECONDS
 LEADER = 'leader'
@@ -71,13 +73,6 @@ class Conditions:
     """Of the yaw of whom one sees, rad; 0: no attitude is told."""
     askew: float = 0.0
     """By how much markers hang askew, rad."""
-    position_drift: float = 0.02
-    yaw_drift: float = math.radians(0.1)
-    tremble: float = 0.005
-    """Of the odometry, m."""
-    sight_rate: int = 15
-    latency: float = 0.066
-    """Of sightings, s."""
     still: bool = False
     """Whether all hover."""
     clocks: Mapping[str, float] = field(default_factory=dict)
@@ -157,27 +152,25 @@ class MadeUpFlock:
         return EPOCH + to_nanoseconds(time + self.conditions.clocks.get(name, 0.0))
 
     def _advance(self) -> None:
-        how, rng = self.conditions, self.rng
+        rng = self.rng
         self.time += STEP
         step, count = len(self.history), len(self.names)
         true = np.array([self.place(k, self.time) for k in range(count)])
-        self.turn = self.turn + how.yaw_drift * math.sqrt(STEP) * rng.normal(size=count)
-        walk = how.position_drift * math.sqrt(STEP) * rng.normal(size=(count, 3))
+        # Odometry walks at random, by 0.1 deg and 2 cm in a second, and trembles by 5 mm.
+        self.turn = self.turn + math.radians(0.1) * math.sqrt(STEP) * rng.normal(size=count)
+        walk = 0.02 * math.sqrt(STEP) * rng.normal(size=(count, 3))
         for k in range(count):
             self.odometry[k] += turned(self.turn[k]) @ (true[k] - self.true[k]) + walk[k]
         self.true = true
         self.history.append((true, self.odometry.copy(), self.turn.copy()))
         for k, name in enumerate(self.names[1:], 1):
-            self._sense(k, name)
-            if step % (30 // how.sight_rate) == 0:
+            shown = self.odometry[k] + 0.005 * rng.normal(size=3)
+            self.sharing[name].take_own(self.state(k, name, k, shown, self.time))
+            if step % LOOKS == 0:
                 self._look(k, name)
         if step % 3 == 0:
             for k, name in enumerate(self.names[1:], 1):
                 self._talk(k, name)
-
-    def _sense(self, k: int, name: str) -> None:
-        shown = self.odometry[k] + self.conditions.tremble * self.rng.normal(size=3)
-        self.sharing[name].take_own(self.state(k, name, k, shown, self.time))
 
     def state(self, k: int, child: str, of: int, place: Array, time: float,
               position_variance: float = 0.0, yaw_variance: float = 0.0,
@@ -196,22 +189,21 @@ class MadeUpFlock:
 
     def _look(self, k: int, name: str) -> None:
         how, rng = self.conditions, self.rng
-        back = round(how.latency / STEP)
-        if len(self.history) <= back:
+        if len(self.history) <= LATE:
             return
-        true, odometry, turn = self.history[-1 - back]
+        true, odometry, turn = self.history[-1 - LATE]
         for of in self.sees[k]:
             place = odometry[k] + turned(turn[k]) @ (true[of] - true[k])
             place = place + self._sight_error(k, of)
             self.sharing[name].take_seen(self.state(
-                k, self.names[of], of, place, self.time - back * STEP, how.sight_std ** 2,
+                k, self.names[of], of, place, self.time - LATE * STEP, how.sight_std ** 2,
                 how.attitude_std ** 2, how.askew + how.attitude_std * rng.normal()))
 
     def _sight_error(self, k: int, of: int) -> Array:
         how, rng = self.conditions, self.rng
         if rng.random() < how.outliers:
             return rng.uniform(-2.0, 2.0, 3)
-        fading = math.exp(-1.0 / (how.sight_rate * how.sight_memory)) if how.sight_memory else 0.0
+        fading = math.exp(-LOOKS * STEP / how.sight_memory) if how.sight_memory else 0.0
         error = (fading * self.lasting.get((k, of), np.zeros(3))
                  + how.sight_std * math.sqrt(1.0 - fading ** 2) * rng.normal(size=3))
         self.lasting[k, of] = error

@@ -96,54 +96,45 @@ def test_what_is_stamped_in_the_future_is_not_told() -> None:
         assert [word.child for word in sharing.messages(now)] == ['f1']
 
 
-def test_own_words_that_come_back_are_no_impostors() -> None:
-    sharing = listening()
-    for word in sharing.messages(EPOCH):
-        sharing.take_message(word, EPOCH)
-    assert reasons(sharing) == []
-    sharing.take_message(state('f1/odom', 'f1', EPOCH + MS), EPOCH + MS)
-    assert reasons(sharing) == ['another vehicle uses this name']
+LATER = EPOCH + 10 * MS
+NOT_ALIGNED, OUT_OF_ORDER = 'not aligned with f2', 'message out of order'
+#: Messages with the times of their reception, and the reasons of their refusal.
+REFUSED: dict[str, tuple[list[tuple[OdometryState, int]], list[str]]] = {
+    **{f'{reason} {k}': ([(word, received), (state(), LATER)], [reason, NOT_ALIGNED])
+       for k, (word, received, reason) in enumerate([
+           (state(frame='odom'), EPOCH, 'frame of a message is not unique'),
+           (state(frame='/odom'), EPOCH, 'frame of a message is not unique'),
+           (state(frame='a/b/odom'), EPOCH, 'frame of a message is not unique'),
+           (state(child=''), EPOCH, 'message of an unnamed vehicle'),
+           (state(velocity=(0, math.inf, 0)), EPOCH, 'message not finite, or too fast'),
+           (state(velocity=(60, 0, 0)), EPOCH, 'message not finite, or too fast'),
+           (state(child=LEADER, variance=0.0), EPOCH, 'message without a covariance'),
+           (state(child=LEADER, variance=-1.0), EPOCH, 'message without a covariance'),
+           (state(child=LEADER, variance=math.nan), EPOCH, 'message without a covariance'),
+           (state(), EPOCH - 25 * MS, 'message from the future'),
+           (state(), EPOCH + 1100 * MS, 'message too old')])},
+    'own words that come back are no impostors': (
+        [(state('f1/odom', 'f1', EPOCH), EPOCH), (state('f1/odom', 'f1', EPOCH + MS), LATER)],
+        ['another vehicle uses this name']),
+    'repeated or late': ([(state(stamp=stamp), EPOCH) for stamp in (EPOCH, EPOCH, EPOCH - MS)],
+                         [NOT_ALIGNED, OUT_OF_ORDER, OUT_OF_ORDER]),
+    # An image takes a while: the stamps of sightings are right, though the clock is ahead.
+    'a clock that is ahead spoils older messages, too, for 5 s': (
+        [(state(child=LEADER), EPOCH), (state(stamp=EPOCH + 45 * MS), EPOCH),
+         (state(child=LEADER, stamp=EPOCH + MS), LATER),
+         (state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)],
+        [NOT_ALIGNED, 'message from the future', 'ignored for a while', NOT_ALIGNED]),
+}
 
 
-@pytest.mark.parametrize(('word', 'received', 'reason'), [
-    (state(frame='odom'), EPOCH, 'frame of a message is not unique'),
-    (state(frame='/odom'), EPOCH, 'frame of a message is not unique'),
-    (state(frame='a/b/odom'), EPOCH, 'frame of a message is not unique'),
-    (state(child=''), EPOCH, 'message of an unnamed vehicle'),
-    (state(velocity=(0, math.inf, 0)), EPOCH, 'message not finite, or too fast'),
-    (state(velocity=(60, 0, 0)), EPOCH, 'message not finite, or too fast'),
-    (state(child=LEADER, variance=0.0), EPOCH, 'message without a covariance'),
-    (state(child=LEADER, variance=-1.0), EPOCH, 'message without a covariance'),
-    (state(child=LEADER, variance=math.nan), EPOCH, 'message without a covariance'),
-    (state(), EPOCH - 25 * MS, 'message from the future'),
-    (state(), EPOCH + 1100 * MS, 'message too old'),
-])
+@pytest.mark.parametrize(('words', 'expected'), REFUSED.values(), ids=REFUSED)
 def test_a_word_that_cannot_be_is_refused_by_its_reason(
-        word: OdometryState, received: int, reason: str) -> None:
+        words: list[tuple[OdometryState, int]], expected: list[str]) -> None:
     sharing = listening()
-    sharing.take_message(word, received)
-    assert reasons(sharing) == [reason]
-    sharing.take_message(state(), EPOCH + 10 * MS)
-    assert reasons(sharing) == ['not aligned with f2']
-
-
-def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:
-    sharing = listening()
-    sharing.take_message(state(child=LEADER), EPOCH)  # an image takes a while
-    sharing.take_message(state(stamp=EPOCH + 45 * MS), EPOCH)
-    sharing.take_message(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
-    assert reasons(sharing)[1:] == ['message from the future', 'ignored for a while']
-    assert sharing.status(EPOCH + 10 * MS)[0].why == 'has a clock that is ahead'
-    sharing.take_message(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
-    assert sharing.status(EPOCH + 5100 * MS)[0].why != 'has a clock that is ahead'
-
-
-def test_a_repeated_or_late_word_changes_nothing() -> None:
-    sharing = listening()
-    for stamp in (EPOCH, EPOCH, EPOCH - 50 * MS):
-        sharing.take_message(state(stamp=stamp), EPOCH)
-    assert reasons(sharing) == [
-        'not aligned with f2', 'message out of order', 'message out of order']
+    sharing.messages(EPOCH)
+    for word, received in words:
+        sharing.take_message(word, received)
+    assert reasons(sharing) == expected
 
 
 def test_tellers_and_whom_they_tell_of_are_counted() -> None:

@@ -66,8 +66,8 @@ def test_the_last_setpoint_is_one_that_the_gate_permits(flies, kind, setpoints, 
     if flies:
         flight.engage()
     decide = flight.bridge.gate.decide
-    monkeypatch.setattr(flight.bridge.gate, 'decide', lambda *arguments: (
-        decide(*arguments)[0]._replace(kind=kind), None))
+    monkeypatch.setattr(flight.bridge.gate, 'decide', lambda *arguments, **options: (
+        decide(*arguments, **options)[0]._replace(kind=kind), None))
     flight.bridge.stop(flight.now)
     flight.wire.written = []
     flight.bridge.finish(flight.now)

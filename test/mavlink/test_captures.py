@@ -97,7 +97,7 @@ def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
     real = flags(name, kind, end)
     flight, states, known = lost(personality, 0.01), [], None
     for step in range(round(seconds / 0.1)):
-        now = flight.controller.estimator_flags(flight.now)
+        now = flight.autopilot.estimator_flags(flight.now)
         if now != known:
             states.append((step * 0.1, now))
             known = now

@@ -33,8 +33,9 @@ from flock_follower.mavlink.envelope import (
     vertical_range,
 )
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide
+from flock_follower.mavlink.permission import Permission
+from flock_follower.mavlink.relative_flight import Relative
+from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, Held
 from flock_follower.messages import Command
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
@@ -48,7 +49,7 @@ class FlownGate:
     def __init__(self, limits, height=3.0, thrust_error=0.0, climb_error=0.0, seed=0,
                  noise=NOISE):
         self.gate = Gate(limits, 'odom')
-        self.gate.permit(OffboardRequested(-1.0))
+        self.gate.permit(Permission().requested(-1.0))
         self.gate.see(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
         self.response, self.thrust_error = np.zeros(3), thrust_error
@@ -158,7 +159,7 @@ def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleratio
 def test_the_bounds_are_those_of_the_approach_speeds():
     limits, place = GateLimits(), Location(1.0, -0.2, np.array([0.0, 40.0]))
     braking = 0.4 * limits.a_max
-    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5)
+    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5, limits.a_max)
     assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5 + 0.3)
     assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5 + 0.3)
     normal, bound = inward(limits, place, np.array([0.0, 0.5, 0.0]), 0.5)
@@ -169,7 +170,7 @@ def test_the_bounds_are_those_of_the_approach_speeds():
 def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     limits = GateLimits()
     rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
-    gate.permit(OffboardRequested(-1.0))
+    gate.permit(Permission().requested(-1.0))
     gate.see(FLOWN, 0.0, airborne=None)
     sent = []
     for k in range(400):
@@ -183,7 +184,8 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
         sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
                            command_age=0.0, link_age=0.0, armed=True, airborne=False,
-                           place=gate.place(now)))
+                           place=gate.place(now), withheld='', unplaced='', held=Held(),
+                           relative=Relative(), wind=np.zeros(3), offset=0.0))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
 

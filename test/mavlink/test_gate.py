@@ -22,7 +22,6 @@ import pytest
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import EndRequested, OffboardRequested
 from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
@@ -33,7 +32,7 @@ NOT_FLOWN = VehicleStatus(True, 'POSCTL', 'active', False)
 
 def fly(gate, now, status=FLOWN):
     """Permit setpoints, which the vehicle obeys unless its status says otherwise."""
-    gate.permit(OffboardRequested(now - 0.001))
+    gate.permit(gate.permission.requested(now - 0.001))
     gate.see(status, now)
     return gate
 
@@ -118,7 +117,7 @@ def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one
     assert gate.new_command
     # Once, though it is not sent: without a velocity the gate levels the vehicle.
     assert decide(gate, 10.0).kind == 'level' and not gate.new_command
-    gate.permit(EndRequested('hold'))
+    gate.permit(gate.permission.ended('hold'))
     assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
     assert not gate.new_command
 
@@ -161,13 +160,13 @@ def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_f
     gate.see(FLOWN, 10.0)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
     assert gate.decide(10.0)[0].kind == 'none'
-    gate.permit(OffboardRequested(10.0))
+    gate.permit(gate.permission.requested(10.0))
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
     gate.see(FLOWN, 10.01)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
     assert gate.decide(10.03)[0].kind == 'command'
-    gate.permit(EndRequested('hold'))
-    gate.permit(OffboardRequested(10.04))
+    gate.permit(gate.permission.ended('hold'))
+    gate.permit(gate.permission.requested(10.04))
     gate.see(FLOWN, 10.05)
     assert gate.permission.phase.name == 'ACTIVE'
     assert gate.decide(10.06)[0].kind == 'brake'

@@ -19,6 +19,7 @@ import struct
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.files import resource
 from flock_follower.mavlink.dialects import ARDUPILOT, DIALECTS, PX4
 from flock_follower.mavlink.parameter_check import (
     obstacle,
@@ -30,7 +31,6 @@ from flock_follower.mavlink.parameter_check import (
     rules,
     unread,
 )
-from flock_follower.resources import resource
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (

@@ -26,9 +26,15 @@ from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import approach_speed, GateLimits, Location
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.relative_flight import LONGEST_STEP, Reckoning, Relative
-from flock_follower.mavlink.setpoint_rules import COMMAND, decide, encode_setpoint, LEVEL, NONE
+from flock_follower.mavlink.setpoint_rules import (
+    COMMAND,
+    decide,
+    encode_setpoint,
+    Held,
+    LEVEL,
+    NONE,
+)
 from flock_follower.mavlink.velocity_check import KnownMotion, Motion, ODOM
 from flock_follower.messages import Command
 
@@ -43,7 +49,8 @@ def judge(limits=LIMITS, **changes):
     """Return the setpoint for a command on the marker alone, with some arguments changed."""
     arguments = {'known': LOST, 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
                  'armed': True, 'place': Location(2.0), 'full': limits,
-                 'relative': Relative(5.0, False, 0.2)}
+                 'relative': Relative(5.0, False, 0.2), 'airborne': True, 'withheld': '',
+                 'unplaced': '', 'held': Held(), 'wind': (0.0, 0.0, 0.0), 'offset': 0.0}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -87,11 +94,13 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
 @given(st.tuples(COMPONENT, COMPONENT, COMPONENT), ANY | st.floats(-4.0, 4.0),
        st.floats(0.0, 12.0) | ANY, st.floats(-2.0, 2.0) | ANY, st.floats(-1.0, 40.0) | ANY,
        st.floats(-0.2, 1.0) | ANY, st.floats(-3.0, 3.0),
-       st.tuples(*[st.floats(-2.0, 2.0)] * 3), st.sampled_from([0.5, 2.5, 20.0]), st.booleans())
+       st.tuples(*[st.floats(-2.0, 2.0)] * 3), st.sampled_from([0.5, 2.5, 20.0]), st.booleans(),
+       st.floats(-3.0, 3.0) | ANY)
 def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
-        wanted, yaw, height, climb, lasted, marker_age, offset, wind, a_max, airborne):
+        wanted, yaw, height, climb, lasted, marker_age, offset, wind, a_max, airborne, bias):
     limits = GateLimits(relative_flight=True, a_max=a_max)
-    setpoint = judge(limits, command=Command(wanted, yaw, relative=True), airborne=airborne,
+    setpoint = judge(limits, command=Command(wanted, yaw, relative=True, thrust_bias=bias),
+                     airborne=airborne,
                      place=Location(height, climb), offset=offset, wind=wind,
                      relative=Relative(lasted, False, marker_age))
     if setpoint.kind != COMMAND:
@@ -100,15 +109,20 @@ def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
     assert 0.0 <= lasted <= 30.0 and -0.1 <= marker_age <= 0.5 and airborne
     sent = encode_setpoint(setpoint.acceleration, setpoint.yaw)
     north, east, down = struct.unpack('<3f', struct.pack('<3f', sent.afx, sent.afy, sent.afz))
-    assert math.hypot(north, east, down) <= min(1.0, a_max)
+    # The offset of an error of the thrust, at most 1.2 m/s^2, is not counted.
+    bias = min(max(bias, -1.2), 1.2) if math.isfinite(bias) else 0.0
+    least, most = sorted((0.0, bias))
+    assert math.hypot(north, east, down) <= a_max
+    assert math.hypot(north, east, max(-down - most, least + down, 0.0)) <= min(1.0, a_max)
     # Towards a bound it never accelerates beyond the speed from which it stops.
-    reached = climb + limits.speed_horizon * (setpoint.acceleration[2] - min(
-        max(offset, -1.2), 1.2))
-    braking, full = 0.4 * a_max, min(1.0, a_max) * (1.0 - 1e-6)
-    if setpoint.acceleration[2] < full:
-        assert reached >= -approach_speed(height - 0.5, braking) - 1e-6
-    if setpoint.acceleration[2] > -full:
-        assert reached <= approach_speed(10.0 - height, braking) + 1e-6
+    up, own, strongest = setpoint.acceleration[2], min(max(offset, -1.2), 1.2), min(1.0, a_max)
+    full, braking = strongest * (1.0 - 1e-6), 0.4 * strongest * (1.0 - 1e-6)
+    if up < min(most + full, a_max * (1.0 - 1e-6)):
+        reached = climb + limits.speed_horizon * (up - max(own, bias))
+        assert reached >= -approach_speed(height - 1.0, braking) - 1e-5
+    if up > max(least - full, -a_max * (1.0 - 1e-6)):
+        reached = climb + limits.speed_horizon * (up - min(own, bias))
+        assert reached <= approach_speed(9.5 - height, braking) + 1e-5
 
 
 class Flown:
@@ -121,7 +135,7 @@ class Flown:
         self.flown = []  # times of commands on the marker alone
 
     def permit(self):
-        self.gate.permit(OffboardRequested(self.now - 0.001))
+        self.gate.permit(self.gate.permission.requested(self.now - 0.001))
 
     def cycle(self, relative, status=OFFBOARD, command=True):
         self.now += 0.05

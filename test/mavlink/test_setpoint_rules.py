@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.setpoint_rules import (
     BRAKE,
     COMMAND,
@@ -46,6 +47,9 @@ LIMITS = GateLimits()
 UNKNOWN = Motion()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
+USUAL = {'airborne': True, 'withheld': '', 'place': Location(), 'unplaced': '',
+         'relative': Relative(), 'wind': (0.0, 0.0, 0.0), 'offset': 0.0}
+"""The arguments of a vehicle in the air of which nothing else is known."""
 KNOWN = [field.name for field in fields(KnownMotion)]
 
 
@@ -55,7 +59,7 @@ def judge(limits=LIMITS, **changes):
     known.update((name, changes.pop(name)) for name in KNOWN if name in changes)
     arguments = {
         'known': KnownMotion(**known), 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
-        'armed': True, 'held': Held(0.3), 'full': limits}
+        'armed': True, 'held': Held(0.3), 'full': limits, **USUAL}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -234,7 +238,8 @@ def usable(motion):
 @settings(max_examples=500)
 @given(LIMIT_SETS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
-    setpoint, again = (decide(limits, full=limits, **arguments) for _ in range(2))
+    setpoint, again = (
+        decide(limits, full=limits, relative=Relative(), **arguments) for _ in range(2))
     known, command = arguments['known'], arguments['command']
     # It is a pure function.
     assert again._replace(acceleration=None) == setpoint._replace(acceleration=None)
@@ -289,7 +294,8 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
         limits, full=full, known=KnownMotion(odom=motion, autopilot=motion, source=ODOM),
         link_age=0.1, armed=True, command_age=0.05,
         command=Command(wanted, 0.5, bias, unit) if commanded else None,
-        airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset,
+        airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset, withheld='',
+        unplaced='', relative=Relative(),
         place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
     assert norm_on_wire(setpoint) <= (limits if commanded and axis is None else full).a_max

@@ -34,7 +34,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
-from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
@@ -112,7 +111,7 @@ class Bench(Driven):
             0, mavlink.MAV_LANDED_STATE_IN_AIR))
         self.wait(lambda: self.bridge.telemetry.flying(time.monotonic()))
         gate = self.bridge.gate
-        self.node._stream.submit(lambda: gate.permit(OffboardRequested(time.monotonic())))
+        self.node._stream.submit(lambda: gate.permit(gate.permission.requested(time.monotonic())))
         self.wait(lambda: gate.permission.streams)
         self.beat()
         self.wait(self.node._flying)
@@ -357,6 +356,6 @@ def test_limits_of_the_planner_that_differ_are_a_warning(make_bench):
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
             ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
             ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than')):
-        bench.node._report.planner_changed(values)
+        bench.node._report.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)

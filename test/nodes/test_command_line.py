@@ -32,8 +32,8 @@ from flock_desk.parameter_tables import NODES
 from flock_desk.program import PROGRAMS
 from flock_follower.bags.bag import typestore
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.nodes.support.parameters import ValidatedNode
-from flock_follower.resources import resource
 
 BRIDGE = 'connection:=udpin:127.0.0.1:0'
 SAMPLE = str(resource('bags/sample'))

@@ -20,13 +20,12 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 import re
-import time
 from typing import Any
 import xml.etree.ElementTree as ElementTree
 
+from driven import overrides
 import pytest
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 import yaml
 
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
@@ -44,41 +43,33 @@ OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_
 
 
 @pytest.fixture(scope='module')
-def graph(ros: Any) -> Iterator[Node]:
-    """Return a node that sees all nodes of a follower."""
-    nodes: list[Node] = [RelativePose(), Planner(), Visualizer(), MavlinkBridge(
-        parameter_overrides=[Parameter('connection', value='udpin:127.0.0.1:0'),
-                             Parameter('relative_flight', value=True)])]
-    end = time.monotonic() + 10.0
-    while not {'/mavlink/odom', '/visualizer/markers', '/odom'} <= dict(
-            nodes[0].get_topic_names_and_types()).keys():
-        assert time.monotonic() < end, 'waited in vain'
-    yield nodes[0]
-    for node in nodes:
+def nodes(ros: Any) -> Iterator[dict[str, Node]]:
+    """Return the nodes of a follower, by name."""
+    made: list[Node] = [RelativePose(), Planner(), Visualizer(), MavlinkBridge(
+        parameter_overrides=overrides(connection='udpin:127.0.0.1:0', relative_flight=True))]
+    yield {node.get_name(): node for node in made}
+    for node in made:
         node.destroy_node()
 
 
-def inputs_and_outputs(graph: Node, node: str) -> list[list[tuple[str, list[str]]]]:
-    """Return what a node publishes, subscribes and serves, with the types."""
-    return [ask(node, '/') for ask in (
-        graph.get_publisher_names_and_types_by_node, graph.get_subscriber_names_and_types_by_node,
-        graph.get_service_names_and_types_by_node)]
-
-
 @pytest.fixture(scope='module')
-def topics(graph: Node) -> dict[str, str]:
+def topics(nodes: dict[str, Node]) -> dict[str, Any]:
     """Return the topics of the nodes, and their types."""
-    return {name: kinds[0] for node in ('relative_pose', 'planner', 'visualizer', 'mavlink_bridge')
-            for found in inputs_and_outputs(graph, node)[:2] for name, kinds in found}
+    return {end.topic_name: end.msg_type for node in nodes.values()
+            for end in (*node.publishers, *node.subscriptions)}
 
 
-def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(graph: Node) -> None:
+def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(
+        nodes: dict[str, Node]) -> None:
     rows = re.findall(r'^\| `(\w+)` \|(.*)\|(.*)\|(.*)\|$', PAGE.read_text(), re.M)
     assert len(rows) == 3
-    for node, *cells in rows:
+    for name, *cells in rows:
+        node = nodes[name]
         assert [set(re.findall('`(.+?)`', cell)) for cell in cells] == [
-            {name.lstrip('/') for name, _ in names if not name.endswith(OF_PARAMETERS)} - OF_ALL
-            for names in inputs_and_outputs(graph, node)]
+            {each.lstrip('/') for each in names if not each.endswith(OF_PARAMETERS)} - OF_ALL
+            for names in ([p.topic_name for p in node.publishers],
+                          [s.topic_name for s in node.subscriptions],
+                          [s.srv_name for s in node.services])]
 
 
 def named_topics() -> list[str]:
@@ -99,15 +90,15 @@ def named_fields() -> list[tuple[str, str]]:
                 CONFIG / 'plotjuggler.xml').getroot().iter('curve'))]
 
 
-def test_every_topic_of_a_layout_is_there(topics: dict[str, str]) -> None:
+def test_every_topic_of_a_layout_is_there(topics: dict[str, Any]) -> None:
     assert len(named_topics()) > 5 and set(named_topics()) <= topics.keys()
 
 
 @pytest.mark.parametrize(('path', 'separator'), named_fields())
 def test_every_field_of_a_layout_is_there(
-        path: str, separator: str, topics: dict[str, str]) -> None:
+        path: str, separator: str, topics: dict[str, Any]) -> None:
     topic = max((t for t in topics if path.startswith(t + separator)), key=len)
-    kind = topics[topic]
+    kind = f'{topics[topic].__module__.split(".")[0]}/msg/{topics[topic].__name__}'
     for part in path[len(topic) + 1:].split(separator):
         if kind.endswith('Quaternion') and part in ANGLES:
             return

@@ -29,6 +29,7 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
+from flock_follower.files import resource
 from flock_follower.nodes import mavlink_bridge, planner
 from flock_follower.nodes.observer import processes
 from flock_follower.nodes.support.middleware import (
@@ -42,7 +43,6 @@ from flock_follower.nodes.support.middleware import (
     reach,
     segment_size,
 )
-from flock_follower.resources import resource
 
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'

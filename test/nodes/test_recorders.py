@@ -12,22 +12,22 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Black box and recorder as processes: kills, a full disk, a slow end, contents."""
+"""Black box and recorder: kills, a full disk, a slow end, and the content of a recording."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+import errno
+import os
 from pathlib import Path
 import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from driven import Driven, overrides
 from full_disk import disk_of
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -35,7 +35,6 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -43,7 +42,8 @@ from flock_desk import recorder_node
 from flock_desk.runs.processes import wait_until
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.messages import NANOSECONDS
-from flock_follower.nodes import SHUTDOWN_TIMEOUT
+from flock_follower.nodes import black_box, SHUTDOWN_TIMEOUT
+from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.parameters.files import parameters_flown, TABLE
 from flock_follower.perception.images import decode_compressed
 
@@ -67,93 +67,62 @@ def slow(folder, files):
 
 writer.describe = slow
 """
-#: A disk that is full until a file is there.
-FULL = """
-import errno, os
-sync = os.fsync
-
-def full(descriptor):
-    if not os.path.exists({!r}):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    sync(descriptor)
-
-os.fsync = full
-black_box.RETRY_PERIOD = 0.3
-"""
-RATE = 100.0  # Hz
 PIXELS = (np.add.outer(np.arange(480), np.arange(640)) // 5 % 256).astype(np.uint8)
 
 
 class Vehicle:
-    """Publishes odometry and images, and starts black boxes."""
+    """Publishes numbered odometry, and starts programs."""
 
     def __init__(self) -> None:
         self.node = Node('vehicle')
         self.odom = self.node.create_publisher(Odometry, '/vio/odom', 10)
-        self.images = self.node.create_publisher(Image, '/drone1/image_raw', 1)
         self.sent = 0
-        self.problems: list[str] = []
         self.processes: list[subprocess.Popen[str]] = []
-        self._image = Image(height=480, width=640, step=640, encoding='mono8',
-                            data=array('B', PIXELS.tobytes()))
-        self._ended = threading.Event()
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._listen, 10)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self._threads = [threading.Thread(target=self.executor.spin),
-                         threading.Thread(target=self._publish)]
-        for thread in self._threads:
-            thread.start()
 
-    def start(self, folder: Path, patch: str = '') -> subprocess.Popen[str]:
-        """Start a black box."""
-        return self.run(
-            'flock_follower.nodes', 'black_box', patch, '--ros-args', '-r', '__ns:=/drone1',
-            '-r', 'odom:=/vio/odom', '-p', f'record_folder:={folder}', '-p', 'disk_free:=10.0')
+    def publish(self) -> None:
+        message = Odometry()
+        message.pose.pose.position.x = float(self.sent)
+        self.odom.publish(message)
+        self.sent += 1
 
-    def run(self, package: str, name: str, patch: str,
-            *arguments: str) -> subprocess.Popen[str]:
-        program = PROGRAM.format(package=package, name=name, patch=patch)
+    def fly(self, seconds: float, until: Callable[[], object] = lambda: False) -> None:
+        """Publish at 100 Hz, for a time or until a condition holds."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not until():
+            self.publish()
+            time.sleep(0.01)
+
+    def start(self, package: str, name: str, patch: str,
+              *arguments: str) -> subprocess.Popen[str]:
         self.processes.append(subprocess.Popen(
-            [sys.executable, '-c', program, *arguments],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+            [sys.executable, '-c', PROGRAM.format(package=package, name=name, patch=patch),
+             *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return self.processes[-1]
-
-    def end(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.communicate()
-        self._ended.set()
-        self.executor.shutdown()
-        for thread in self._threads:
-            thread.join()
-        self.node.destroy_node()
-
-    def _publish(self) -> None:
-        while not self._ended.wait(1.0 / RATE):
-            message = Odometry()
-            message.header.stamp = self.node.get_clock().now().to_msg()
-            message.pose.pose.position.x = float(self.sent)
-            self.odom.publish(message)
-            if self.sent % 4 == 0:
-                self.images.publish(self._image)
-            self.sent += 1
-
-    def _listen(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == 'drone1/black_box' and status.level == DiagnosticStatus.ERROR:
-                self.problems.append(status.message)
 
 
 @pytest.fixture
 def vehicle(ros: None) -> Iterator[Vehicle]:
     made = Vehicle()
     yield made
-    made.end()
+    for process in made.processes:
+        process.kill()
+        process.communicate()
+    made.node.destroy_node()
+
+
+@pytest.fixture
+def box(vehicle: Vehicle, tmp_path: Path) -> Iterator[Driven]:
+    """Give a black box without threads: tests have it take and write."""
+    made = Driven(black_box.BlackBox(namespace='/drone1', cli_args=[
+        '--ros-args', '-r', 'odom:=/vio/odom'], parameter_overrides=overrides(
+            record_folder=str(tmp_path / 'box'), disk_free=10.0)))
+    wait_until(vehicle.odom.get_subscription_count, 20.0, 'the subscription')
+    yield made
+    made.close()
 
 
 def numbers(path: Path) -> list[int]:
-    """Return the numbers of the odometry messages in a recording; none where it cannot be read."""
+    """Return the numbers of the odometry messages in a recording; none if it cannot be read."""
     try:
         with open_bag(path) as bag:
             return [round(deserialize(m.data, m.msgtype).pose.pose.position.x)
@@ -162,18 +131,15 @@ def numbers(path: Path) -> list[int]:
         return []
 
 
-def recorded(folder: Path, number: int) -> bool:
-    """Return whether a recording has begun; to read it would hold up who publishes here."""
-    return any(file.stat().st_size > 100_000 for file in folder.glob(f'{number:04d}_*/*.mcap'))
-
-
 def test_a_killed_black_box_has_all_but_the_last_second_and_the_next_finishes_it(
         vehicle: Vehicle, tmp_path: Path) -> None:
-    chance = random.Random(3)
     for number in (1, 2):
-        process = vehicle.start(tmp_path)
-        wait_until(partial(recorded, tmp_path, number), 20.0, 'a recording')
-        time.sleep(chance.uniform(0.0, 0.8))
+        process = vehicle.start(
+            'flock_follower.nodes', 'black_box', '', '--ros-args', '-r', 'odom:=/vio/odom',
+            '-p', f'record_folder:={tmp_path}', '-p', 'disk_free:=10.0')
+        vehicle.fly(20.0, lambda number=number: any(
+            file.stat().st_size > 20_000 for file in tmp_path.glob(f'{number:04d}_*/*.mcap')))
+        vehicle.fly(random.Random(number).uniform(0.0, 0.8))
         process.kill()
         killed = time.time()
         process.wait()
@@ -183,55 +149,62 @@ def test_a_killed_black_box_has_all_but_the_last_second_and_the_next_finishes_it
             assert killed - bag.end_ns / NANOSECONDS < 1.0
         found = numbers(path)
         assert found == list(range(found[0], found[-1] + 1))
-    first, _ = sorted(tmp_path.iterdir())
-    with open_bag(first) as bag:
+    with open_bag(min(tmp_path.iterdir())) as bag:
         assert bag.incomplete == ''
 
 
 def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
-        vehicle: Vehicle, tmp_path: Path) -> None:
-    room = tmp_path / 'room'
-    process = vehicle.start(tmp_path / 'box', FULL.format(str(room)))
-    wait_until(lambda: len(vehicle.problems) > 2, 20.0, 'a problem')
-    assert set(vehicle.problems) == {
-        f'not recording to {tmp_path / "box"}: No space left on device'}
-    assert not any(numbers(path) for path in (tmp_path / 'box').iterdir())
-    room.touch()
-    wait_until(lambda: any(numbers(path) for path in (tmp_path / 'box').iterdir()), 10.0,
-               'a recording')
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=10.0)
-    assert process.returncode == 0 and 'Traceback' not in error
-    assert error.count('No space left on device') == 1  # at most one line per 5 s
-    path, = (tmp_path / 'box').iterdir()
-    with open_bag(path) as bag:
-        assert bag.incomplete == ''
+        vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', full)
+        for _ in range(2):
+            vehicle.publish()
+            box.node._take()
+            box.node._write()
+        told = f'not recording to {tmp_path / "box"}: No space left on device'
+        assert box.problems() == told
+    assert box.counters['not recorded'] >= 2
+    box.node._retry = 0.0
+
+    def recorded() -> list[int]:
+        vehicle.publish()
+        box.node._take()
+        box.node._write()
+        return [n for path in (tmp_path / 'box').iterdir() for n in numbers(path)]
+    wait_until(recorded, 10.0, 'a recording')
+    assert box.problems() == ''
+    box.node._recording.close()
 
 
 def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
-        vehicle: Vehicle, tmp_path: Path) -> None:
+        vehicle: Vehicle, box: Driven, tmp_path: Path) -> None:
     planner = Node('planner', namespace='drone1')
     planner.declare_parameter('v_max', 0.75)
     planner.declare_parameter('epsilon', 1e-5)
-    states = planner.create_publisher(
-        String, 'planner/state', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    states.publish(String(data='IDLE'))
-    vehicle.executor.add_node(planner)
-    process = vehicle.start(tmp_path / 'box')
+    planner.create_publisher(String, 'planner/state', LATCHED_QOS).publish(String(data='IDLE'))
+    images = planner.create_publisher(Image, 'image_raw', 1)
+    executor = SingleThreadedExecutor()
+    for node in (planner, box.node):
+        executor.add_node(node)
 
-    def kept() -> str:
-        files = list((tmp_path / 'box').glob('*/parameters.yaml'))
-        return files[0].read_text() if files else ''
-
-    wait_until(lambda: 'v_max: 0.75\n' in kept(), 20.0, 'the parameters')
-    assert '    epsilon: 1.0e-05\n' in kept()
+    def kept(text: str) -> bool:
+        vehicle.publish()
+        images.publish(Image(height=480, width=640, step=640, encoding='mono8',
+                             data=array('B', PIXELS.tobytes())))
+        executor.spin_once(timeout_sec=0.01)
+        box.node._take()
+        box.node._write()
+        return any(text in file.read_text()
+                   for file in (tmp_path / 'box').glob('*/parameters.yaml'))
+    wait_until(lambda: kept('v_max: 0.75\n'), 20.0, 'the parameters')
+    assert kept('    epsilon: 1.0e-05\n')
     planner.undeclare_parameter('epsilon')
     planner.set_parameters([Parameter('v_max', value=0.5)])
-    wait_until(lambda: 'v_max: 0.5\n' in kept(), 10.0, 'the parameters')
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=10.0)
-    assert process.returncode == 0 and 'Traceback' not in error
-    vehicle.executor.remove_node(planner)
+    wait_until(lambda: kept('v_max: 0.5\n'), 20.0, 'the parameters')
+    box.node._recording.close()
+    executor.shutdown()
     planner.destroy_node()
     path, = (tmp_path / 'box').iterdir()
     with open_bag(path) as bag:
@@ -241,18 +214,28 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
         stamps = [m.stamp_ns for m in bag.messages(['/odom'])]
     decoded = decode_compressed(deserialize(image.data, image.msgtype).data)
     assert np.abs(decoded.astype(int) - PIXELS).mean() < 1.0
-    assert counts['/image_raw/compressed'] > 5 and '/image_raw' not in counts
+    assert counts['/image_raw/compressed'] > 1 and '/image_raw' not in counts
     assert np.all(np.diff(stamps) >= 0)
     values = parameters_flown(path, TABLE)
     assert values is not None and values['planner']['v_max'] == 0.5
 
 
+def test_it_records_in_its_threads_until_it_is_asked_to_end(
+        vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(black_box, 'spin', lambda node: vehicle.fly(
+        10.0, lambda: 'recording' in box.values))
+    assert box.node.record() == 0
+    path, = (tmp_path / 'box').iterdir()
+    with open_bag(path) as bag:
+        assert bag.incomplete == '' and bag.message_count > 0
+
+
 def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
         vehicle: Vehicle, tmp_path: Path) -> None:
-    process = vehicle.run('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
-                          '/vio/odom:nav_msgs/msg/Odometry')
-    wait_until(lambda: vehicle.odom.get_subscription_count() > 0, 20.0, 'the recorder')
-    time.sleep(0.3)
+    process = vehicle.start('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
+                            '/vio/odom:nav_msgs/msg/Odometry')
+    wait_until(vehicle.odom.get_subscription_count, 20.0, 'the recorder')
+    vehicle.fly(1.0)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=20.0)
     assert (process.returncode, 'Traceback' in error) == (0, False), error

@@ -29,7 +29,7 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 MOMENTS = (0.3, 1.2, 2.5)  # s: during the imports, at the start, and in flight
 WRITER = """

@@ -106,13 +106,10 @@ def test_it_draws_the_flight_and_nothing_while_nobody_looks(rig: Rig) -> None:
     assert set(drawn) == {
         'base_link', 'command', 'edges', 'leader', 'leader covariance', 'leader d0', 'leader d1',
         'leader name', 'leader velocity', 'sight', 'state'}
-    assert {one.header.frame_id for one in drawn.values()} == {'odom'}
-    assert all(one.action == Marker.ADD and one.color.a > 0.0 for one in drawn.values())
+    assert all((one.header.frame_id, one.action) == ('odom', Marker.ADD) and one.color.a > 0.0
+               for one in drawn.values())
     own = drawn['base_link'].pose.position
     assert (own.x, own.y, own.z) == pytest.approx((0.0, 0.0, 1.5))  # the IMU is 0.5 m above it
-    assert drawn['leader'].pose.position.y == pytest.approx(2.0, abs=0.1)
-    assert points(drawn['leader velocity'])[1] - points(drawn['leader velocity'])[0] == (
-        pytest.approx([0.0, 0.5, 0.0], abs=1e-6))
     assert np.ptp(points(drawn['leader d1'])[:, 0]) == pytest.approx(2.0 * np.sqrt(8.0), rel=0.01)
     assert points(drawn['sight'])[0] == pytest.approx([0.0, 0.1, 1.5])
     assert drawn['state'].text == 'TRACK\nguard: separation'

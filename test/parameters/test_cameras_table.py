@@ -21,11 +21,11 @@ from typing import Any
 
 import pytest
 
+from flock_follower.files import resource
 from flock_follower.parameters import planner_table, relative_pose_table
 from flock_follower.parameters.cameras_table import cameras, MOST_OFFSET
 from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.perception.time_offset import MOST
-from flock_follower.resources import resource
 
 BOTH = {'relative_pose': relative_pose_table, 'planner': planner_table}
 

@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
+from flock_follower.files import resource
 from flock_follower.parameters.files import (
     files_in,
     given,
@@ -36,7 +37,6 @@ from flock_follower.parameters.files import (
 from flock_follower.parameters.planner_table import build
 from flock_follower.perception import markers as neighbors
 from flock_follower.planner.params import Member, RADIUS, ROLES
-from flock_follower.resources import resource
 
 
 def of(node: str, **values: Any) -> dict[str, Any]:
@@ -154,19 +154,6 @@ def reported(path: Path, node: str, document: Any) -> str:
     except ValueError as error:
         return str(error).replace(str(path), 'error')
     return warning.replace(str(path), 'warning')
-
-
-@pytest.mark.parametrize('node', ['/planner', '/drone1/planner'])
-@pytest.mark.parametrize(('section', 'root', 'drone'), [
-    # Whom rclpy 7.1.6 gives what is in a section; see test_parameters for the proof.
-    ('planner', True, False), ('/planner', True, False), ('/**', True, True),
-    ('/*', True, False), ('**', True, True), ('/**/planner', True, True),
-    ('/*/planner', False, True), ('drone1/planner', False, True), ('/drone1/*', False, True),
-    ('/drone1/**', False, True), ('/*/**', True, True), ('/a/**/planner', False, False)])
-def test_a_file_passes_in_silence_where_ros_takes_something_from_it(
-        tmp_path: Path, section: str, root: bool, drone: bool, node: str) -> None:
-    heeded = drone if 'drone' in node else root
-    assert (reported(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
 
 
 def test_namespaces_may_nest(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge
@@ -46,7 +46,9 @@ from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.parameters.files import parse_parameters, TABLE
 
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
-PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage}
+PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage,
+          '/neighbors': Odometry, '/neighbors/acceleration': AccelWithCovarianceStamped,
+          '/command/trajectory': MultiDOFJointTrajectory}
 
 
 @pytest.fixture(scope='module')
@@ -69,15 +71,25 @@ def published(path: Path, topic: str) -> list[tuple[int, Any]]:
 def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result: Path) -> None:
     node = Driven(RelativePose(parameter_overrides=overrides(
         image_transport='compressed', **PATIENT)))
-    with open_bag(bag) as messages:
-        for topic, _, _, data in messages.messages(list(PLAYED)):
-            node.give(topic[1:], deserialize_message(data, PLAYED[topic]))
+    for _, topic, message in messages_of(
+            (bag, ['/camera_info', '/odom', '/image_raw/compressed'])):
+        node.give(topic, message)
     node.wait(lambda: len(node.sent['neighbors']) == 60)  # the last image waits for odometry
     node.close()
     for mine, (_, theirs) in zip(node.sent['neighbors'], published(result, '/neighbors'),
                                  strict=True):
         for a, b in zip(from_odometry(mine), from_odometry(theirs)):
             assert np.array_equal(a, b)
+
+
+def messages_of(*sources: tuple[Path, list[str]]) -> list[tuple[int, str, Any]]:
+    """Return stamps, ns, topics and messages in order; of one stamp in the order of the topics."""
+    found = []
+    for path, topics in sources:
+        with open_bag(path) as bag:
+            found += [(m.stamp_ns, topic, deserialize_message(m.data, PLAYED[topic]))
+                      for topic in topics for m in bag.messages([topic])]
+    return sorted(found, key=lambda each: each[0])
 
 
 class BagClock:
@@ -91,29 +103,21 @@ class BagClock:
 
 def test_planner_gives_the_same_commands_at_the_same_ticks(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Planner(parameter_overrides=overrides(require_bridge=False, use_sim_time=True))
-    clock, sent = BagClock(), Driven(node).sent['command/trajectory']
-    monkeypatch.setattr(node, 'get_clock', lambda: clock)
-    node._loop.engage(True)
+    node = Driven(Planner(parameter_overrides=overrides(
+        require_bridge=False, use_sim_time=True)))
+    clock, sent = BagClock(), node.sent['command/trajectory']
+    monkeypatch.setattr(node.node, 'get_clock', lambda: clock)
+    node.call('engage', data=True)
     expected = published(result, '/command/trajectory')
-    with open_bag(bag) as messages:
-        events = [(m.stamp_ns, node._take_odom, Odometry, m.data)
-                  for m in messages.messages(['/odom'])]
-        (info, *_) = [m.data for m in messages.messages(['/camera_info'])]
-    node._take_camera_info(deserialize_message(info, CameraInfo))
-    with open_bag(result) as messages:
-        for topic, take, kind in (
-                ('/neighbors/acceleration', node._take_acceleration, AccelWithCovarianceStamped),
-                ('/neighbors', node._take_neighbor, Odometry)):
-            events += [(m.stamp_ns, take, kind, m.data) for m in messages.messages([topic])]
-    events.sort(key=lambda event: event[0])
+    events = messages_of((bag, ['/camera_info', '/odom']),
+                         (result, ['/neighbors/acceleration', '/neighbors']))
     for tick, _ in expected:
         while events and events[0][0] < tick:
-            _, take, kind, data = events.pop(0)
-            take(deserialize_message(data, kind), clock.nanoseconds)
+            clock.nanoseconds, topic, message = events.pop(0)
+            node.give(topic, message)
         clock.nanoseconds = tick
-        node._tick()
-    node.destroy_node()
+        node.node._tick()
+    node.close()
 
     assert len(sent) == len(expected) == 19
     for mine, (_, theirs) in zip(sent, expected):
@@ -126,7 +130,7 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
 def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open_bag(bag) as messages:
-        start = next(iter(messages.messages(list(PLAYED)))).stamp_ns
+        start = messages.start_ns
     clock, line = BagClock(), MemoryLine()
     clock.nanoseconds = start
 
@@ -140,6 +144,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     monkeypatch.setattr(SetpointThread, 'submit', lambda self, action: action() or True)
     # As evaluate: the vehicle of a bag does not obey, so no wind can be told from that.
     node = mavlink_bridge.MavlinkBridge(parameter_overrides=overrides(wind_compensation='never'))
+    driven = Driven(node)
     node._even_clock.simulated = True
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)
@@ -151,29 +156,17 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
             mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
         node._bridge.receive(seconds())
-    node._bridge.gate.permit(OffboardRequested(-math.inf))
+    node._bridge.gate.permit(Permission().requested(-math.inf))
     beat()
 
-    def take_odom(message: Odometry) -> None:
-        node._take_odom(message, clock.nanoseconds)
-
     expected = published(result, '/setpoint')
-    with open_bag(bag) as messages:
-        events = [(m.stamp_ns, 1, take_odom, m.data, Odometry)
-                  for m in messages.messages(['/odom'])]
-
-    def take_command(message: MultiDOFJointTrajectory) -> None:
-        node._on_command((message, {'publication_sequence_number': None,
-                                      'received_timestamp': 0}))
-    with open_bag(result) as messages:  # a command is taken at its tick, before an odometry
-        events += [(m.stamp_ns, 0, take_command, m.data, MultiDOFJointTrajectory)
-                   for m in messages.messages(['/command/trajectory'])]
-    events.sort(key=lambda event: event[:2])
+    events = messages_of((result, ['/command/trajectory']), (bag, ['/odom']))
     sent = []
     for cycle, _ in expected:
-        while events and events[0][:2] < (cycle, 1):
-            clock.nanoseconds, _, take, data, kind = events.pop(0)
-            take(deserialize_message(data, kind))
+        # A command is taken at its tick, before an odometry.
+        while events and (events[0][0], events[0][1] == '/odom') < (cycle, True):
+            clock.nanoseconds, topic, message = events.pop(0)
+            driven.give(topic, message)
         node._hand_over_odom()
         clock.nanoseconds = cycle
         if (cycle - start) % 500_000_000 == 0:

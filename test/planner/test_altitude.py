@@ -77,6 +77,20 @@ def flown(seconds: float, leads: Callable[[float], tuple[float, float]] = lambda
         yield altitude, height, speed
 
 
+@pytest.mark.parametrize('error', [-0.6, 0.6])
+def test_a_wrong_thrust_is_offset_where_a_neighbor_leaves_no_speed_for_the_climb(
+        error: float) -> None:
+    """It sank by 0.4 m in 3 s, until the marker left the image."""
+    altitude, height, speed, lowest = Altitude.begun(me(2.0), 0.0, PARAMS), 2.0, 0.0, 0.0
+    for _ in range(60):
+        altitude, vertical = altitude.controlled(me(height, speed), PARAMS, PERIOD, -0.0, 0.0)
+        speed += PERIOD * (vertical + error)
+        height += PERIOD * speed
+        lowest = max(lowest, abs(height - 2.0))
+    assert lowest < 0.25 and abs(speed) < 0.02
+    assert altitude.thrust_bias == pytest.approx(-error, abs=0.05)
+
+
 def heights(*args: Any, **options: Any) -> list[float]:
     return [height for _, height, _ in flown(*args, **options)]
 

@@ -23,8 +23,9 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import wrap_angle
+from flock_follower.planner.guard import retreat
 from flock_follower.planner.inputs import expected, FRESH
-from flock_follower.planner.memory import Memory
+from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import step
@@ -118,6 +119,26 @@ def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> 
     assert min(turned[:100]) < -0.6
     assert max(np.abs(turned)) > 3.0  # all round
     assert max(np.abs(np.diff(np.unwrap(turned)))) <= PARAMS.yaw_rate_max * PARAMS.period + 1e-9
+
+
+def test_it_awaits_one_that_brakes_and_sinks_where_that_leads() -> None:
+    follower = Follower()
+    for tick in range(10):  # passing to the left, ever slower
+        t = 0.1 * tick - 0.9
+        follower.tick(seen(follower.now, [2.0, 0.6 * t - 0.4 * t * t, 2.0 - 0.2 * t],
+                           (0.0, 0.6 - 0.8 * t, -0.2), acceleration=np.array([0.0, -0.8, 0.0])))
+    for _ in range(20):
+        follower.tick()
+    # After 2 s it is 1.2 - 1.2 m aside, the follower 0.6 m; without the acceleration 1.2 m.
+    assert -0.4 < follower.yaw < -0.1
+    assert follower.position[2] < 1.75
+
+
+@pytest.mark.parametrize(('distance', 'moved'), [(1.9, 1.0), (3.3, 0.53), (5.0, 0.0)])
+def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
+                                                                moved: float) -> None:
+    loss = Loss(np.array([1.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]), 4.0 + distance)
+    assert retreat(loss, PARAMS) == pytest.approx(moved, abs=0.01)
 
 
 def test_it_follows_again_by_itself_within_resume_timeout() -> None:

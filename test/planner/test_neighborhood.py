@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_desk.flocks.graph import Graph
+from flock_desk.flocks.laws import Graph
 from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState

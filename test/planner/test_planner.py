@@ -402,6 +402,21 @@ def test_a_command_on_its_way_counts_as_flown() -> None:
     assert commanded(fresh)[0] < commanded(braking)[0] - 0.5
 
 
+def test_drag_does_not_keep_it_below_its_largest_speed() -> None:
+    """It fell back at 0.48 m/s: commands that only offset the drag counted as coming speed."""
+    memory, x, v, a = Memory(), np.array([0.0, 0.0, 2.0]), np.zeros(3), np.zeros(3)
+    for tick in range(150):
+        now = 0.1 * tick
+        it = leader(now, (2.3 + 0.49 * now, 0.0, 2.0), (0.49, 0.0, 0.0))
+        memory, decision = step(memory, now, True, own(now, x, v), [it], PARAMS)
+        for _ in range(10):
+            a = a + 0.01 / PARAMS.response_time * (commanded(decision) - a)
+            v = v + 0.01 * (a - 0.15 * v)
+            x = x + 0.01 * v
+        assert v[0] < PARAMS.v_max + 0.01
+    assert v[0] > 0.485
+
+
 @pytest.mark.parametrize(('it', 'said'), [
     (leader(0.0, (2.0, 0.0, 2.0), (0.9, 0.0, 0.0)),
      'leader at 0.9 m/s, v_max 0.5 m/s: cannot keep up'),
@@ -479,22 +494,6 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, cou
         speed = float(np.linalg.norm(memory.own.velocity))
         assert np.linalg.norm(reached) <= max(speed, params.v_max)
         assert abs(decision.yaw_rate) <= params.yaw_rate_max
-
-
-def test_noise_carries_a_follower_behind_a_hovering_leader_to_the_middle_of_the_band() -> None:
-    rng, memory = np.random.default_rng(3), Memory()
-    x, v = np.array([0.0, 0.0, 2.0]), np.zeros(3)
-    target = np.array([1.2, 0.0, 2.0])
-    distances = []
-    for tick in range(1200):
-        now = 0.1 * tick
-        seen = [leader(now, target + rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.05, 3))]
-        memory, decision = step(memory, now, True, own(now, x, v), seen, PARAMS)
-        v = v + 0.1 * commanded(decision)
-        x = x + 0.1 * v
-        distances.append(np.linalg.norm(x - target))
-    middle = math.sqrt((PARAMS.law.d0 + PARAMS.law.d1) / 2)
-    assert np.mean(distances[-300:]) == pytest.approx(middle, abs=0.05)
 
 
 @pytest.mark.parametrize(('change', 'message'), [

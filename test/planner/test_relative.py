@@ -83,19 +83,34 @@ def test_an_error_of_the_tilt_is_offset(tilted):
     assert distances[-1] == pytest.approx(math.sqrt(4.5), abs=0.1)
 
 
+@pytest.mark.parametrize('error', [1.1, -1.1])
+def test_an_error_of_the_thrust_is_offset_beyond_the_limit_of_the_acceleration(error):
+    memory, z, v, a, offs = Memory(), 0.0, 0.0, 0.0, []
+    for k in range(150):
+        now = 0.1 * k
+        v += 0.1 * (a + error * min(now / 5.0, 1.0))
+        z += 0.1 * v
+        memory, decision = tick(memory, now, [leader(now, (2.1, 0.0, 0.0))], (0.0, 0.0, v),
+                                position=(0.0, 0.0, z))
+        a += 0.3 * (decision.acceleration[2] - a)
+        assert abs(decision.acceleration[2] - decision.thrust_bias) <= 0.7
+        offs.append(abs(z))
+    assert max(offs) < 0.8 and offs[-1] < 0.1
+    assert decision.thrust_bias == pytest.approx(-error, abs=0.1)
+
+
 def test_a_leader_that_stops_is_not_run_into():
     assert flown(20.0, stops_at=5.0).min() > 1.5
 
 
 @settings(max_examples=300)
 @given(st.tuples(*[st.floats(-100.0, 100.0)] * 2), st.floats(-100.0, 100.0),
-       st.none() | st.tuples(*[st.floats(-0.5, 0.5)] * 3))
-def test_the_command_is_short_and_changes_slowly(level, vertical, last):
-    command = limited(np.array(level), vertical, None if last is None else np.array(last))
-    before = np.zeros(3) if last is None else last
-    assert np.linalg.norm(command) <= RELATIVE_MAX + 1e-9
-    if last is None:
-        assert abs(command[2]) <= RELATIVE_MAX
+       st.floats(-1.2, 1.2), st.none() | st.tuples(*[st.floats(-0.5, 0.5)] * 3))
+def test_the_command_is_short_and_changes_slowly(level, vertical, bias, last):
+    offset = np.array([0.0, 0.0, bias])
+    before = offset if last is None else offset + last
+    command = limited(np.array(level), vertical, bias, None if last is None else before)
+    assert np.linalg.norm(command - offset) <= RELATIVE_MAX + 1e-9
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 
 
@@ -103,8 +118,9 @@ def test_the_command_is_short_and_changes_slowly(level, vertical, last):
     ([leader(5.0, age=0.51)], 0.0, 'no neighbor in sight'), ([], 0.0, 'no neighbor in sight'),
     ([leader(5.0)._replace(received=True)], 0.0, 'no neighbor in sight'),
     ([leader(5.0, name='leader/duplicate')], 0.0, 'no neighbor in sight'),
+    ([leader(5.0, (4.0, 0.0, 0.0))], 0.0, 'leader is 4.0 m away'),
     ([leader(5.0)], 0.31, '0.31 s old')])
-def test_without_the_marker_or_the_attitude_nothing_is_commanded(seen, own_age, reason):
+def test_without_the_marker_nearby_or_the_attitude_nothing_is_commanded(seen, own_age, reason):
     memory, _ = tick(Memory(), 5.0 - own_age, [])
     _, decision = step(memory, 5.0, True, None, seen, replace(PARAMS, predict_timeout=1.0))
     assert (decision.state, decision.acceleration) == (State.HOLD, None)
@@ -112,7 +128,7 @@ def test_without_the_marker_or_the_attitude_nothing_is_commanded(seen, own_age, 
 
 
 def test_the_relative_speed_is_bounded():
-    far = leader(5.0, (30.0, 0.0, 0.0))
+    far = leader(5.0, (3.7, 0.0, 0.0))
     for speed, acceleration in ((0.3, 0.1 / 0.6), (0.4, 0.0), (0.5, -0.1 / 0.6)):
         decision = tick(Memory(), 5.0, [far], (speed, 0.0, 0.0))[1]
         assert decision.acceleration[0] == pytest.approx(acceleration)

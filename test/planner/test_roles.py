@@ -113,7 +113,7 @@ def test_hulls_that_overlap_are_driven_apart() -> None:
     params = PlannerParams(radius=1.0, vehicles={'leader': Member('leader', 1.0)})
     decision = decide(seen('leader', 0.0, 1.5), params=params)[1]
     assert commanded(decision)[0] == pytest.approx(
-        -RETURN_SPEED / params.guarding.T_g)
+        -RETURN_SPEED / params.guarding.T_g, rel=1e-3)
 
 
 @pytest.mark.parametrize(('changes', 'message'), [

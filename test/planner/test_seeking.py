@@ -67,11 +67,18 @@ def test_one_that_comes_into_view_meanwhile_does_not_end_it() -> None:
     assert not follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 0.05
 
 
+def test_it_looks_for_a_leader_that_it_only_received_if_nobody_is_in_view() -> None:
+    follower, _ = fly(1.0, 'ahead', 'leader behind')
+    follower, _ = fly(3.0, 'ahead', 'behind', follower)
+    assert not follower.memory.looking  # it stays with the one ahead
+    follower, decisions = fly(3.0, '', 'behind', follower)
+    assert follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 2.0
+
+
 @pytest.mark.parametrize(('in_sight', 'received', 'then_seen', 'then_received'), [
     ('leader behind', '', 'behind', ''),  # another one is in view: it stays with that
     ('leader', 'behind', '', 'leader behind'),  # it is heard of
-    ('ahead', 'behind', '', 'behind'),  # whoever talks will be heard of again
-    ('', 'leader behind', '', 'behind')])  # never seen: others know better where it was
+    ('ahead', 'behind', '', 'behind')])  # no leader was known
 def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
                               then_received: str) -> None:
     follower, _ = fly(1.0, in_sight, received)

@@ -85,21 +85,23 @@ def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
         assert measured['odom and autopilot'].startswith('yaws differ by')
 
 
-class Desk:
-    """Drivers of camera and odometry, in this process."""
+Publish = Callable[..., None]
 
-    def __init__(self) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        self.rclpy = rclpy
-        rclpy.init()
-        self.executor = SingleThreadedExecutor()
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
 
-    def publish(self, driver: str, kind: Any, topic: str, rate: float,
-                fill: Callable[[Any, float], None] = lambda message, now: None) -> None:
-        """Have a driver publish a topic; ``fill`` gets a message and the time of day, s."""
-        node = self.rclpy.create_node(driver)
+@pytest.fixture
+def publish(domain: None) -> Iterator[Publish]:
+    """Return a function that has a driver, in this process, publish a topic."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    rclpy.init()
+    executor = SingleThreadedExecutor()
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+
+    def start(driver: str, kind: Any, topic: str, rate: float,
+              fill: Callable[[Any, float], None] = lambda message, now: None) -> None:
+        """Begin to publish; ``fill`` gets a message and the time of day, s."""
+        node = rclpy.create_node(driver)
         publisher = node.create_publisher(kind, topic, 10)
 
         def tick() -> None:
@@ -107,19 +109,11 @@ class Desk:
             fill(message, time.time())
             publisher.publish(message)
         node.create_timer(1.0 / rate, tick)
-        self.executor.add_node(node)
-
-    def close(self) -> None:
-        self.executor.shutdown(2.0)
-        self.rclpy.try_shutdown()
-        self.thread.join(5.0)
-
-
-@pytest.fixture
-def desk(domain: None) -> Iterator[Desk]:
-    made = Desk()
-    yield made
-    made.close()
+        executor.add_node(node)
+    yield start
+    executor.shutdown(2.0)
+    rclpy.try_shutdown()
+    thread.join(5.0)
 
 
 def lying(late: float) -> Callable[[Any, float], None]:
@@ -138,14 +132,14 @@ def assert_told(found: dict[str, list[Any]], what: str, measured: str, advice: s
                for f in found.get(what, [])), found.get(what, sorted(found))
 
 
-def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: Path) -> None:
+def test_our_nodes_that_are_started_wrongly_are_told_how(
+        publish: Publish, tmp_path: Path) -> None:
     from nav_msgs.msg import Odometry
     from std_msgs.msg import String
     from trajectory_msgs.msg import MultiDOFJointTrajectory
-    desk.publish('vio', Odometry, '/vio/odom', 50.0, lying(0.4))
-    desk.publish('joystick', MultiDOFJointTrajectory, 'command/trajectory', 5.0)
-    desk.publish('stand_in', String, 'mavlink_bridge/state', 2.0)
-    desk.thread.start()
+    publish('vio', Odometry, '/vio/odom', 50.0, lying(0.4))
+    publish('joystick', MultiDOFJointTrajectory, 'command/trajectory', 5.0)
+    publish('stand_in', String, 'mavlink_bridge/state', 2.0)
     other, mine = tmp_path / 'other.yaml', tmp_path / 'mine.yaml'
     other.write_text('camera: {ros__parameters: {rate: 30}}\n')
     mine.write_text('planners: {ros__parameters: {v_max: 0.3}}\n'
@@ -177,22 +171,6 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
                 'for /camera', 'section')
     assert_told(found, 'parameter file', 'relative_pose has not taken it: max_wait is 0.35',
                 '--params-file')
-
-
-def test_what_the_autopilot_says_against_flying_is_repeated(tmp_path: Path) -> None:
-    port = free_udp_port()
-    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
-        processes.start('autopilot', 'flock_desk.autopilot', [
-            '--connect', f'127.0.0.1:{port}', '--personality', 'arducopter', '--start', 'landed',
-            '--deny-arming', 'press the safety button'])
-        processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
-            '--ros-args', '-r', '__ns:=/drone1', '-p', f'connection:=udpin:127.0.0.1:{port}'])
-        processes.wait_for_log('mavlink_bridge', 'HEARTBEAT received', DEADLINE)
-        code, found = check(processes.environment, '--seconds', '5', '--namespace', 'drone1')
-    assert code == 1
-    assert_told(found, 'ready to arm', 'no: press the safety button', 'its own words')
-    assert_told(found, 'nodes', 'not running: relative_pose, planner', 'start:')
-    assert_told(found, 'ready for offboard', 'GUID_TIMEOUT = 3 s', 'refuse offboard')
 
 
 def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:

@@ -26,7 +26,7 @@ import pytest
 
 from flock_desk import evaluate
 from flock_desk.flights import main
-from flock_desk.runs.cluster import mapped
+from flock_desk.runs.processes import mapped
 
 SHORT = 'summary: short\nduration: 3\nleader: {motion: legs}\n'
 
@@ -82,7 +82,7 @@ def test_where_no_scheduler_answers_it_is_a_message_not_a_traceback(
         tmp_path: Path, capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('distributed')
-    monkeypatch.setattr('flock_desk.runs.cluster.TIMEOUT', 1.0)
+    monkeypatch.setattr('flock_desk.runs.processes.SCHEDULER_TIMEOUT', 1.0)
     assert main(['--scenario', 'hover', '--runs', '1', '--scheduler', 'tcp://127.0.0.1:9',
                  '--output', str(tmp_path)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]

@@ -25,15 +25,15 @@ import pytest
 from flock_desk.demo import BOUNDS, PARAMS
 from flock_desk.runs.evaluation import evaluate
 from flock_desk.runs.judge import judge
-from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
+from flock_desk.runs.plots import chapters, flight_picture
 from flock_desk.runs.record import FlightRecord, read_replayed
 from flock_desk.runs.summary import evaluation_figures, replay_figures
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.writer import BagWriter
+from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import read_parameters, TABLE
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 
@@ -107,6 +107,6 @@ def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: FlightRe
 
 
 def test_the_report_shows_the_flight_and_its_errors(flight: FlightRecord) -> None:
-    flown, errors = chapters(PlottedFlight.of(flight))
+    flown, errors = chapters(flight)
     assert [len(chapter.illustrations) for chapter in (flown, errors)] == [1, 1]
-    assert flight_picture(PlottedFlight.of(flight), 'a title').startswith(b'\x89PNG')
+    assert flight_picture(flight, 'a title').startswith(b'\x89PNG')

@@ -20,33 +20,26 @@ from collections import Counter
 import json
 from pathlib import Path
 import re
-import shutil
 from typing import Any
 
 from bag_excerpts import edited, excerpt, SAMPLE, without
-import cv2
 import numpy as np
 import pytest
 
 from flock_desk.evaluate import main
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
-from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
 from flock_follower.check import main as check_main
 from flock_follower.checks.recorded_system import check_bag
-from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.files import resource
 from flock_follower.messages import (
     from_odometry,
     RANGE,
-    set_quaternion,
-    set_vector,
-    to_array,
 )
 from flock_follower.parameters.files import read_parameters, TABLE
-from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')
@@ -120,13 +113,6 @@ def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:
     assert sum(spent[stage]['count'] for stage in ('none', 'track', 'roi', 'full')) == 36
 
 
-def test_two_runs_differ_in_timings_only(bag: Path, result: Path, tmp_path: Path) -> None:
-    assert main([str(bag), '--output', str(tmp_path)]) == 0
-    assert (tmp_path / 'result.mcap').read_bytes() == (result / 'result.mcap').read_bytes()
-    assert set(TIMINGS) < set(summary(tmp_path))
-    assert without_timings(summary(tmp_path)) == without_timings(summary(result))
-
-
 def test_a_bag_faster_than_v_max_is_told_first(
         bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     slow = tmp_path / 'slow.yaml'
@@ -142,27 +128,20 @@ def test_a_bag_faster_than_v_max_is_told_first(
     assert 'class="warning">' not in (result / 'report.html').read_text()
 
 
-def ned(message: BagMessage) -> BagMessage:
-    """Return odometry as a source sends it that knows neither ENU nor FLU."""
-    def turn(fields: Any) -> None:
-        pose, twist = fields.pose.pose, fields.twist.twist
-        q = pose.orientation
-        set_vector(pose.position, enu_to_ned(to_array(pose.position)))
-        set_quaternion(q, quaternion_enu_flu_to_ned_frd([q.x, q.y, q.z, q.w]))
-        for vector in (twist.linear, twist.angular):
-            set_vector(vector, flu_to_frd(to_array(vector)))
-    return edited(message, turn) if message.topic == '/odom' else message
+def late(message: BagMessage) -> BagMessage:
+    """Return odometry that comes 0.4 s late."""
+    return message._replace(stamp_ns=message.stamp_ns + 400_000_000 * (message.topic == '/odom'))
 
 
 def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    what = 'odom up: images turn the other way round'
-    out, spoilt = tmp_path / 'out', excerpt(tmp_path / 'bag', 4.0, ned)
+    what = 'odom latency: '
+    out, spoilt = tmp_path / 'out', excerpt(tmp_path / 'bag', 1.2, late)
     assert main([str(spoilt), '--output', str(out)]) == 1
     first = capsys.readouterr().err.splitlines()[0]
     assert first.startswith(f'error: {what}')
     page = (out / 'report.html').read_text()
-    assert page.index(what.partition(': ')[2]) < page.index('<h2>')
+    assert page.index('Error: odom latency') < page.index('<h2>')
     _, findings = check_bag(spoilt, read_parameters(resource('config/follower.yaml'), TABLE))
     for level in ('error', 'warning'):
         assert summary(out)['check'][f'{level}s'] == [
@@ -215,28 +194,6 @@ def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Pat
         assert figures[key] is None, key
     assert figures['recall'] == 1.0 and figures['distance_m']['mean'] > 1.0
     assert (tmp_path / 'report.html').read_text().count('base64,') == 2
-
-
-def test_recall_is_of_the_images_that_have_a_marker_in_view(tmp_path: Path) -> None:
-    black = cv2.imencode('.jpg', np.zeros((480, 640), dtype=np.uint8))[1].ravel()
-    start: list[int] = []
-
-    def flown_past(message: BagMessage) -> BagMessage:
-        start.append(message.stamp_ns)
-        if message.stamp_ns - start[0] < 600_000_000:
-            return message
-        if message.topic == '/image_raw/compressed':
-            return edited(message, lambda fields: setattr(fields, 'data', black))
-        if message.topic == '/truth/neighbors':
-            return edited(message, lambda fields: setattr(fields.pose.pose.position, 'x', -9.0))
-        return message
-
-    bag = excerpt(tmp_path / 'bag', 1.2, flown_past)
-    assert main([str(bag), '--output', str(tmp_path)]) == 0
-    figures = summary(tmp_path)
-    assert figures['recall'] == 1.0
-    assert figures['frames_in_view'] < 20 < figures['frames'] == 36
-    assert figures['detections']['none'] == 36 - figures['frames_in_view']
 
 
 def test_a_broken_bound_is_exit_code_1_and_named(
@@ -300,45 +257,13 @@ def test_bad_files_are_exit_code_2_and_one_line(
         bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong, output = tmp_path / 'wrong.yaml', ['--output', str(tmp_path / 'out')]
     assert 'nowhere: no such bag' in refusal(['nowhere', *output], capsys)
-    assert 'nowhere.yaml: No such file' in refusal(
-        [str(bag), '--config', 'nowhere.yaml', *output], capsys)
     wrong.write_text('planner: {ros__parameters: {amax: 1.0}}')
     assert 'wrong.yaml: unknown parameter amax' in refusal(
-        [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('relative_pose: {ros__parameters: {neighbors_file: /nowhere.yaml}}')
-    assert '/nowhere.yaml: No such file' in refusal(
-        [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('/**: {ros__parameters: {d1: 0.5}}')
-    assert 'd1 = 0.5: must be a number in [d0 + 0.001, 10000] m^2' in refusal(
         [str(bag), '--config', str(wrong), *output], capsys)
     wrong.write_text('recal: {min: 0.9}')
     assert 'recal is no figure of the summary: did you mean recall?' in refusal(
         [str(bag), '--expect', str(wrong), *output], capsys)
     assert str(wrong) in refusal([str(bag), '--output', str(wrong)], capsys)
-    with pytest.raises(SystemExit) as stop:
-        main([])
-    assert stop.value.code == 2
-    capsys.readouterr()
-
-
-def test_a_truncated_bag_is_refused_and_leaves_nothing_behind(
-        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cut = tmp_path / 'cut.mcap'
-    whole = next(bag.glob('*.mcap')).read_bytes()
-    cut.write_bytes(whole[:len(whole) // 2])
-    out = tmp_path / 'out'
-    refusal([str(cut), '--output', str(out)], capsys)
-    assert list(out.iterdir()) == []
-
-
-def test_a_bag_that_was_never_finished_is_evaluated_and_told(
-        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    part = tmp_path / 'part'
-    shutil.copytree(bag, part)
-    mark_incomplete(part, 'No space left on device')
-    (part / 'metadata.yaml').unlink()
-    assert main([str(part), '--output', str(tmp_path / 'out')]) == 0
-    assert f'warning: {part} is incomplete: No space left on device' in capsys.readouterr().err
 
 
 def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
@@ -369,9 +294,6 @@ def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
     assert main([str(path), '--output', str(tmp_path / 'cut')]) == 0
     assert f'warning: {path} is incomplete: {last.name} was cut short' in capsys.readouterr().err
     assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
-    (path / 'parameters.yaml').write_text('planner: {ros__parameters: {v_max: -1.0}}\n')
-    assert 'parameters.yaml: planner: v_max = -1.0: must be' in refusal(
-        [str(path), '--output', str(tmp_path / 'none')], capsys)
 
 
 def test_images_that_are_named_are_not_replaced_by_others(

@@ -20,13 +20,10 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import Any
 
 from matplotlib.axis import Axis
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
-from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 import numpy as np
 import pytest
@@ -34,13 +31,11 @@ import pytest
 from flock_desk import figures
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.runs import paper_plots
-from flock_desk.runs.paper_plots import distance, positions, styled, WIDTH
-from flock_desk.runs.record import last_flight, LiveRecord, read_flown, scenario_flown, set_aside
-from flock_desk.scenarios.scenario_file import load
+from flock_desk.runs.paper_plots import styled, WIDTH
+from flock_desk.runs.record import last_flight, scenario_flown, set_aside
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
-from flock_follower.geometry import Array
 from flock_follower.messages import ODOMETRY, odometry
 
 pytestmark = pytest.mark.slow
@@ -106,18 +101,6 @@ def test_every_figure_is_written_in_every_kind_and_legible(
         assert_legible(figure, name)
 
 
-def test_arrows_at_the_start_are_seen_whole(redrawn: tuple[Path, dict[str, Figure]]) -> None:
-    arrows = [(axis, *axis.findobj(Quiver)) for name, figure in redrawn[1].items()
-              for axis in figure.axes if 'trajectories' in name and axis.axison]
-    assert len(arrows) == 10
-    for axis, quiver, *_ in arrows:
-        inches = np.hypot(quiver.U, quiver.V) / quiver.scale
-        assert np.all((inches >= 0.12) & (inches <= 0.35))
-        tips = axis.transData.transform(quiver.XY) + axis.figure.dpi * np.stack(
-            [quiver.U, quiver.V], axis=1) / quiver.scale
-        assert np.all((tips > axis.bbox.min) & (tips < axis.bbox.max))
-
-
 def test_only_the_law_keeps_the_band_in_both_scenarios(
         redrawn: tuple[Path, dict[str, Figure]]) -> None:
     rows = read(redrawn[0] / 'results.csv')
@@ -140,17 +123,6 @@ def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path, arguments: l
     assert {p.name for p in tmp_path.iterdir()} == {f'{name}.{kind}'
                                                     for kind in ('png', 'svg', 'pdf', 'csv')}
     assert len(read(tmp_path / f'{name}.csv')) > least_rows
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--agents', '0'], 'error: count = 0: must be an integer in [1, inf)\n'),
-    (['--agents', '9', '--neighbors', 'graph', '--model', 'vicsek'], "error: neighbors = 'graph'"),
-    (['--agents', '9', '--neighbors', 'all'], 'error: agents 0 and '),
-    (['--agents', '9', '--dt', '-1'], 'error: dt = -1.0: must be a number in (0, inf)')])
-def test_bad_options_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
-                                     arguments: list[str], message: str) -> None:
-    assert figures.main(['--out', str(tmp_path), *arguments]) == 1
-    assert capsys.readouterr().err.splitlines(keepends=True)[-1].startswith(message)
 
 
 def write_flight(folder: Path, scenario: str = 'indoor') -> None:
@@ -196,56 +168,6 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_flight(folder, 'outdoor')
     write_flight(folder / 'earlier' / 'indoor', 'indoor')
     return folder
-
-
-@pytest.fixture(scope='module')
-def flight(flights: Path) -> LiveRecord:
-    return read_flown(load('outdoor'), flights)
-
-
-def line(axis: Any, colour: str, *, truth: bool) -> Array:
-    """Return a line's data; that of the truth is the broad one."""
-    (found,) = [line.get_xydata() for line in axis.lines
-                if to_hex(line.get_color()) == colour.lower()
-                and (line.get_linewidth() > 3.0) == truth and len(line.get_xydata()) > 2]
-    return found.T
-
-
-@pytest.mark.parametrize(('colour', 'begin', 'slope', 'error'), [
-    ('#0072B2', 2.0, 0.35, DRIFT[0] + SEEN_FARTHER), ('#D55E00', 0.0, 0.3, DRIFT[0])])
-def test_positions_are_those_the_follower_knew_above_the_true_ones(
-        flight: LiveRecord, colour: str, begin: float, slope: float, error: float) -> None:
-    figure = positions(flight)
-    above, below = figure.axes
-    t, known = line(above, colour, truth=False)
-    shown = np.isfinite(known)
-    assert known[shown] == pytest.approx(begin + slope * t[shown] + error, abs=1e-6)
-    t, true = line(above, colour, truth=True)
-    shown = np.isfinite(true)
-    assert true[shown] == pytest.approx(begin + slope * t[shown], abs=1e-6)
-    t, y = line(below, colour, truth=True)
-    assert y[np.isfinite(y)] == pytest.approx(0.1 * np.sin(t[np.isfinite(y)]), abs=1e-6)
-    # No line across a gap.
-    assert not np.any((t > NO_IMAGE[0] + 1e-6) & (t < NO_IMAGE[1] - 1e-6) & np.isfinite(true))
-    assert_legible(figure, 'positions')
-
-
-def test_the_distance_is_drawn_in_its_band_and_where_the_leader_was_hidden(
-        flight: LiveRecord) -> None:
-    figure = distance(flight)
-    axis, = figure.axes
-    t, known = line(axis, '#0072B2', truth=False)
-    shown = np.isfinite(known)
-    assert known[shown] == pytest.approx(2.0 + SEEN_FARTHER + 0.05 * t[shown], abs=1e-6)
-    hidden = (t >= NO_ESTIMATE[0]) & (t < NO_ESTIMATE[1])
-    assert not np.any(hidden & shown)
-    assert np.isfinite(line(axis, '#333333', truth=True)[1][hidden]).all()
-    edges = sorted({line.get_ydata()[0] for line in axis.lines if line.get_linestyle() == '--'})
-    assert edges == pytest.approx([1.0, np.sqrt(8.0)])
-    assert axis.get_ylim()[0] == 0.0 and axis.get_ylim()[1] > edges[1]
-    spans = [patch.get_extents().transformed(axis.transData.inverted()) for patch in axis.patches]
-    assert [(box.x0, box.x1) for box in spans] == [pytest.approx(NO_ESTIMATE)]
-    assert_legible(figure, 'distance')
 
 
 def test_flights_are_drawn_twice_the_same_or_how_to_fly_them_is_said(

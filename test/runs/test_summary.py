@@ -25,7 +25,6 @@ from flock_desk.runs.summary import (
     consistency,
     hold_figures,
     jsonable,
-    most,
     rate,
     sight_figures,
     spread,
@@ -62,7 +61,7 @@ def table(estimates: dict[int, dict[str, Estimate]], leader: list[float],
     """Return the table of estimates where the leader really was at an offset."""
     return compared(estimates, straight([0.0, 0.0, 0.0], yaw), straight([5.0, 0.0, 1.0]),
                     straight(np.add(leader, [5.0, 0.0, 1.0]).tolist()), STAMPS,
-                    np.ones(len(STAMPS)) if visible is None else visible, 0)[0]
+                    np.ones(len(STAMPS)) if visible is None else visible, 0)
 
 
 def test_drift_common_to_both_is_no_error() -> None:
@@ -111,12 +110,6 @@ def test_what_is_not_known_is_none() -> None:
     assert spread(np.array([1.0, 2.0, 6.0])) == {'min': 1.0, 'mean': 3.0, 'max': 6.0}
     assert jsonable({'a': {'b': np.nan, 'c': float('inf'), 'd': 1.0}}) == {
         'a': {'b': None, 'c': None, 'd': 1.0}}
-
-
-def test_the_greatest_of_values_that_are_not_all_finite_is_not_known() -> None:
-    assert most(np.array([1.0, 3.0, -4.0])) == 3.0 and most(np.zeros(0)) is None
-    for wrong in (np.nan, np.inf, -np.inf):
-        assert most(np.array([1.0, wrong])) is None
 
 
 def test_a_hold_is_told_with_its_length_and_reason() -> None:

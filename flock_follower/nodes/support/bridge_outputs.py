@@ -18,13 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import math
-import time
 from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
@@ -36,6 +34,7 @@ from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.publisher_thread import PublisherThread
+from flock_follower.nodes.support.runtime import FlockNode
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
@@ -48,7 +47,7 @@ class BridgeOutputs:
     Both decide from the bridge's state, and submit functions that create a message.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, report: BridgeReport,
+    def __init__(self, node: FlockNode, bridge: Bridge, report: BridgeReport,
                  publisher: PublisherThread) -> None:
         self._node = node
         self._bridge = bridge
@@ -151,13 +150,8 @@ class BridgeOutputs:
 
     def _stamp(self, valid: float) -> int:
         """Return the ROS time, ns, of a time on the monotonic clock, s, never in the future."""
-        for _ in range(3):  # between its two readings the thread may have had to wait
-            before = time.monotonic()
-            now = self._node.get_clock().now().nanoseconds
-            after = time.monotonic()
-            if after - before < 1e-3:
-                break
-        return max(0, now - max(0, round((after - valid) * 1e9)))
+        system, monotonic = self._node.read_clocks()
+        return max(0, system - max(0, round((monotonic - valid) * 1e9)))
 
     def _battery_state(self, battery: Battery) -> BatteryState:
         message = BatteryState(

@@ -21,7 +21,6 @@ from collections.abc import Callable
 from functools import partial
 import math
 import time
-from typing import Any
 
 from rclpy.node import Node
 
@@ -35,9 +34,11 @@ from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.parameters.planner_table import SPECS
 
+PLANNER_PERIOD = 5.0  # s between two requests for the planner's bounds
 SILENCE = 3.0  # s without an autopilot after which the node reports it
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
 SHOWN = 5.0  # s for which a clock mismatch is shown
@@ -70,7 +71,8 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._reported_check: ParameterCheck | None = None
-        self._planner_values: dict[str, Any] = {}
+        self.planner = RemoteParameters(node, 'planner')
+        node.create_timer(PLANNER_PERIOD, lambda: self.planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._logged: dict[Request, bool] = {}  # whether its result is logged, too
         self._bytes = (self._start, 0, 0)
         alive, housekeeping = self._while_alive, bridge.housekeeping
@@ -121,13 +123,9 @@ class BridgeReport:
 
     # The executor's thread.
 
-    def planner_changed(self, values: dict[str, Any]) -> None:
-        """Take the bounds and limits of the planner."""
-        self._planner_values = values
-
     def _planner_differs(self) -> str:
         """Return which limits of the planner are others, which bounds of it set wider, or ''."""
-        values, limits = self._planner_values, self._bridge.gate.limits
+        values, limits = self.planner.values or {}, self._bridge.gate.limits
         usual = {spec.name: spec.default for spec in SPECS}
         found = [f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
                  'mavlink_bridge: the lower one acts' for name in LIMITS
@@ -146,16 +144,16 @@ class BridgeReport:
         self._log_link(now)
         self._log_parameters()
         self._log_own_requests()
-        self._diagnostics.values.update({
-            **self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)})
-        self._update_readiness(now)
+        self._diagnostics.parts['bridge'] = {
+            **self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)}
         return None
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
-        """Return the state of the autopilot and of the flight."""
+        """Return the state of autopilot and flight; why offboard, and arming, would be refused."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
         status, flying = bridge.status(now), telemetry.flying(now)
         lost = 'lost' if telemetry.status else 'never received'
+        unready = bridge.unready(now)
         return {
             'link': 'alive' if status else lost,
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
@@ -166,7 +164,9 @@ class BridgeReport:
             'state': bridge.state(now),
             'withheld': bridge.withheld(),
             'reboots': self._reboots,
-            'handed_over': bridge.end.why}
+            'handed_over': bridge.end.why,
+            REFUSED: bridge.refusal(now) if bridge.alive(now) else '',
+            **({} if unready is None else {NOT_READY: unready})}
 
     def _gate_values(self, now: float) -> dict[str, object]:
         """Return the newest setpoint, and the checks and estimates of the gate."""
@@ -234,21 +234,20 @@ class BridgeReport:
 
     def _log_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
-        check, values = self._bridge.housekeeping.parameters, self._diagnostics.values
+        check = self._bridge.housekeeping.parameters
         result = check.result()
         if result is None:
             return
-        values['parameters'] = (
-            f'{result.differing} of {result.answered} differ, {result.unanswered} unanswered')
+        lines = {name: rest for name, _, rest in (line.partition(' ') for line in result.lines)}
+        self._diagnostics.parts['parameters'] = {
+            'parameters': f'{result.differing} of {result.answered} differ, '
+                          f'{result.unanswered} unanswered',
+            **{f'{PARAMETER}{name}': rest for name, rest in lines.items()}}
         if check is self._reported_check:
             return
         self._reported_check = check
-        for key in [key for key in values if key.startswith(PARAMETER)]:
-            del values[key]
         for line in result.lines:
             self._node.get_logger().warning(f'parameter {line}')
-            name, _, rest = line.partition(' ')
-            values[f'{PARAMETER}{name}'] = rest
         if result.answered and not result.lines:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')
@@ -256,24 +255,15 @@ class BridgeReport:
     def _log_own_requests(self) -> None:
         """Log the bridge's own requests and their results."""
         log = self._node.get_logger()
-        own = ((self._bridge.blind_landing, 'no valid velocity'),
-               (self._bridge.handover, self._bridge.end.why))
-        before, self._logged = self._logged, {
-            request: request.outcome is not None for request, _ in own if request is not None}
-        for request, why in own:
-            if request is not None and request not in before:
+        for request, why in ((self._bridge.blind_landing, 'no valid velocity'),
+                             (self._bridge.handover, self._bridge.end.why)):
+            if request is not None and request not in self._logged:
+                self._logged[request] = False
                 log.error(f'the bridge requests {request.goal.name}: {why}')
-            if request is not None and request.outcome is not None and not before.get(request):
+            if request is not None and request.outcome is not None and not self._logged[request]:
+                self._logged[request] = True
                 write = log.warning if request.outcome.success else log.error
                 write(request.outcome.message)
-
-    def _update_readiness(self, now: float) -> None:
-        """Show why offboard would be refused, and why arming, as the autopilot reports it."""
-        values = self._diagnostics.values
-        values[REFUSED] = self._bridge.refusal(now) if self._bridge.alive(now) else ''
-        values.pop(NOT_READY, None)
-        if (against := self._bridge.unready(now)) is not None:
-            values[NOT_READY] = against
 
     # Problems; '' or None without one.
 

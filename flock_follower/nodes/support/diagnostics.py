@@ -25,7 +25,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 import time
 import traceback
-from typing import Any
+from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -39,6 +39,8 @@ ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
 NONE_SENDING = 'none sending'
+#: The clock of timers that setting the system clock must not stop.
+STEADY: Final = Clock(clock_type=ClockType.STEADY_TIME)
 Problem = tuple[bytes, str]
 
 
@@ -160,15 +162,16 @@ class Diagnostics:
     """
     The diagnostics of one node.
 
-    ``values`` holds key-value pairs, ``counters`` the rejections by reason, ``checks`` functions
-    that return a problem ``(level, message)`` or None and are asked at each publication; one that
-    raises is an internal error and hides no other. The status shows the worst problem; every
-    problem is also logged at most once per 5 s.
+    ``values`` holds key-value pairs, ``parts`` those that are replaced together, ``counters`` the
+    rejections by reason, ``checks`` functions that return a problem ``(level, message)`` or None
+    and are asked at each publication; one that raises is an internal error and hides no other. The
+    status shows the worst problem; every problem is also logged at most once per 5 s.
     """
 
     def __init__(self, node: Node, period: float = 1.0) -> None:
         self._node = node
         self.values: dict[str, Any] = {}
+        self.parts: dict[str, dict[str, Any]] = {}
         self.counters: Counter[str] = Counter()
         self.rates: dict[str, Rate] = {}
         self.latencies: dict[str, Latency] = {}
@@ -177,8 +180,7 @@ class Diagnostics:
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(period, self.publish, clock=self._steady)
+        self._timer = node.create_timer(period, self.publish, clock=STEADY)
 
     def watch(self, topic: str, msg_type: Any, qos: QoSProfile, *, timeout: float = 2.0,
               required: bool = True, of: str = '') -> Input:
@@ -251,10 +253,11 @@ class Diagnostics:
             name=self._node.get_fully_qualified_name().lstrip('/'),
             level=problems[0][0] if problems else OK,
             message='; '.join(message for _, message in problems) or 'running')
-        values = {**self.values,
-                  **{name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}}
-        for name, latency in self.latencies.items():
-            values |= latency.values(name)
+        values = dict(self.values)
+        for part in (*self.parts.values(), *(
+                latency.values(name) for name, latency in self.latencies.items())):
+            values |= part
+        values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
         values |= {f'rejected: {reason}': n for reason, n in self.counters.items()}
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])

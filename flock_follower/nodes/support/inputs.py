@@ -26,13 +26,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState, to_array
+from flock_follower.nodes.support.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.odometry.buffer import StaticFrames
 from flock_follower.odometry.derivation import NONE
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.spec import filled
-from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 
 BASE, TF_STATIC = 'base_link', '/tf_static'
 LARGEST = 65536  # bytes of a message on /tf_static: about 500 transforms

@@ -22,7 +22,7 @@ from pathlib import Path
 import re
 from typing import Final
 
-from flock_follower.resources import resource
+from flock_follower.files import resource
 
 #: The shared memory of Fast DDS without a profile, bytes.
 DEFAULT_SEGMENT: Final = 512 * 1024

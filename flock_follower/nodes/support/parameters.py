@@ -47,6 +47,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 import yaml
 
 from flock_follower.checks.topic_names import full_name
+from flock_follower.files import resource
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.parameters.files import FLOWN, shared, unheeded
 from flock_follower.parameters.spec import (
@@ -55,7 +56,6 @@ from flock_follower.parameters.spec import (
     refuse_unknown,
     Spec,
 )
-from flock_follower.resources import resource
 
 T = TypeVar('T')
 _NEIGHBORS = 'neighbors_file'

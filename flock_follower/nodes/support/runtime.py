@@ -33,7 +33,6 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -47,7 +46,7 @@ from rclpy.timer import Timer
 from rclpy.waitable import Waitable
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
-from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
+from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import usage, ValidatedNode
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.files import files_in
@@ -59,7 +58,7 @@ READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 #: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
 EVENTS_TIME = 0.02  # s of each second in which QoS events are served
-READING_TIME = 0.01  # s within which two clocks are read
+READING_TIME = 1e-3  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
 
 
@@ -224,7 +223,7 @@ class FlockNode(ValidatedNode):
         With ``use_sim_time`` it runs on that time, unless ``clock`` is given.
         """
         if kwargs.get('clock') is None and not self.get_parameter('use_sim_time').value:
-            kwargs['clock'] = Clock(clock_type=ClockType.STEADY_TIME)
+            kwargs['clock'] = STEADY
         name = getattr(callback, '__name__', repr(callback))
         return super().create_timer(timer_period_sec, _guarded(
             callback, lambda error: self._caught(f'in timer {name}', error)), *args, **kwargs)

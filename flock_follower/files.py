@@ -12,14 +12,36 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Atomic file writes: if the disk is full, no partial file remains under the final name."""
+"""Files: where the package's own ones are, however it was installed; atomic writes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+import sys
 from typing import BinaryIO
+
+
+def resource(relative: str) -> Path:
+    """
+    Return the path of a file or folder that the package ships, such as 'config/follower.yaml'.
+
+    An ament install (colcon) is looked at first, then the interpreter's prefix (pip), then the
+    source tree, because an editable install copies no data files.
+
+    :raises FileNotFoundError: naming every place that was searched.
+    """
+    bases = [Path(__file__).resolve().parent.parent,
+             Path(sys.prefix) / 'share' / 'flock_follower']
+    with suppress(ImportError, LookupError, OSError):  # not an ament install
+        from ament_index_python.packages import get_package_share_directory
+        bases.insert(0, Path(get_package_share_directory('flock_follower')))
+    for base in bases:
+        if (base / relative).exists():
+            return base / relative
+    places = ', '.join(str(base / relative) for base in bases)
+    raise FileNotFoundError(f'{relative} is not installed: looked for {places}')
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_follower.planner.modes import ClockWatch, ON_THE_WAY
+from flock_follower.nodes.support.clock_watch import ClockWatch, ON_THE_WAY
 
 START = 1_700_000_000 * 10**9  # ns
 SECOND = 10**9  # ns

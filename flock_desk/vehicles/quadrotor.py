@@ -28,12 +28,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import (
-    Array,
-    GRAVITY,
-    matrix_to_quaternion,
-    matrix_to_rotation_vector,
-)
+from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion, matrix_to_rotation_vector
 
 _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 

@@ -13,10 +13,16 @@
 # limitations under the License.
 
 """
-The flocking law on a neighbour graph: for flocks larger than one band can hold.
+The accelerations of large flocks: all pairs in blocks, a neighbour graph, the nearest; Vicsek.
 
-With every pair in the sum, every pair must stay inside (d0, d1): no more than a handful of
-agents fit, and one pair outside is drawn to r^2 = d1, where the law is singular. Here
+``accelerations`` sums over all pairs. ``velocities_after`` is the rule of Vicsek et al. (1995) in
+discrete time, without noise, in two readings: in the literal one each agent keeps its own speed
+and takes the mean heading of the agents within a radius, itself included. The paper's figure of
+three agents, whose speeds become equal, fits only the other: each takes their mean velocity.
+
+The law on a neighbour graph is for flocks larger than one band can hold. With every pair in the
+sum, every pair must stay inside (d0, d1): no more than a handful of agents fit, and one pair
+outside is drawn to r^2 = d1, where the law is singular. Here
 
 * an edge joins two agents that start with r^2 < d1, or later come as near as
   r^2 < d0 + 0.8 (d1 - d0), and is never dropped: alignment, separation and cohesion act on edges;
@@ -34,7 +40,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import get_args, Literal
+from typing import Any, get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,14 +52,75 @@ from flock_follower.flocking import (
     cohesion,
     disagreement,
     FlockingParams,
+    Model,
     separation,
+    sum_over_neighbors,
 )
 from flock_follower.geometry import Array
 
 Pairs = NDArray[np.int64]
 Coupling = Literal['flock', 'pair']
+Method = Literal['auto', 'whole', 'blocked']
 _JOIN = 0.8  # share of the band, from d0
 _ROWS = 2048  # agents at a time, so that their arrays stay in cache
+_ENTRIES = 2 ** 17  # of a block, whose few arrays of 1 MB stay in cache
+_FEW = 128  # agents up to which whole matrices are the fastest
+
+
+def check_choice(name: str, value: str, known: Any) -> None:
+    """
+    Check that a value is one of a ``Literal`` type.
+
+    :raises ValueError: naming the parameter, its value and the valid ones.
+    """
+    if value not in get_args(known):
+        raise ValueError(f'{name} = {value!r}: must be one of {", ".join(get_args(known))}')
+
+
+def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
+                  model: Model = 'flocking', method: Method = 'auto') -> Array:
+    """
+    Return the acceleration (k, n), m/s^2, of every agent, each seeing all others.
+
+    :param positions: (k, n), n = 2 or 3, m.
+    :param velocities: (k, n), m/s, in the same frame.
+    :param method: 'whole' (k, k) matrices; 'blocked', some rows of them at a time, in O(k) memory;
+        'auto', the first of them for a few agents.
+    :raises ValueError: for another method or model, other shapes, or values not finite.
+    """
+    x, v = checked(positions, velocities)
+    check_choice('method', method, Method)
+    whole = method == 'whole' or (method == 'auto' and len(x) <= _FEW)
+    count = len(x) if whole else max(1, _ENTRIES // len(x))
+    scale, u = disagreement(v), np.empty_like(x)
+    for first in range(0, len(x), count):
+        rows = slice(first, first + count)
+        u[rows] = sum_over_neighbors(x - x[rows, None], v - v[rows, None], scale, params, model)
+    return u
+
+
+def velocities_after(positions: Array, velocities: Array, radius: float = 1.0,
+                     mean_velocity: bool = False) -> Array:
+    """
+    Return the velocities (k, n), m/s, that the agents take next.
+
+    :param positions: (k, n), m, now.
+    :param velocities: (k, n), m/s, now.
+    :param radius: how far an agent sees, m.
+    :param mean_velocity: take the mean velocity, not the mean heading at the agent's own speed.
+    """
+    speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+    seen = velocities if mean_velocity else velocities / np.where(speed > 0.0, speed, 1.0)
+    i, j = pairs_within(positions, radius).T
+    k = len(positions)
+    total, count = seen.copy(), 1 + np.bincount(i, minlength=k) + np.bincount(j, minlength=k)
+    for axis in range(positions.shape[1]):
+        total[:, axis] += np.bincount(i, seen[j, axis], k) + np.bincount(j, seen[i, axis], k)
+    if mean_velocity:
+        return total / count[:, None]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    heading = np.where(length > 1e-12, total / np.where(length > 0.0, length, 1.0), seen)
+    return speed * heading
 
 
 @dataclass(frozen=True)
@@ -63,14 +130,10 @@ class Graph:
     count: int
     edges: Pairs
 
-    def with_edges(self, pairs: Pairs) -> Graph:
-        """Return the graph with these pairs as edges too; itself if it has them already."""
-        new = pairs[~self.joins(pairs)]
-        return Graph(self.count, np.concatenate([self.edges, new])) if len(new) else self
-
     def joins(self, pairs: Pairs) -> NDArray[np.bool_]:
         """Return (m,) which of the pairs are edges."""
-        return np.isin(self._keys(pairs), self._keys(self.edges))
+        own, others = (each[:, 0] * self.count + each[:, 1] for each in (self.edges, pairs))
+        return np.isin(others, own)
 
     @cached_property
     def connected(self) -> bool:
@@ -79,9 +142,6 @@ class Graph:
         from scipy.sparse.csgraph import connected_components
         joined = coo_array((np.ones(len(self.edges)), self.edges.T), (self.count, self.count))
         return bool(connected_components(joined, directed=False, return_labels=False) == 1)
-
-    def _keys(self, pairs: Pairs) -> NDArray[np.int64]:
-        return pairs[:, 0] * self.count + pairs[:, 1]
 
 
 def complete_graph(count: int) -> Graph:
@@ -94,19 +154,21 @@ def initial_graph(positions: Array, params: FlockingParams) -> Graph:
     return Graph(len(positions), pairs_within(positions, np.sqrt(params.d1)))
 
 
-def grown(graph: Graph, positions: Array, params: FlockingParams,
-          near: Pairs | None = None) -> Graph:
+def grown(graph: Graph, positions: Array, params: FlockingParams, near: Pairs) -> Graph:
     """
     Return the graph with an edge more for every two agents that have come near enough.
 
-    :param near: all pairs with r^2 < d1 at least, if known; found here otherwise.
+    :param near: all pairs with r^2 < d1 at least.
     """
-    near = pairs_within(positions, np.sqrt(params.d1)) if near is None else near
-    return graph.with_edges(near[squared_distances(positions, near) < _joining(params)])
+    joining = params.d0 + _JOIN * (params.d1 - params.d0)
+    pairs = near[squared_distances(positions, near) < joining]
+    new = pairs[~graph.joins(pairs)]
+    return Graph(graph.count, np.concatenate([graph.edges, new])) if len(new) else graph
 
 
-def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
-                  graph: Graph, coupling: Coupling = 'flock', near: Pairs | None = None) -> Array:
+def graph_accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
+                              graph: Graph, coupling: Coupling = 'flock',
+                        near: Pairs | None = None) -> Array:
     """
     Return the acceleration (k, n), m/s^2, of every agent; they sum to zero.
 
@@ -141,15 +203,14 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
 
 
 def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Graph,
-                  near: Pairs | None = None) -> bool:
+                  near: Pairs) -> bool:
     """
     Return whether no pair comes more than halfway from where it is to a singularity of the law.
 
     :param before: positions (k, n), m.
     :param after: those a step later.
-    :param near: as in :func:`accelerations`, of the positions before.
+    :param near: all pairs with r^2 < d1 at least, of the positions before.
     """
-    near = pairs_within(before, np.sqrt(params.d1)) if near is None else near
     old, new = squared_distances(before, near), squared_distances(after, near)
     if np.any(new - params.d0 < 0.5 * np.minimum(old - params.d0, params.d1 - params.d0)):
         return False
@@ -169,8 +230,8 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
     and together for 20 s, most of the others in the narrow band, where the graph kept all 72.
 
     :param neighbors: (k, m), the neighbours of each agent, such as the seven nearest.
-    :param coupling: as in :func:`accelerations`.
-    :raises ValueError: as :func:`accelerations`.
+    :param coupling: as in :func:`graph_accelerations`.
+    :raises ValueError: as :func:`graph_accelerations`.
     """
     x, v = _checked(positions, velocities, len(neighbors), coupling)
     whole = disagreement(v)
@@ -188,12 +249,10 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
 
 def squared_distances(positions: Array, pairs: Pairs) -> Array:
     """Return r^2 (m,), m^2, of the pairs (m, 2) among the positions (k, n)."""
-    return np.sum((positions[pairs[:, 1]] - positions[pairs[:, 0]]) ** 2, axis=1)
-
-
-def _joining(params: FlockingParams) -> float:
-    """Return the r^2, m^2, below which two agents join."""
-    return params.d0 + _JOIN * (params.d1 - params.d0)
+    ends = positions.take(pairs, 0)
+    offset = ends[:, 1] - ends[:, 0]
+    squares: Array = np.einsum('ij,ij->i', offset, offset)
+    return squares
 
 
 def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
@@ -201,9 +260,7 @@ def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
     x, v = checked(positions, velocities)
     if len(x) != count:
         raise ValueError(f'positions has {len(x)} agents: the graph has {count}')
-    if coupling not in get_args(Coupling):
-        raise ValueError(f'coupling = {coupling!r}: must be one of '
-                         f'{", ".join(get_args(Coupling))}')
+    check_choice('coupling', coupling, Coupling)
     return x, v
 
 

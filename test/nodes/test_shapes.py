@@ -29,7 +29,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import Command, OdometryState
-from flock_follower.visualization import (
+from flock_follower.nodes.shapes import (
     ACCELERATION_SCALE,
     Band,
     CameraSight,

@@ -24,16 +24,16 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_desk.flocks import graph as flock_graph
+from flock_desk.flocks import laws
 from flock_desk.flocks.agents import simulate
-from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph, nearest
+from flock_desk.flocks.laws import complete_graph, Graph, grown, initial_graph, nearest
 from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
     LEADERLESS,
     PARAMS,
+    random_start,
 )
-from flock_desk.flocks.starts import random_start
 from flock_follower import flocking
 from flock_follower.flock import neighbor_graph
 from flock_follower.geometry import Array, rotation_vector_to_matrix
@@ -49,13 +49,29 @@ def edges(*pairs: tuple[int, int]) -> Any:
 
 def test_the_complete_graph_is_the_papers_law() -> None:
     x, v = LEADERLESS.positions, LEADERLESS.velocities
-    u = flock_graph.accelerations(x, v, PARAMS, complete_graph(3))
+    u = laws.graph_accelerations(x, v, PARAMS, complete_graph(3))
     assert u == pytest.approx(flocking.accelerations(x, v, PARAMS), rel=1e-12)
+
+
+@pytest.mark.parametrize('model', ['flocking', 'cucker_dong', 'cucker_smale'])
+def test_blocks_give_the_sums_of_the_plain_law(model: Any) -> None:
+    rng = np.random.default_rng(0)
+    x, v = 30.0 * rng.random((600, 2)), rng.normal(size=(600, 2))  # three blocks
+    for params in (FLIGHT_PARAMS, flocking.FlockingParams(beta=0.0, theta=1.5, d0=0.0)):
+        np.testing.assert_array_equal(laws.accelerations(x, v, params, model, 'blocked'),
+                                      flocking.accelerations(x, v, params, model))
+
+
+def test_the_nearest_are_found_without_oneself() -> None:
+    x = np.random.default_rng(2).random((40, 3))
+    distances = np.linalg.norm(x - x[:, None], axis=2) + np.diag(np.full(40, np.inf))
+    np.testing.assert_array_equal(np.sort(nearest(x, 7)), np.sort(np.argsort(distances)[:, :7]))
+    assert nearest(x[:3], 7).shape == (3, 2) and nearest(x[:1], 7).shape == (1, 0)
 
 
 def test_for_two_agents_each_pairs_own_disagreement_is_the_papers() -> None:
     x, v = LEADER_FOLLOWER.positions, LEADER_FOLLOWER.velocities
-    u = flock_graph.accelerations(x, v, PARAMS, complete_graph(2), 'pair')
+    u = laws.graph_accelerations(x, v, PARAMS, complete_graph(2), 'pair')
     assert u == pytest.approx(flocking.accelerations(x, v, PARAMS), rel=1e-12)
 
 
@@ -65,7 +81,7 @@ def test_agents_without_an_edge_only_separate_and_not_beyond_the_band() -> None:
 
     def of_first(distance: float) -> Array:
         x = np.array([[0.0, 0.0], [distance, 0.0]])
-        u = flock_graph.accelerations(x, v, FLIGHT_PARAMS, nobody)
+        u = laws.graph_accelerations(x, v, FLIGHT_PARAMS, nobody)
         assert u[1] == pytest.approx(-u[0])
         return u[0]
 
@@ -81,12 +97,12 @@ def test_edges_begin_at_once_below_d1_and_later_below_four_fifths_of_the_band() 
         return np.array([[0.0, 0.0], [np.sqrt(r2), 0.0]])
 
     assert len(initial_graph(at(7.99), FLIGHT_PARAMS).edges) == 1
-    alone = initial_graph(at(8.01), FLIGHT_PARAMS)
+    alone, pair = initial_graph(at(8.01), FLIGHT_PARAMS), edges((0, 1))
     assert len(alone.edges) == 0
-    assert grown(alone, at(6.61), FLIGHT_PARAMS) is alone  # d0 + 0.8 (d1 - d0) = 6.6
-    joined = grown(alone, at(6.59), FLIGHT_PARAMS)
+    assert grown(alone, at(6.61), FLIGHT_PARAMS, pair) is alone  # d0 + 0.8 (d1 - d0) = 6.6
+    joined = grown(alone, at(6.59), FLIGHT_PARAMS, pair)
     assert joined.edges.tolist() == [[0, 1]]
-    assert grown(joined, at(7.9), FLIGHT_PARAMS) is joined  # never dropped, nor joined twice
+    assert grown(joined, at(7.9), FLIGHT_PARAMS, pair) is joined  # never dropped, nor joined twice
 
 
 @pytest.mark.parametrize(('count', 'pairs', 'connected'), [
@@ -101,7 +117,7 @@ def test_a_graph_knows_whether_it_is_connected(count: int, pairs: list[tuple[int
 @given(FLOCKS, COUPLINGS)
 def test_accelerations_on_a_graph_sum_to_zero(start: Any, coupling: Any) -> None:
     x, v = start.positions, start.velocities
-    u = flock_graph.accelerations(x, v, FLIGHT_PARAMS, initial_graph(x, FLIGHT_PARAMS), coupling)
+    u = laws.graph_accelerations(x, v, FLIGHT_PARAMS, initial_graph(x, FLIGHT_PARAMS), coupling)
     assert np.linalg.norm(u.sum(axis=0)) <= 1e-12 * (1.0 + np.sum(np.abs(u)))
 
 
@@ -112,8 +128,8 @@ def test_the_graph_law_moves_and_turns_with_the_axes(start: Any, coupling: Any,
     n = x.shape[1]
     turn = rotation_vector_to_matrix(vector if n == 3 else [0.0, 0.0, vector[2]])[:n, :n]
     graph = initial_graph(x, FLIGHT_PARAMS)
-    u = flock_graph.accelerations(x, v, FLIGHT_PARAMS, graph, coupling)
-    moved = flock_graph.accelerations(x @ turn.T + vector[:n], v @ turn.T - vector[:n],
+    u = laws.graph_accelerations(x, v, FLIGHT_PARAMS, graph, coupling)
+    moved = laws.graph_accelerations(x @ turn.T + vector[:n], v @ turn.T - vector[:n],
                                       FLIGHT_PARAMS, graph, coupling)
     assert moved == pytest.approx(u @ turn.T, rel=1e-8, abs=1e-8 * (1.0 + np.abs(u).max()))
 
@@ -122,14 +138,14 @@ def test_the_graph_law_moves_and_turns_with_the_axes(start: Any, coupling: Any,
        arrays(float, (3, 2), elements=st.floats(-1.0, 1.0)))
 def test_among_few_near_agents_the_nearest_are_the_law(noise: Array, v: Array) -> None:
     x = LEADERLESS.positions + noise  # so near that psi is still 1
-    u = flock_graph.nearest_accelerations(x, v, FLIGHT_PARAMS, nearest(x, 7))
+    u = laws.nearest_accelerations(x, v, FLIGHT_PARAMS, nearest(x, 7))
     assert u == pytest.approx(flocking.accelerations(x, v, FLIGHT_PARAMS), rel=1e-9, abs=1e-9)
 
 
 def test_the_nearest_are_attended_to_without_return() -> None:
     x = np.array([[0.0, 0.0], [1.3, 0.0], [2.9, 0.0]])
     v = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
-    u = flock_graph.nearest_accelerations(x, v, FLIGHT_PARAMS, nearest(x, 1))
+    u = laws.nearest_accelerations(x, v, FLIGHT_PARAMS, nearest(x, 1))
     assert nearest(x, 1).tolist() == [[1], [0], [1]]
     assert u[1, 1] == 0.0 > u[2, 1]  # the last heeds the middle one, who does not see it
 
@@ -168,7 +184,8 @@ def test_a_step_is_small_up_to_half_the_way_to_an_edge_of_the_band(r2: float, jo
 
     graph = complete_graph(2) if joined else Graph(2, edges())
     before = at(2.0 if r2 < 4.0 else 7.0)  # gaps of 1 m^2
-    assert flock_graph.step_is_small(before, at(r2), FLIGHT_PARAMS, graph) is small
+    assert laws.step_is_small(before, at(r2), FLIGHT_PARAMS, graph,
+                              laws.pairs_within(before, np.sqrt(8.0))) is small
 
 
 def test_edges_that_join_on_the_way_are_recorded_with_their_time() -> None:
@@ -183,13 +200,13 @@ def test_edges_that_join_on_the_way_are_recorded_with_their_time() -> None:
 
 
 @pytest.mark.parametrize(('call', 'message'), [
-    (lambda x: flock_graph.accelerations(x, x, PARAMS, complete_graph(4)),
+    (lambda x: laws.graph_accelerations(x, x, PARAMS, complete_graph(4)),
      r'^positions has 3 agents: the graph has 4$'),
-    (lambda x: flock_graph.accelerations(x, x, PARAMS, complete_graph(3), 'all'),
+    (lambda x: laws.graph_accelerations(x, x, PARAMS, complete_graph(3), 'all'),
      r"^coupling = 'all': must be one of flock, pair$"),
-    (lambda x: flock_graph.accelerations(x * np.nan, x, PARAMS, complete_graph(3)),
+    (lambda x: laws.graph_accelerations(x * np.nan, x, PARAMS, complete_graph(3)),
      r'^positions = .* finite'),
-    (lambda x: flock_graph.nearest_accelerations(x, x[:2], PARAMS, nearest(x, 2)),
+    (lambda x: laws.nearest_accelerations(x, x[:2], PARAMS, nearest(x, 2)),
      r'positions has shape \(3, 2\) and velocities \(2, 2\)'),
 ])
 def test_bad_input_is_refused_with_what_to_change(call: Any, message: str) -> None:
@@ -211,7 +228,7 @@ def test_one_agent_that_knows_all_commands_itself_what_the_law_of_the_flock_does
     x, v = drawn_flock(seed)
     graph = initial_graph(0.9 * x, flocking.FlockingParams(beta=0.25, d0=0.5, d1=3.5))
     assert 0 < len(graph.edges) < 21
-    whole = flock_graph.accelerations(x, v, params, graph)
+    whole = laws.graph_accelerations(x, v, params, graph)
     for k in range(len(x)):
         others = np.arange(len(x)) != k
         share = np.array([graph.joins(np.array([[min(k, j), max(k, j)]]))[0]

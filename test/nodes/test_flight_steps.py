@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from flock_follower.flight_steps import (
+from flock_follower.nodes.flight_steps import (
     DISCOVERY,
     Flight,
     INTERRUPTED,

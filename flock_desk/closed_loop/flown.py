@@ -1,0 +1,194 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The vehicles of a real-time flight: embedded or external follower, scenario or external leader.
+
+Times are integer nanoseconds since the flight's start, and s of the scenario (``scenario_run``).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from flock_desk.closed_loop.scenario_run import ScenarioRun
+from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP
+from flock_desk.sensors.vio import Odometry
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
+from flock_desk.vehicles.flight_log import FlightLog
+from flock_desk.vehicles.px4 import OFFBOARD
+from flock_follower.geometry import (
+    Array,
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    quaternion_from_yaw,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    Transform,
+    yaw_from_quaternion,
+)
+
+#: Set up as config/px4.params recommends, where PX4's defaults are others.
+RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,
+                      'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
+
+
+class EmbeddedVehicle:
+    """
+    The vehicle of an embedded PX4, which is stepped before each step here.
+
+    :param now: monotonic time of the start, s, that messages of the autopilot count from.
+    :param altitude: m, at which it hovers then.
+    :param system_id: its own, of MAVLink.
+    """
+
+    def __init__(self, now: float, altitude: float, system_id: int = 1) -> None:
+        self.autopilot = autopilot = EmbeddedAutopilot(
+            'px4', now=now, altitude=altitude, system_id=system_id, parameters=RECOMMENDED)
+        self.log = autopilot.log
+        self._rotation = autopilot.vehicle.rotation
+
+    @property
+    def offboard(self) -> bool:
+        """Return whether its mode is OFFBOARD: it obeys the bridge's setpoints."""
+        return self.autopilot.controller.mode == OFFBOARD
+
+    def step(self, time_ns: int) -> Odometry:
+        """Return the true motion, without covariances, a step after that returned before."""
+        vehicle = self.autopilot.vehicle
+        before, self._rotation = self._rotation, vehicle.rotation
+        return _motion(time_ns, vehicle.position, vehicle.velocity, before, self._rotation)
+
+    def knows(self, time_ns: int) -> bool:
+        """Return True."""
+        return True
+
+
+class ExternalVehicle:
+    """
+    The vehicle of an external autopilot, in the ENU frame of that.
+
+    :param start_ns: time zero of the flight on the clock of ``motion``.
+    :param height: m above the ground, of its first reported place.
+    """
+
+    def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
+        self.offboard = False
+        """Whether it obeys the bridge's setpoints, by the bridge's state; set by the owner."""
+        self.armed, self.mode = False, ''
+        """Armed and mode by the HEARTBEAT, for the log; set by the owner."""
+        self.log = FlightLog()
+        self._motion, self._start_ns = motion, start_ns
+        self.origin = np.array([0.0, 0.0, height])
+        """(3,), m, of the frame of ``motion``."""
+        self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
+
+    def step(self, time_ns: int) -> Odometry:
+        """Return the reported motion, interpolated."""
+        motion = self._motion.at(self._start_ns + time_ns)
+        position = self.origin + motion.position
+        self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
+                       np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
+                       self.mode)
+        # Not the reported rates: poses arrive unevenly, and the camera sees that.
+        before, self._rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
+        return _motion(time_ns, position, motion.velocity, before, self._rotation)
+
+    def knows(self, time_ns: int) -> bool:
+        """Return whether poses were reported shortly before and after a time of the last 0.3 s."""
+        return self._motion.knows(self._start_ns + time_ns)
+
+
+FlownVehicle = EmbeddedVehicle | ExternalVehicle
+
+
+def _motion(time_ns: int, position: Array, velocity: Array, before: Array,
+            rotation: Array) -> Odometry:
+    """Return the motion; the rates are those of the attitude since the step before."""
+    return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
+                    rotation.T @ velocity, matrix_to_rotation_vector(before.T @ rotation) / STEP)
+
+
+class ScenarioLeader:
+    """
+    A leader on the scenario's course; its motion is None before it appears.
+
+    :param in_place: whether the follower starts at the scenario's place; else the scenario is
+        moved to its place, height and heading once it is in offboard mode.
+    """
+
+    def __init__(self, scenario: ScenarioRun, in_place: bool) -> None:
+        self._scenario, self._in_place = scenario, in_place
+        #: The scenario's frame in the vehicle's.
+        self._frame: Transform | None = Transform() if in_place else None
+
+    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
+        """Come to a follower that has just come into offboard mode; face away from it."""
+        if not self._in_place and time < 0.0 and not offboard:
+            self._frame = None
+        elif self._frame is None and offboard:
+            height = np.array([0.0, 0.0, self._scenario.scenario.start.altitude])
+            self._frame = Transform.from_quaternion(
+                follower.position - height,
+                quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
+        if self._frame is not None:
+            self._scenario.turn(time, self._frame.inverse().apply(follower.position))
+
+    def motion(self, time_ns: int, time: float) -> Odometry | None:
+        """Return the motion on its course."""
+        if self._frame is None:
+            return None
+        leader = self._scenario.leader_odometry(time)
+        return leader._replace(
+            position=self._frame.apply(leader.position),
+            quaternion=quaternion_multiply(self._frame.quaternion, leader.quaternion))
+
+    def knows(self, time_ns: int) -> bool:
+        """Return True."""
+        return True
+
+
+class ExternalLeader:
+    """
+    A leader that an external autopilot flies and reports.
+
+    :param motion: with the same ``origin`` as the follower's.
+    :param start_ns: time zero of the flight on the clock of ``motion``.
+    :param origin: (3,), m, of the frame of ``motion`` in that of the flight.
+    """
+
+    def __init__(self, motion: ExternalMotion, start_ns: int, origin: Array) -> None:
+        self._motion, self._start_ns, self._origin = motion, start_ns, origin
+
+    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
+        """Do nothing: the leader flies by itself."""
+
+    def motion(self, time_ns: int, time: float) -> Odometry | None:
+        """Return the reported motion; of a future moment, the newest; None once poses stall."""
+        newest, at = self._motion.newest, self._start_ns + time_ns
+        if newest is None or at - newest > LONGEST_GAP:
+            return None
+        leader = self._motion.at(at)
+        return Odometry(time, self._origin + leader.position, leader.quaternion,
+                        quaternion_to_matrix(leader.quaternion).T @ leader.velocity,
+                        leader.angular)
+
+    def knows(self, time_ns: int) -> bool:
+        """Return whether poses were reported shortly before and after."""
+        return self._motion.knows(self._start_ns + time_ns)
+
+
+FlownLeader = ScenarioLeader | ExternalLeader

@@ -1,0 +1,311 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One simulated follower: the real ``follower.Follower``, its odom frame, operator and pilot.
+
+A lone follower's odom frame is the world's. In a flock each has one of its own, which begins
+where it stands and along where it faces, as visual-inertial odometry does.
+
+The operator arms, takes off, calls offboard and engage; the pilot takes over and gives back by
+the mode switch; the bridge may die and start again. An autopilot of few modes obeys them: it
+flies take-off, hold and the pilot's climb by itself, and setpoints in its offboard mode, with the
+waits and timeouts measured on PX4 1.16 and ArduCopter 4.7. MAVLink itself is the embedded
+autopilots' (``vehicles``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+import math
+from typing import Final
+
+import numpy as np
+
+from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
+from flock_desk.closed_loop.world import GATE_STEPS
+from flock_desk.scenarios.courses import STEP
+from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario, VioErrors
+from flock_follower.flock.exchange import Sharing
+from flock_follower.flocking import FlockingParams
+from flock_follower.follower import ControlCycle, Follower, Listener, Tick
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    Transform,
+    yaw_from_quaternion,
+)
+from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.messages import (
+    AccelerationState,
+    OdometryState,
+    RELATIVE,
+    to_nanoseconds,
+    with_acceleration,
+)
+from flock_follower.perception.neighbor_motion import POSITION, VELOCITY
+from flock_follower.planner.inputs import OwnState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
+from flock_follower.planner.sight import View
+from flock_follower.planner.step import Decision
+
+_AFTER = 1  # ns by which ticks come after what arrives at their moment
+_ZERO, _LEVEL = np.zeros(3), np.eye(3)
+_UNKNOWN = np.zeros((6, 6))
+_ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is known
+#: The pilot's mode, by the autopilot.
+MANUAL: Final = {'px4': 'POSCTL', 'ardupilot': 'ALT_HOLD'}
+#: s between HEARTBEATs: PX4 refuses to send more than one per second.
+HEARTBEAT_PERIOD: Final = {'px4': 1.0, 'ardupilot': 0.2}
+SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T and GUID_TIMEOUT as recommended
+CLIMB_SPEED: Final = 1.0  # m/s, of the take-off and of the pilot
+UP: Final = np.array([0.0, 0.0, 1.0])
+STIFFNESS, DAMPING = 1.5, 2.2  # 1/s^2 and 1/s, of the autopilot's own position control
+
+
+class SimulatedFollower(Listener):
+    """
+    The follower of one row, its operator, pilot and autopilot; receives the follower's events.
+
+    :param frame: name of the odom frame; :param T_odom_world: its place in the world.
+    :param start: where its vehicle begins (3,), m.
+    :param view: field of view of its camera; () if cameras look to all sides.
+    :param name: of its vehicle.
+    :param cpu_time: see ``Follower``; :param law: see ``controllers``.
+    """
+
+    def __init__(self, scenario: Scenario, guard: bool, run: int, frame: str,
+                 T_odom_world: Transform, start: Array, view: View, name: str,
+                 cpu_time: Callable[[], float], law: type[FlockingParams]) -> None:
+        # Scenarios judge the planner in open space: the bounds of the envelope are far.
+        self._limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
+                                  height_max=1000.0, radius_max=10000.0,
+                                  relative_flight=scenario.flight.relative_flight)
+        self._autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
+        self._dialect = DIALECTS[self._autopilot]
+        planner = PlannerLoop()
+        planner.view, planner.ground = view, 0.0
+        # Ticks come after everything of their moment, cycles in the middle between two ticks.
+        self._follower = Follower(
+            planner, _params(scenario, guard, law, name), self._new_control(), self,
+            cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
+            sharing=Sharing(name) if scenario.company.words else None)
+        self._follower.advance(_AFTER)
+        self.decision = Decision(State.IDLE)
+        self.cpu = 0.0
+        """CPU time of the last tick, s."""
+        self.failed = False
+        self.outbox: list[OdometryState] = []
+        """Messages to the others; the owner empties it."""
+        self._errors, self._alone = scenario.odometry, scenario.flock is None
+        self._frame, self._T_odom_world = frame, T_odom_world
+        self._turn = yaw_from_quaternion(T_odom_world.quaternion)
+        self._known: OwnState | None = None
+        self._now = 0.0
+        usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_STEPS * STEP)
+        self._waiting = sorted(scenario.operations or usual, key=lambda o: o.at)
+        self._armed = not scenario.takes_off
+        self._mode = self._dialect.offboard if self._armed else self._dialect.hold
+        self._status: VehicleStatus | None = None
+        self._goal = start
+        self._yaw: float | None = None
+        self._taking_off = False
+        self._mode_asked = self._restart = math.inf  # s, when they come
+        self._beat = self._setpoint_time = -math.inf
+        self._setpoint: Setpoint | None = None
+        self._asked = False
+        """Whether offboard was called, by the operations and HEARTBEATs so far."""
+        self.unasked = 0
+        """Number of setpoints sent while offboard was not requested."""
+        self.obeying = False
+        """Whether the vehicle flies setpoints."""
+
+    def _new_control(self) -> Gate:
+        """Return the control of a bridge that starts."""
+        gate = Gate(self._limits)
+        gate.compensates_wind = not self._dialect.compensates_wind
+        return gate
+
+    def sense(self, now: float, own: OwnState | None) -> None:
+        """Take the newest odometry there is."""
+        if own is None or own is self._known or self.failed:
+            return
+        self._known, to_odom = own, self._T_odom_world
+        pose, twist = (_UNKNOWN, _UNKNOWN) if self._alone else _covariances(self._errors, now)
+        self._follower.odometry(to_nanoseconds(now), OdometryState(
+            to_nanoseconds(own.stamp), self._frame, 'base_link', to_odom.apply(own.position),
+            quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity, _ZERO,
+            pose, twist, _LEVEL))
+
+    def lean(self, now: float, quaternion: Array) -> OdometryState | None:
+        """Take the attitude by the autopilot; return the motion without odometry, if flown on."""
+        return None if self.failed else self._follower.attitude(
+            to_nanoseconds(now), quaternion, _ZERO)
+
+    def receive(self, now: float, message: OdometryState) -> None:
+        """Take a message of another follower."""
+        if not self.failed:
+            self._follower.receive(to_nanoseconds(now), message)
+
+    def plan(self, now: float, looked: list[float], seen: list[Sighted]) -> None:
+        """Tick with what has arrived: stamps of images, s, and estimates."""
+        if self.failed:
+            return
+        for stamp in looked:
+            self._follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
+        for each in seen:
+            self._see(now, each)
+        self._follower.advance(to_nanoseconds(now) + _AFTER)
+
+    def _see(self, now: float, sighted: Sighted) -> None:
+        name, n, yaw, relative = sighted
+        to_frame = Transform() if relative else self._T_odom_world
+        axes, pose, twist = to_frame.rotation, np.zeros((6, 6)), np.zeros((6, 6))
+        pose[:3, :3] = axes @ n.covariance[POSITION, POSITION] @ axes.T
+        twist[:3, :3] = axes @ n.covariance[VELOCITY, VELOCITY] @ axes.T
+        pose[5, 5] = _ANY_YAW if yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
+        quaternion = quaternion_from_yaw((yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
+        acceleration = quaternion_to_matrix(quaternion).T @ (axes @ n.acceleration)
+        stamp = to_nanoseconds(n.stamp)
+        self._follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
+            stamp, RELATIVE if relative else self._frame, name, to_frame.apply(n.position),
+            quaternion, axes @ n.velocity, _ZERO, pose, twist, _LEVEL),
+            AccelerationState(stamp, name, acceleration)))
+
+    def obey(self, now: float, position: Array, velocity: Array, yaw: float,
+             estimate: Array, altitude: float) -> tuple[Array, float | None]:
+        """
+        Let everything happen that is due; return the acceleration and yaw to fly from now on.
+
+        :param altitude: by its barometer, m.
+        """
+        time, self._now = to_nanoseconds(now), now
+        self._follower.estimate(time, self._T_odom_world.rotation @ estimate)
+        self._follower.height(time, altitude, float(position[2]))
+        self._follower.advance(time + _AFTER)
+        while self._waiting and self._waiting[0].at <= now + 1e-9:
+            self._do(self._waiting.pop(0), now, position, yaw)
+        if now >= self._restart:
+            self._restart = math.inf
+            self._follower.bridge_started(time, self._new_control())
+        if now >= self._mode_asked:
+            self._mode_asked = math.inf
+            self._mode, self._goal = self._dialect.offboard, position
+        on_ground = self._taking_off or bool(position[2] < 0.05)
+        if self._taking_off and position[2] > self._goal[2] - 0.2:
+            self._taking_off = False
+            self._mode = self._dialect.takeoff_modes[-1]
+            self._goal = np.array([*position[:2], self._goal[2]])
+        self._report_status(now, on_ground)
+        return self._fly(now, position, velocity)
+
+    def _do(self, operation: Operation, now: float, position: Array, yaw: float) -> None:
+        time, above = to_nanoseconds(now), position + operation.height * UP
+        self._yaw = yaw
+        match operation.what:
+            case 'arm':
+                self._armed = True
+            case 'takeoff':
+                self._taking_off = True
+                self._mode, self._goal = self._dialect.takeoff_modes[0], above
+            case 'offboard':
+                self._asked = True
+                self._follower.permit(time, now - 1e-3)
+                # The bridge has to stream first, and to receive the mode by HEARTBEAT.
+                self._mode_asked = now + self._dialect.stream_before_offboard
+            case 'engage':
+                self._follower.engage(time, True)
+            case 'pilot':
+                self._mode, self._goal = MANUAL[self._autopilot], above
+            case 'restart':
+                self._asked = False
+                self._follower.bridge_died(time)
+                self._restart = now + operation.duration
+
+    def _report_status(self, now: float, on_ground: bool) -> None:
+        if now - self._beat < HEARTBEAT_PERIOD[self._autopilot] - 1e-9:
+            return
+        self._beat = now
+        obeyed = self._status is not None and self._status.offboard
+        self._status = VehicleStatus(self._armed, self._mode, 'active',
+                                     self._mode == self._dialect.offboard)
+        if obeyed and not self._status.offboard:
+            self._asked = False
+        self._follower.vehicle(to_nanoseconds(now), self._status, not on_ground)
+
+    def _fly(self, now: float, position: Array,
+             velocity: Array) -> tuple[Array, float | None]:
+        silent = now - self._setpoint_time > SETPOINT_TIMEOUT
+        offboard = self._mode == self._dialect.offboard and not self._taking_off
+        if offboard and not silent and self._setpoint is not None:
+            self.obeying = True
+            self._goal = position.copy()
+            return self._setpoint.acceleration, self._setpoint.yaw
+        if offboard and self.obeying and self._autopilot == 'px4':
+            self._mode = self._dialect.hold  # COM_OBL_RC_ACT 5
+        self.obeying = False
+        if not self._armed:
+            return np.zeros(3), None
+        nominal = np.clip(STIFFNESS * (self._goal - position), -DAMPING * CLIMB_SPEED,
+                          DAMPING * CLIMB_SPEED) - DAMPING * velocity
+        return nominal, self._yaw
+
+    def fail(self, now: float) -> None:
+        """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
+        self.failed, self.decision = True, Decision(State.IDLE)
+        self._follower.bridge_died(to_nanoseconds(now))
+
+    def send(self, time: int, messages: list[OdometryState]) -> None:
+        if not self.failed:
+            self.outbox += messages
+
+    def tick(self, tick: Tick) -> None:
+        if not self.failed:
+            self.decision, self.cpu = tick.decision, tick.cpu
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        setpoint = cycle.setpoint
+        if setpoint.kind != NONE:
+            self._setpoint, self._setpoint_time = setpoint._replace(
+                acceleration=self._T_odom_world.rotation.T @ setpoint.acceleration,
+                yaw=None if setpoint.yaw is None else setpoint.yaw - self._turn), self._now
+            self.unasked += not self._asked
+
+
+def _params(scenario: Scenario, guard: bool, law: type[FlockingParams],
+            name: str) -> PlannerParams:
+    """Return the planner's parameters of a vehicle."""
+    params = scenario.flight.planner(guard)
+    params = replace(params, law=law(**vars(params.law)))
+    return params if scenario.flock is None else replace(params, vehicles={
+        other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)
+        for other in scenario.flock.names if other != name})
+
+
+def _covariances(errors: VioErrors, time: float) -> tuple[Array, Array]:
+    """Return the covariances (6, 6) of pose and twist that an odometry has after a time, s."""
+    walks = np.array([errors.position_walk, errors.position_walk, errors.height_walk])
+    pose = np.diag([*(errors.position ** 2 + time * walks ** 2),
+                    *[errors.tilt ** 2 + errors.tilt_bias ** 2] * 2,
+                    errors.attitude ** 2 + time * errors.yaw_walk ** 2])
+    twist = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
+                    + [errors.gyro_bias ** 2 + errors.gyro ** 2] * 3)
+    return pose, twist
