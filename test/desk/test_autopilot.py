@@ -105,7 +105,7 @@ def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
     assert not flight.controller.armed and flight.vehicle.landed
 
 
-def test_setpoints_alone_end_the_failsafe():
+def test_setpoints_alone_end_the_failsafe_and_a_mode_that_is_chosen_ends_it_for_good():
     flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
     offboard(flight, setpoint())
     flight.fly(1.5)
@@ -113,11 +113,6 @@ def test_setpoints_alone_end_the_failsafe():
     assert flight.controller.chosen == 'OFFBOARD'
     flight.fly(0.1, setpoint())
     assert (flight.controller.mode, flight.controller.in_failsafe) == ('OFFBOARD', False)
-
-
-def test_a_mode_that_is_chosen_ends_the_failsafe_for_good():
-    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
-    offboard(flight, setpoint())
     flight.fly(1.5)
     assert flight.mode('AUTO.LOITER') == [0, 0] and not flight.controller.in_failsafe
     flight.fly(1.0, setpoint())
