@@ -221,3 +221,10 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
     if not done:
         raise ValueError(f'image of {image.shape[1]}x{image.shape[0]} px: cannot be encoded')
     return bytes(data)
+
+
+def grey_levels(image: GrayImage, pixels: Array) -> Any:
+    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
+    at = pixels.astype(np.float32)[:, None]
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)
