@@ -34,6 +34,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_follower.geometry import Array
+
 #: The largest image decoded, pixels: 8K, more than any camera in flight sends.
 MAX_PIXELS: Final[int] = 7680 * 4320
 _PNG: Final[bytes] = b'\x89PNG\r\n\x1a\n'
