@@ -93,10 +93,16 @@ def test_an_error_of_the_thrust_is_offset_beyond_the_limit_of_the_acceleration(e
         memory, decision = tick(memory, now, [leader(now, (2.1, 0.0, 0.0))], (0.0, 0.0, v),
                                 position=(0.0, 0.0, z))
         a += 0.3 * (decision.acceleration[2] - a)
-        assert abs(decision.acceleration[2] - decision.thrust_bias) <= 0.7
         offs.append(abs(z))
     assert max(offs) < 0.8 and offs[-1] < 0.1
     assert decision.thrust_bias == pytest.approx(-error, abs=0.1)
+
+
+def test_the_altitude_leaves_acceleration_for_the_distance():
+    memory = Memory()
+    for k in range(10):
+        memory, decision = tick(memory, 0.1 * k, [leader(0.1 * k, (2.1, 0.0, 4.0))])
+    assert decision.acceleration[2] - decision.thrust_bias == pytest.approx(0.6)
 
 
 def test_a_leader_that_stops_is_not_run_into():
