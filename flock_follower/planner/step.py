@@ -353,7 +353,8 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
         return facing(last, me, there, params, elapsed) if since <= 0.0 else searching(
             last, me, there, since, params, elapsed)
     if faced is not None:
-        return facing(last, me, faced, params, elapsed)
+        # Seen again during a turn: the yaw commanded last is where it would overshoot to.
+        return facing(me.yaw if memory.params is None else last, me, faced, params, elapsed)
     if state is State.SEARCH:  # it looks round, anticlockwise
         return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
     return last

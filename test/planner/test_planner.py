@@ -287,6 +287,13 @@ def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
     assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
 
 
+def test_seen_again_during_a_turn_it_turns_back_from_where_it_points() -> None:
+    """Turning on to the yaw commanded last it lost the leader again."""
+    memory = tracking()._replace(yaw=0.8, params=None)
+    decision = decide(0.1, leader(0.1), me=own(0.1, yaw=0.3), memory=memory)
+    assert decision.yaw == pytest.approx(0.2)
+
+
 def test_yaw_and_altitude_of_the_engagement_are_held_if_their_modes_say_so() -> None:
     params = PlannerParams(yaw_mode='hold', altitude_mode='hold')
     memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
