@@ -25,7 +25,7 @@ import argparse
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, lru_cache, partial
 import os
 from pathlib import Path
 import shutil
@@ -226,7 +226,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
         shutil.move(str(Path(scratch) / out.name), out)
 
 
-_recording = cache(Recording)  # one in each process that renders
+_recording = lru_cache(maxsize=1)(Recording)  # one in each process that renders
 
 
 def _rendered(variant: Variant, seed: int, k: int) -> BagMessage:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
@@ -91,7 +92,9 @@ def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 
     for marker_id, pose in markers.items():
         code = (codes or {}).get(marker_id, marker_code(marker_id))
         _paint(image, camera, pose, code, cover, motion, black, white, rays)
-    image = _blurred(image, blur)
+    if blur:
+        size = 2 * max(4, int(np.ceil(3.5 * blur))) + 1
+        image = cv2.GaussianBlur(image, (size, size), blur, borderType=cv2.BORDER_REPLICATE)
     image = 255.0 * (np.maximum(image, 0.0) / 255.0)**(1.0 / gamma)
     image += rng.normal(0.0, noise, image.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
@@ -137,17 +140,6 @@ def _paint(image: Array, camera: CameraModel, pose: Transform, code: Any, cover:
             values[cover.hides(*(on_marker.T / SIDE))] = cover.level
         total += values.reshape(u.shape)
     image[y0:y1, x0:x1] = total / rays**2
-
-
-def _blurred(image: Array, sigma: float) -> Array:
-    reach = max(4, int(np.ceil(3.5 * sigma)))
-    x = np.arange(-reach, reach + 1)
-    kernel = np.exp(-0.5 * (x / sigma)**2)
-    kernel /= kernel.sum()
-    height, width = image.shape
-    padded = np.pad(image, reach, mode='edge')
-    rows = sum(w * padded[:, reach + k:reach + k + width] for k, w in zip(x, kernel))
-    return np.asarray(sum(w * rows[reach + k:reach + k + height] for k, w in zip(x, kernel)))
 
 
 def seen_corners(image: GrayImage, camera: CameraModel, side: float) -> Array:

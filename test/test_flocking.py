@@ -253,12 +253,9 @@ def test_coincident_and_far_agents_get_finite_accelerations(theta: float) -> Non
         assert np.all(np.isfinite(accelerations(x, v, params)))
 
 
-def test_equal_velocities_give_no_acceleration_even_outside_the_band() -> None:
-    x = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])
+def test_equal_velocities_and_an_agent_alone_give_no_acceleration() -> None:
+    x = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])  # outside the band
     assert np.array_equal(accelerations(x, np.ones((2, 3)), FLIGHT), np.zeros((2, 3)))
-
-
-def test_an_agent_alone_does_not_accelerate() -> None:
     assert np.array_equal(acceleration(np.zeros((0, 3)), np.zeros((0, 3)), FLIGHT), np.zeros(3))
     assert np.array_equal(accelerations([[1.0, 2.0]], [[3.0, 4.0]], FLIGHT), np.zeros((1, 2)))
 

@@ -195,30 +195,16 @@ class _Panorama:
         return full[_CELL:_CELL + self._shape[0], _CELL:_CELL + self._shape[1]]
 
 
-class _Window(NamedTuple):
-    """A part of an image, with first and last + 1 column and row."""
+def _around(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return first and last + 1 column and row (2,) of the part of a window with pixels (n, 2)."""
+    return (np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, low),
+            np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN, high))
 
-    left: int
-    top: int
-    right: int
-    bottom: int
 
-    def around(self, pixels: Array) -> _Window:
-        """Return the part of it that holds pixels (n, 2)."""
-        low = np.floor(pixels.min(axis=0)).astype(int) - _MARGIN
-        high = np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN
-        return _Window(max(low[0], self.left), max(low[1], self.top),
-                       min(high[0], self.right), min(high[1], self.bottom))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return width and height."""
-        return max(self.right - self.left, 0), max(self.bottom - self.top, 0)
-
-    def of(self, image: Image, n: int = 1, left: int = 0, top: int = 0) -> Image:
-        """Return this part of an image that begins at (left, top), with n samples per pixel."""
-        return image[n * (self.top - top):n * (self.bottom - top),
-                     n * (self.left - left):n * (self.right - left)]
+def _part(image: Image, low: Any, high: Any, n: int = 1) -> Image:
+    """Return a window of an image that has n samples per pixel."""
+    (left, top), (right, bottom) = n * low, n * high
+    return image[top:bottom, left:right]
 
 
 class _Drawing:
@@ -241,18 +227,18 @@ class _Drawing:
         n, pose = self._n, camera.inverse() @ body
         points = pose.apply(self._points)
         ahead = points[:, 2] > NEAR
-        whole = _Window(0, 0, self._camera.width, self._camera.height)
         if not ahead.any():
             return
         pixels = self._camera.project(np.where(ahead[:, None], points, 1.0))
-        window = whole.around(pixels[ahead])
-        if not all(window.size):
+        low, high = _around(pixels[ahead], 0, (self._camera.width, self._camera.height))
+        if not (low < high).all():
             return
-        fine = np.zeros((n * window.size[1], n * window.size[0], 2), np.float32)
+        size = (high - low).tolist()
+        fine = np.zeros((n * size[1], n * size[0], 2), np.float32)
         light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(
             self._normals @ body.rotation.T @ _SUN, 0.0)
         # The centre of a sample lies half a sample from the edge of its pixel.
-        corners = np.rint((((pixels - window[:2]) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
+        corners = np.rint((((pixels - low) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         eye = pose.inverse().translation
         shown = np.logical_and.reduceat(ahead, self._starts) & (
             self._two_sided | (np.sum(self._normals * (eye - self._middles), axis=1)
@@ -266,37 +252,35 @@ class _Drawing:
             if texture is None and face.opacity == 1.0:
                 cv2.fillConvexPoly(fine, corners[part], colour, shift=_SHIFT)
                 continue
-            inner = window.around(pixels[part])
-            if not all(inner.size):
+            first, end = _around(pixels[part], low, high)
+            if not (first < end).all():
                 continue
+            behind = _part(fine, first - low, end - low, n)
             if texture is not None:
-                self._print(fine, window, inner, points[part],
+                self._print(behind, _part(self._rays, first, end), points[part],
                             texture * np.array([light[k], 1.0], np.float32))
                 continue
-            behind = inner.of(fine, n, window.left, window.top)
             painted = behind.copy()
-            offset = n * 2 ** _SHIFT * np.subtract(inner[:2], window[:2], dtype=np.int32)
+            offset = (n * 2 ** _SHIFT * (first - low)).astype(np.int32)
             cv2.fillConvexPoly(painted, corners[part] - offset, colour, shift=_SHIFT)
             behind += np.float32(face.opacity) * (painted - behind)
-        drawn = cv2.resize(fine, window.size, interpolation=cv2.INTER_AREA)
-        seen = window.of(image)
+        drawn = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+        seen = _part(image, low, high)
         seen[:] = drawn[..., 0] + (1.0 - drawn[..., 1]) * seen
 
-    def _print(self, fine: Image, window: _Window, inner: _Window, corners: Array,
-               texture: Image) -> None:
+    def _print(self, behind: Image, rays: Image, corners: Array, texture: Image) -> None:
         """Draw a print whose corners (4, 3) are in the optical frame, on light and cover."""
         # A ray meets the plane of the print at corner 0 + s (1 - 0) + t (3 - 0), in shares s, t.
         # Texels are at places / nearness.
         to_print = np.linalg.inv(np.stack(
             [corners[1] - corners[0], corners[3] - corners[0], corners[0]], axis=1))
         to_print[:2] *= np.reshape(texture.shape[1::-1], (2, 1))
-        column, row, nearness = cv2.split(cv2.transform(inner.of(self._rays), to_print))
+        column, row, nearness = cv2.split(cv2.transform(rays, to_print))
         nearness, n = np.maximum(nearness, np.float32(1e-3)), self._n
         places = cv2.resize(cv2.merge([column / nearness, row / nearness]) - np.float32(0.5),
                             None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
-        part = inner.of(fine, n, window.left, window.top)
         seen = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderValue=0)
-        part[:] = seen + (1.0 - seen[..., 1:]) * part
+        behind[:] = seen + (1.0 - seen[..., 1:]) * behind
 
 
 def _texture(cells: Array) -> Image:

@@ -54,7 +54,6 @@ PLANNER_STEPS = 12
 
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
-        noise: PerceptionNoise | None = None,
         cpu_time: Callable[[], float] = lambda: 0.0,
         law: type[FlockingParams] = FlockingParams) -> Flights:
     """
@@ -65,10 +64,12 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     :param law: the law, or a controller in its place: see ``controllers``.
     """
-    world, noise = World(scenario, runs), noise or _noise(scenario)
+    world, noise = World(scenario, runs), _noise(scenario)
     lookout = Lookout(world, noise)
     followers = _followers(world, guard, noise, cpu_time, law)
-    flock, radio = scenario.company, _radio(scenario, runs)
+    flock = scenario.company
+    radio: Radio[OdometryState] = Radio(
+        flock.followers, flock.delay, flock.loss, world.random('radio'))
     failing = [] if flock.fails is None else followers[
         flock.fails.follower - 1::flock.followers]
     count = round(scenario.duration / STEP)
@@ -133,10 +134,3 @@ def _followers(world: World, guard: bool, noise: PerceptionNoise,
         followers.append(SimulatedFollower(
             scenario, guard, run, frame, T_world_odom.inverse(), start, view, name, cpu_time, law))
     return followers
-
-
-def _radio(scenario: Scenario, runs: Sequence[int]) -> Radio[OdometryState]:
-    flock = scenario.company
-    return Radio(flock.followers, flock.delay, flock.loss, [
-        scenario.random(run, 'radio', number)
-        for run in runs for number in range(1, flock.followers + 1)])

@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 
 from flock_desk.closed_loop.scenario_run import ScenarioRun
-from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP
+from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP, Motion
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
 from flock_desk.vehicles.flight_log import FlightLog
@@ -46,7 +46,30 @@ RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRID
                       'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 
 
-class EmbeddedVehicle:
+class _Reported:
+    """
+    A vehicle by its motion, which comes step by step.
+
+    :param start_ns: time zero of the flight on the clock of ``motion``.
+    :param origin: (3,), m, of the frame of ``motion`` in that of the flight.
+    """
+
+    def __init__(self, motion: ExternalMotion, start_ns: int, origin: Array) -> None:
+        self._motion, self._start_ns, self.origin = motion, start_ns, origin
+
+    def at(self, time_ns: int) -> Odometry:
+        """Return the true motion at a time of the last 0.3 s, interpolated; no covariances."""
+        motion = self._motion.at(self._start_ns + time_ns)
+        return Odometry(
+            time_ns * 1e-9, self.origin + motion.position, motion.quaternion,
+            quaternion_to_matrix(motion.quaternion).T @ motion.velocity, motion.angular)
+
+    def knows(self, time_ns: int) -> bool:
+        """Return whether motion was reported shortly before and after a time."""
+        return self._motion.knows(self._start_ns + time_ns)
+
+
+class EmbeddedVehicle(_Reported):
     """
     The vehicle of an embedded PX4, which is stepped before each step here.
 
@@ -56,10 +79,11 @@ class EmbeddedVehicle:
     """
 
     def __init__(self, now: float, altitude: float, system_id: int = 1) -> None:
-        self.autopilot = autopilot = EmbeddedAutopilot(
+        super().__init__(ExternalMotion(), 0, np.zeros(3))
+        self.autopilot = EmbeddedAutopilot(
             'px4', now=now, altitude=altitude, system_id=system_id, parameters=RECOMMENDED)
-        self.log = autopilot.log
-        self._rotation = autopilot.vehicle.rotation
+        self.log = self.autopilot.log
+        self._rotation = self.autopilot.vehicle.rotation
 
     @property
     def offboard(self) -> bool:
@@ -68,58 +92,43 @@ class EmbeddedVehicle:
 
     def step(self, time_ns: int) -> Odometry:
         """Return the true motion, without covariances, a step after that returned before."""
-        vehicle = self.autopilot.vehicle
-        before, self._rotation = self._rotation, vehicle.rotation
-        return _motion(time_ns, vehicle.position, vehicle.velocity, before, self._rotation)
+        vehicle, before = self.autopilot.vehicle, self._rotation
+        self._rotation = vehicle.rotation
+        self._motion.add(Motion(
+            time_ns, vehicle.position, vehicle.velocity, matrix_to_quaternion(self._rotation),
+            matrix_to_rotation_vector(before.T @ self._rotation) / STEP))
+        return self.at(time_ns)
 
-    def knows(self, time_ns: int) -> bool:
-        """Return True."""
-        return True
 
-
-class ExternalVehicle:
+class ExternalVehicle(_Reported):
     """
     The vehicle of an external autopilot, in the ENU frame of that.
 
-    :param start_ns: time zero of the flight on the clock of ``motion``.
     :param height: m above the ground, of its first reported place.
     """
 
     def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
+        super().__init__(motion, start_ns, np.array([0.0, 0.0, height]))
         self.offboard = False
         """Whether it obeys the bridge's setpoints, by the bridge's state; set by the owner."""
         self.armed, self.mode = False, ''
         """Armed and mode by the HEARTBEAT, for the log; set by the owner."""
         self.log = FlightLog()
-        self._motion, self._start_ns = motion, start_ns
-        self.origin = np.array([0.0, 0.0, height])
-        """(3,), m, of the frame of ``motion``."""
         self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
         """Return the reported motion, interpolated."""
-        motion = self._motion.at(self._start_ns + time_ns)
-        position = self.origin + motion.position
-        self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
-                       np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
-                       self.mode)
+        state = self.at(time_ns)
+        before, self._rotation = self._rotation, quaternion_to_matrix(state.quaternion)
+        self.log.moved((self._start_ns + time_ns) * 1e-9, state.position,
+                       self._rotation @ state.linear, np.full(3, np.nan),
+                       yaw_from_quaternion(state.quaternion), self.armed, self.mode)
         # Not the reported rates: poses arrive unevenly, and the camera sees that.
-        before, self._rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
-        return _motion(time_ns, position, motion.velocity, before, self._rotation)
-
-    def knows(self, time_ns: int) -> bool:
-        """Return whether poses were reported shortly before and after a time of the last 0.3 s."""
-        return self._motion.knows(self._start_ns + time_ns)
+        return state._replace(
+            angular=matrix_to_rotation_vector(before.T @ self._rotation) / STEP)
 
 
 FlownVehicle = EmbeddedVehicle | ExternalVehicle
-
-
-def _motion(time_ns: int, position: Array, velocity: Array, before: Array,
-            rotation: Array) -> Odometry:
-    """Return the motion; the rates are those of the attitude since the step before."""
-    return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
-                    rotation.T @ velocity, matrix_to_rotation_vector(before.T @ rotation) / STEP)
 
 
 class ScenarioLeader:
@@ -161,17 +170,8 @@ class ScenarioLeader:
         return True
 
 
-class ExternalLeader:
-    """
-    A leader that an external autopilot flies and reports.
-
-    :param motion: with the same ``origin`` as the follower's.
-    :param start_ns: time zero of the flight on the clock of ``motion``.
-    :param origin: (3,), m, of the frame of ``motion`` in that of the flight.
-    """
-
-    def __init__(self, motion: ExternalMotion, start_ns: int, origin: Array) -> None:
-        self._motion, self._start_ns, self._origin = motion, start_ns, origin
+class ExternalLeader(_Reported):
+    """A leader that an external autopilot flies; its motion has the follower's ``origin``."""
 
     def step(self, follower: Odometry, time: float, offboard: bool) -> None:
         """Do nothing: the leader flies by itself."""
@@ -181,14 +181,7 @@ class ExternalLeader:
         newest, at = self._motion.newest, self._start_ns + time_ns
         if newest is None or at - newest > LONGEST_GAP:
             return None
-        leader = self._motion.at(at)
-        return Odometry(time, self._origin + leader.position, leader.quaternion,
-                        quaternion_to_matrix(leader.quaternion).T @ leader.velocity,
-                        leader.angular)
-
-    def knows(self, time_ns: int) -> bool:
-        """Return whether poses were reported shortly before and after."""
-        return self._motion.knows(self._start_ns + time_ns)
+        return self.at(time_ns)._replace(time=time)
 
 
 FlownLeader = ScenarioLeader | ExternalLeader

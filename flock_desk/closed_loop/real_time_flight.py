@@ -46,7 +46,6 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,
-    slerp,
     Transform,
 )
 
@@ -95,8 +94,9 @@ class RealTimeFlight:
         self._images = 0
         self._leader = leader or ScenarioLeader(
             self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
-        self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
-        self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
+        self.follower = vehicle.step(0)
+        """The follower's true motion at the last step."""
+        self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
@@ -118,16 +118,10 @@ class RealTimeFlight:
         return (math.nan if leader is None
                 else float(np.linalg.norm(leader.position - self.follower.position)))
 
-    @property
-    def follower(self) -> Odometry:
-        """Return the follower's true motion at the last step."""
-        return self._past[-1]
-
     def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
-        state = self.vehicle.step(self.time_ns)
-        self._past.append(state)
+        self.follower = state = self.vehicle.step(self.time_ns)
         if self.began_ns is None and engaged and self.vehicle.offboard:
             self.began_ns = self.time_ns
             self.skipped_images = 0
@@ -174,24 +168,10 @@ class RealTimeFlight:
         motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
         leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
         pixels = self.camera.image(
-            self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
+            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                             self.truth(stamp_ns), leader, usable)
-
-    def truth(self, time_ns: int) -> Odometry:
-        """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
-        time = time_ns * 1e-9
-        after = next((k for k, state in enumerate(self._past) if state.time >= time),
-                     len(self._past) - 1)
-        b = self._past[after]
-        a = self._past[max(after - 1, 0)]
-        share = 1.0 if b.time == a.time else min(max((time - a.time) / (b.time - a.time), 0.0),
-                                                 1.0)
-        mixed = [(1.0 - share) * x + share * y
-                 for x, y in ((a.position, b.position), (a.linear, b.linear))]
-        return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular)
+                             self.vehicle.at(stamp_ns), leader, usable)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9

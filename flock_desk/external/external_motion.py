@@ -84,14 +84,15 @@ class BootClock:
         self._boot = 0  # ms since boot, unwrapped
         self._offset = math.inf  # s, ours less the autopilot's
         self._received = 0.0
-        self.reboots = 0
+        self.rebooted = False
+        """Whether the newest message is the first one after a reboot."""
 
     def stamp(self, time_boot_ms: int, now: int) -> int:
         """Return the stamp of a message received now, ns of the own clock."""
         if self._last is not None:
             step = (time_boot_ms - self._last + _WRAP // 2) % _WRAP - _WRAP // 2
-            if step < -_REBOOT:
-                self.reboots += 1
+            self.rebooted = step < -_REBOOT
+            if self.rebooted:
                 self._offset, step = math.inf, 0
             self._boot += step
         self._last = time_boot_ms
@@ -112,7 +113,6 @@ class ExternalMotion:
     def __init__(self) -> None:
         self.source = ''
         """Name of the message that places it; '' until a truth comes, or ``use_estimate``."""
-        self.reboots = 0
         self.times: list[tuple[float, float]] = []
         """Own time and the autopilot's since it booted, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
@@ -225,8 +225,7 @@ class ExternalMotion:
 
     def _estimate(self, message: Any, now: int) -> None:
         time = self._clock.stamp(message.time_boot_ms, now)
-        if self._clock.reboots > self.reboots:
-            self.reboots = self._clock.reboots
+        if self._clock.rebooted:
             self._poses.clear()
         turned, self._turned = self._turned, None
         if turned is None:

@@ -194,6 +194,7 @@ def equal_scales(axis: Axes) -> None:
 
 
 def draw_distance(axis: Axes, flight: Flight, table: Table) -> None:
+    """Draw the estimated and the true distance in the band; the table has rows of gaps."""
     law = flight.params.law
     low, high = np.sqrt(law.d0), np.sqrt(law.d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
@@ -214,6 +215,7 @@ def draw_distance(axis: Axes, flight: Flight, table: Table) -> None:
 
 
 def draw_above(axis: Axes, flight: Flight) -> None:
+    """Draw the paths from above, and lines between leader and follower at the same times."""
     times = flight.table['time']
     period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
     draw_map(axis, flight.paths, f'from above (● start, ■ end; a line every {period:.0f} s)')
@@ -298,6 +300,7 @@ def _usually(values: Array, percentile: float) -> float:
 
 
 def encoded(figure: Figure, kind: str = 'png') -> bytes:
+    """Return a figure as an image file, PNG or JPEG ('jpg')."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, pil_kwargs={'quality': 88} if kind == 'jpg' else None)
     return buffer.getvalue()

@@ -176,28 +176,27 @@ class _ScenarioReader:
         self._path = path
 
     def dataclass(self, kind: Any, node: Any, where: str, before: Any = None,
-                  **given: Any) -> Any:
+                  name: str = '') -> Any:
         """Return one of a kind; a missing key is as in ``before``, or the default."""
+        allowed = [f.name for f in fields(kind) if f.name != 'name']  # that of the file
         if not isinstance(node, yaml.MappingNode):
             raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
-                                    f'{", ".join(self._keys(kind, given))}')
+                                    f'{", ".join(allowed)}')
         hints = get_type_hints(kind)
-        values = dict(given)
+        values: dict[str, Any] = {'name': name} if name else {}
         lines: dict[str, Any] = {}
         for key, value in node.value:
-            name = key.value
-            if name not in self._keys(kind, given):
-                allowed = list(self._keys(kind, given))
-                like = difflib.get_close_matches(str(name), allowed, 1)
+            if key.value not in allowed:
+                like = difflib.get_close_matches(str(key.value), allowed, 1)
                 hint = f' (did you mean {like[0]}?)' if like else ''
-                raise self._error(key, f'{where}{name}: unknown key{hint}: must be one of '
+                raise self._error(key, f'{where}{key.value}: unknown key{hint}: must be one of '
                                        f'{", ".join(allowed)}')
-            if name in lines:
-                raise self._error(key, f'{where}{name}: given twice, first in line '
-                                       f'{lines[name].start_mark.line + 1}')
-            lines[name] = value
-            values[name] = self._value(hints[name], value, f'{where}{name}',
-                                       getattr(before, name, None))
+            if key.value in lines:
+                raise self._error(key, f'{where}{key.value}: given twice, first in line '
+                                       f'{lines[key.value].start_mark.line + 1}')
+            lines[key.value] = value
+            values[key.value] = self._value(hints[key.value], value, f'{where}{key.value}',
+                                            getattr(before, key.value, None))
         for f in fields(kind):
             if before is None and f.name not in values and f.default is MISSING and (
                     f.default_factory is MISSING):
@@ -207,9 +206,6 @@ class _ScenarioReader:
         except ValueError as error:
             named = str(error).split(' = ')[0]
             raise self._error(lines.get(named, node), f'{where}{error}') from None
-
-    def _keys(self, kind: Any, given: dict[str, Any]) -> Iterator[str]:
-        return (f.name for f in fields(kind) if f.name not in given)
 
     def _value(self, kind: Any, node: Any, where: str, before: Any = None) -> Any:
         if get_origin(kind) is UnionType:  # a part that may be missing
@@ -265,12 +261,10 @@ def _table(where: str, part: type) -> str:
     hints = get_type_hints(part)
     title = f'`{where}`' if where else 'The file'
     rows = [f'\n## {title}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
-            '| key | default | valid | meaning |', '|---|---|---|---|']
-    for field in fields(part):  # type: ignore[arg-type]
-        if field.name == 'name':
-            continue  # that of the file
-        rows.append(f'| `{field.name}` | {_default(field)} | {_valid(field, hints)} | '
-                    f'{field.metadata.get("meaning", "")} |')
+            '| key | default | valid | meaning |', '|---|---|---|---|',
+            *(f'| `{field.name}` | {_default(field)} | {_valid(field, hints)} | '
+              f'{field.metadata.get("meaning", "")} |'
+              for field in fields(part) if field.name != 'name')]  # type: ignore[arg-type]
     return '\n'.join(rows) + '\n'
 
 

@@ -38,7 +38,7 @@ from flock_desk.vehicles.flight_controller import ACCEPTED, FlightController
 from flock_desk.vehicles.flight_log import FlightLog
 from flock_desk.vehicles.profiles import Parameters, PROFILES
 from flock_desk.vehicles.px4 import Px4
-from flock_desk.vehicles.quadrotor import Quadrotor, VehicleParams
+from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import (
     Array,
     enu_to_ned,
@@ -99,7 +99,7 @@ class EmbeddedAutopilot:
         self._silent_until = -math.inf
         self._arming_denial, self._ready_after = arming_denial, ready_after
         self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
-                                 VehicleParams(tilt_max=self._profile.tilt_max))
+                                 self._profile.tilt_max)
         self.barometer = Barometer([np.random.default_rng([seed, 1])])
         self.charge: float | None = 1.0
         """Remaining charge of the battery, a share; None: unknown. A reboot keeps it."""

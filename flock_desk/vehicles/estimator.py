@@ -97,10 +97,6 @@ class Estimator:
         """Return the time since the last valid vision, s; 0 if it does not use vision."""
         return now - self._vision_time if self.uses_vision else 0.0
 
-    def ready(self, now: float) -> bool:
-        """Return whether the position has been estimated."""
-        return self.started(now) and math.isfinite(self.vision_age(now))
-
     def started(self, now: float) -> bool:
         """Return whether it runs, be it without anything to rest on."""
         return now >= self._ready_at

@@ -21,7 +21,6 @@ one vehicle, or as many independent ones as its arrays have rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import Any, Final
 
@@ -33,26 +32,13 @@ from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion, matrix
 _UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
-class VehicleParams:
-    """Dynamics of the vehicle; the defaults resemble a 250 mm to 450 mm quadrotor on PX4."""
-
-    attitude_time: float = 0.15
-    """Time constant of tilting, s."""
-    thrust_time: float = 0.05
-    """Time constant of the thrust, s."""
-    tilt_max: float = math.radians(45.0)
-    """Largest tilt, rad."""
-    thrust_max: float = 2.0 * GRAVITY
-    """Largest specific thrust, m/s^2."""
-    yaw_gain: float = 2.8
-    """Yaw rate for a yaw error, 1/s."""
-    yaw_rate_max: float = math.radians(60.0)
-    """Largest yaw rate, rad/s."""
-    drag: float = 0.1
-    """Deceleration for a speed through the air, 1/s."""
-    thrust_error: float = 0.008
-    """Error of the hover thrust, m/s^2: without height control it climbs 0.9 m in 15 s."""
+# Dynamics of a 250 mm to 450 mm quadrotor on PX4.
+ATTITUDE_TIME, THRUST_TIME = 0.15, 0.05  # s, time constants of tilting and of the thrust
+TILT_MAX = math.radians(45.0)
+THRUST_MAX = 2.0 * GRAVITY  # m/s^2, specific
+YAW_GAIN, YAW_RATE_MAX = 2.8, math.radians(60.0)  # yaw rate for a yaw error, 1/s, and its limit
+DRAG = 0.1  # 1/s, deceleration for a speed through the air
+THRUST_ERROR = 0.008  # m/s^2, of the hover thrust: without height control it climbs 0.9 m in 15 s
 
 
 class Quadrotor:
@@ -66,8 +52,8 @@ class Quadrotor:
     """
 
     def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0,
-                 params: VehicleParams | None = None) -> None:
-        self.params = params or VehicleParams()
+                 tilt_max: float = TILT_MAX) -> None:
+        self._tilt_max = tilt_max  # rad
         self.position: Array = np.array(position, dtype=float)
         self.velocity: Array = np.zeros_like(self.position)
         self.acceleration: Array = np.zeros_like(self.position)
@@ -75,7 +61,7 @@ class Quadrotor:
         self.axis: Array = np.zeros_like(self.position) + _UP
         """The body's z axis in ENU."""
         self.thrust: Any = np.where(self.position[..., 2] > 0.0, GRAVITY, 0.0)
-        self.thrust_error: Any = self.params.thrust_error
+        self.thrust_error: Any = THRUST_ERROR
         """Error of the hover thrust, m/s^2; one for each vehicle, or one for all."""
         self._before: tuple[Array, Any, float] = self.axis, self.yaw, 1.0
 
@@ -117,11 +103,11 @@ class Quadrotor:
             thrust = np.zeros_like(thrust)
         tilt = np.where(landed[..., None], _UP, tilt)
         self.thrust = self.thrust + (thrust - self.thrust) * -math.expm1(
-            -dt / self.params.thrust_time)
-        self.axis = _turn(self.axis, tilt, -math.expm1(-dt / self.params.attitude_time))
+            -dt / THRUST_TIME)
+        self.axis = _turn(self.axis, tilt, -math.expm1(-dt / ATTITUDE_TIME))
         rate = np.minimum(np.maximum(
-            self.params.yaw_gain * _wrapped(np.asarray(yaw) - self.yaw),
-            -self.params.yaw_rate_max), self.params.yaw_rate_max)
+            YAW_GAIN * _wrapped(np.asarray(yaw) - self.yaw),
+            -YAW_RATE_MAX), YAW_RATE_MAX)
         self.yaw = _wrapped(self.yaw + np.where(landed, 0.0, rate * dt))
         self._move(dt, powered, landed, np.asarray(wind, dtype=float))
 
@@ -130,17 +116,17 @@ class Quadrotor:
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = np.maximum(force[..., 2], 0.1 * GRAVITY)
         level = np.hypot(force[..., 0], force[..., 1])
-        most = up * math.tan(self.params.tilt_max)
+        most = up * math.tan(self._tilt_max)
         force *= np.where(level > most, most / np.maximum(level, 1e-9), 1.0)[..., None]
         force[..., 2] = up
         size = np.sqrt(np.sum(force * force, axis=-1))
-        return np.minimum(size, self.params.thrust_max), force / size[..., None]
+        return np.minimum(size, THRUST_MAX), force / size[..., None]
 
     def _move(self, dt: float, powered: bool, landed: Any, wind: Array) -> None:
         force = self.thrust[..., None] * self.axis
         error = np.asarray(self.thrust_error if powered else 0.0)
         acceleration = (force + (error - GRAVITY)[..., None] * _UP
-                        - self.params.drag * (self.velocity - wind))
+                        - DRAG * (self.velocity - wind))
         # On the ground it stays until the thrust clearly exceeds its weight.
         flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]
         self.acceleration = np.where(flying, acceleration, 0.0)

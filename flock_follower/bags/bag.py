@@ -108,7 +108,10 @@ class Bag(AbstractContextManager['Bag']):
             if why := _unreadable(connections):
                 self.skipped[name] = why
             else:
-                self.topics[name] = _topic(name, connections)
+                self.topics[name] = Topic(
+                    name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
+                    any(c.ext.latching if isinstance(c.ext, ConnectionExtRosbag1) else
+                        is_latched(c) for c in connections))
         self._connections = groups
 
     @property
@@ -190,14 +193,11 @@ def open_bag(path: str | Path) -> Bag:
                 raise BagError(f'{database}: {problem}')
         reader = _reader(path, bool(cut or (reason and path.is_dir() and mcap_files(path))))
         reader.open()
-        try:
-            bag = Bag(path, reader, reason)
-            if bag.message_count == 0:
-                reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
-                raise BagError(f'{path}: holds no message that can be read{reasons}')
-        except BaseException:
-            reader.close()
-            raise
+        bag = Bag(path, reader, reason)
+        if bag.message_count == 0:
+            bag.close()
+            reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
+            raise BagError(f'{path}: holds no message that can be read{reasons}')
     return bag
 
 
@@ -237,12 +237,6 @@ def reason_of(error: Exception) -> str:
 def absolute(topic: str) -> str:
     """Return the name of a topic with a slash before it, and none after it."""
     return f'/{topic.strip("/")}'
-
-
-def _topic(name: str, connections: list[Connection]) -> Topic:
-    return Topic(name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
-                 any(c.ext.latching if isinstance(c.ext, ConnectionExtRosbag1) else is_latched(c)
-                     for c in connections))
 
 
 def _unreadable(connections: list[Connection]) -> str | None:

@@ -29,13 +29,14 @@ disengages it. After ``resume_timeout`` without a neighbour the commands end. Bo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 import math
 import os
 import sys
 import time
-from typing import Any, TypeVar
+from typing import Any
 
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
@@ -75,7 +76,6 @@ from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 
-Dated = TypeVar('Dated', OdometryState, AccelerationState)
 #: ns between the stamps of a neighbour's state and of its acceleration, two messages.
 ACCELERATION_AGE = 100_000_000
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
@@ -105,14 +105,13 @@ class Planner(FlockNode):
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
-            self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
-                      required=False),
+            self._poll_states(Odometry, MOTION_TOPIC, from_odometry, self._take_motion, 200),
             self.poll(Odometry, 'odom', self._take_odom, best_effort(200)),
-            self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
-                      self._take_acceleration, best_effort(100), required=False),
-            self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(100)),
-            self.poll(Odometry, 'neighbors/heard', self._take_received, best_effort(50),
-                      required=False),
+            self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
+                              from_acceleration, self._take_acceleration, 100),
+            self._poll_states(Odometry, 'neighbors', from_odometry, self._take_neighbor, 100,
+                              required=True),
+            self._poll_states(Odometry, 'neighbors/heard', from_odometry, self._take_received, 50),
             *(self.poll(CameraInfo, camera.camera_info,
                         partial(self._take_camera_info, camera=camera.name), best_effort(),
                         required=False) for camera in configured)]
@@ -148,29 +147,25 @@ class Planner(FlockNode):
         return not self._loop.waiting(self._bridge_age()) and (
             self._settings.values['require_bridge'] or self._loop.engaged)
 
-    def _fresh(self, topic: str, message: Any) -> bool:
-        return self._even_clock.fresh(topic, stamp_to_nanoseconds(message.header.stamp))
-
-    def _dated(self, state: Dated, arrival: int) -> Dated:
-        """Return a state with its stamp on the loop's clock, and no later than its arrival."""
-        if self._even_clock.simulated:
-            return state
-        return state._replace(stamp=min(state.stamp, arrival) - self._even_clock.shift)
+    def _poll_states(self, kind: Any, topic: str, convert: Callable[[Any], Any],
+                     take: Callable[[Any, int], None], depth: int,
+                     required: bool = False) -> Callable[[], None]:
+        """Poll a topic; ``take`` gets states, their stamps by the loop's clock, and arrivals."""
+        def taken(message: Any, arrival: int) -> None:
+            if self._even_clock.fresh(topic, stamp_to_nanoseconds(message.header.stamp)):
+                state = convert(message)
+                take(state._replace(stamp=self._even_clock.dated(state.stamp, arrival)), arrival)
+        return self.poll(kind, topic, taken, best_effort(depth), required=required)
 
     def _take_odom(self, message: Odometry, arrival: int) -> None:
         shift = self._even_clock.shift
-        if not self._fresh('odom', message):
+        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
             return
         state = self._own.take(message, arrival - shift, shift)
         if state is not None:
             if not self._even_clock.simulated:
                 state = state._replace(stamp=min(state.stamp, arrival - shift))
             self._loop.take_odometry(state, arrival - shift)
-
-    def _take_motion(self, message: Odometry, arrival: int) -> None:
-        if self._fresh(MOTION_TOPIC, message):
-            self._loop.take_odometry(
-                self._dated(from_odometry(message), arrival), arrival - self._even_clock.shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -183,22 +178,20 @@ class Planner(FlockNode):
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
         return time.monotonic() - self._bridge_received
 
-    def _take_neighbor(self, message: Odometry, arrival: int) -> None:
-        if self._fresh('neighbors', message):
-            state = self._dated(from_odometry(message), arrival)
-            reported = self._accelerations.get(state.child)
-            if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
-                state = with_acceleration(state, reported)
-            self._loop.take_neighbor(state)
+    def _take_neighbor(self, state: OdometryState, _: int) -> None:
+        reported = self._accelerations.get(state.child)
+        if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
+            state = with_acceleration(state, reported)
+        self._loop.take_neighbor(state)
 
-    def _take_received(self, message: Odometry, arrival: int) -> None:
-        if self._fresh('neighbors/heard', message):
-            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), received=True)
+    def _take_received(self, state: OdometryState, _: int) -> None:
+        self._loop.take_neighbor(state, received=True)
 
-    def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
-        if self._fresh('neighbors/acceleration', message):
-            state = self._dated(from_acceleration(message), arrival)
-            self._accelerations[state.child] = state
+    def _take_motion(self, state: OdometryState, arrival: int) -> None:
+        self._loop.take_odometry(state, arrival - self._even_clock.shift)
+
+    def _take_acceleration(self, state: AccelerationState, _: int) -> None:
+        self._accelerations[state.child] = state
 
     def _take_camera_info(self, message: CameraInfo, _: int = 0, camera: str = '') -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model

@@ -195,7 +195,7 @@ class CameraModel:
 
     def linear_map(self, x: float, y: float) -> Array:
         """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
-        over_x, over_xy, over_y = map(float, self._slopes(x, y))
+        over_x, over_xy, over_y = self._slopes(x, y)
         mapped: Array = self.matrix[:2, :2].dot(np.array([[over_x, over_xy], [over_xy, over_y]]))
         return mapped
 

@@ -34,6 +34,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_follower.geometry import Array
+
 #: The largest image decoded, pixels: 8K, more than any camera in flight sends.
 MAX_PIXELS: Final[int] = 7680 * 4320
 _PNG: Final[bytes] = b'\x89PNG\r\n\x1a\n'
@@ -221,3 +223,10 @@ def encode_jpeg(image: GrayImage, quality: int) -> bytes:
     if not done:
         raise ValueError(f'image of {image.shape[1]}x{image.shape[0]} px: cannot be encoded')
     return bytes(data)
+
+
+def grey_levels(image: GrayImage, pixels: Array) -> Any:
+    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
+    at = pixels.astype(np.float32)[:, None]
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)

@@ -50,10 +50,9 @@ LIMIT = 16.0
 MOST = 0.05
 #: Lower limit of the variance of the attitude, as share of the initial one.
 LEAST = 0.04
-#: Lower limits of the shares of a measured position's and attitude's variance: of the position
-#: that of independent edges; the attitude of a marker seen from the front errs now and then by
-#: more, and alike for some images, which changes do not show.
-LEAST_SHARES = (WIDENING**-2, WIDENING**-1)
+#: Lower limit of the shares of a measured pose's variances. It is not that of independent edges: a
+#: marker seen from the front errs now and then by more, and alike for some images.
+LEAST_SHARE = 1.0 / WIDENING
 _LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
@@ -86,19 +85,19 @@ class LearntNoise:
         """Return the noise of the distance, one standard deviation, a share of it."""
         return math.sqrt(self._along)
 
-    def covariance(self, measured: Array, sight: Array) -> Array:
-        """
-        Return the covariance (6, 6) of a pose, with the noise of the own attitude.
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Return the factors on the deviations of a measured position and attitude."""
+        place, turn = self.shares
+        return math.sqrt(place), math.sqrt(turn)
 
-        :param measured: the covariance (6, 6) by the image alone, :param sight: (3,), m.
-        """
+    def covariance(self, sight: Array) -> Array:
+        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
         # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
         # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()
         leverage[:3] = skew(-sight)
-        scale = np.sqrt(self.shares).repeat(3)
-        covariance: Array = leverage.dot(self._across * leverage.T) + measured * (
-            scale[:, None] * scale)
+        covariance: Array = leverage.dot(self._across * leverage.T)
         if self._along:
             covariance[:3, :3] += self._along * sight[:, None] * sight
         return covariance
@@ -111,7 +110,8 @@ class LearntNoise:
         """
         # In plain numbers: for every image, and so small.
         (x, y, z), (u, v, w, *turn) = sight.tolist(), change.tolist()
-        (xx, xy, xz, *_), (_, yy, yz, *_), (_, _, zz, *_) = expected.tolist()[:3]
+        rows = expected.tolist()
+        (xx, xy, xz, *_), (_, yy, yz, *_), (_, _, zz, *_) = rows[:3]
         squared = x * x + y * y + z * z
         along = (x * u + y * v + z * w)**2 / squared
         variance = (x * x * xx + y * y * yy + z * z * zz
@@ -120,17 +120,21 @@ class LearntNoise:
         self._count = min(self._count + 1, LEARNT)
         # Two axes across, each off by the noise times the distance, in two innovations.
         for_attitude = _excess(across, across_variance) / (4.0 * squared * self._count)
-        for_distance = _excess(along, variance) / (2.0 * squared * self._count)
         self._across = min(max(self._across + for_attitude, LEAST * self._initial), MOST**2)
-        self._along = min(max(self._along + for_distance, 0.0), MOST**2)
-        self._share(0, along, variance)
+        # Noise of the distance is added only once all of the measured variance is noise.
+        if self._along or (self.shares[0] == 1.0 and along > variance):
+            for_distance = _excess(along, variance) / (2.0 * squared * self._count)
+            self._along = min(max(self._along + for_distance, 0.0), MOST**2)
+        else:
+            self._share(0, along, variance)
         if turn:
-            self._share(1, sum(a * a for a in turn), float(expected.diagonal()[3:].sum()))
+            a, b, c = turn
+            self._share(1, a * a + b * b + c * c, rows[3][3] + rows[4][4] + rows[5][5])
 
     def _share(self, which: int, squared: float, expected: float) -> None:
         """Learn one of the shares from the square of a change and its expected value."""
         share = self.shares[which] * (1.0 + (squared / expected - 1.0) / self._count)
-        self.shares[which] = min(max(share, LEAST_SHARES[which]), 1.0)
+        self.shares[which] = min(max(share, LEAST_SHARE), 1.0)
 
 
 def _excess(squared: float, expected: float) -> float:

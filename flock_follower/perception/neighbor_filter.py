@@ -343,9 +343,9 @@ class NeighborFilter:
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
-        learnt = self._motion
+        quiet = [min(factor, 1.0) for factor in self._motion.factors]
         self.reset()
-        self._motion = learnt
+        self._motion.factors = quiet  # a high one may come from what made the track restart
         to_body = POSE.T @ _to_body(body.rotation @ reference)
         full = to_body @ covariance @ to_body.T
         velocity: Array = np.zeros(3)

@@ -197,10 +197,12 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        due = next((k for k, each in enumerate(self._pending) if self._ready(each, now)), None)
-        if due is None:
+        for image in self._pending:
+            if self._ready(image, now):
+                break
+        else:
             return None
-        image = self._pending.pop(due)
+        self._pending = [each for each in self._pending if each is not image]
         image = image._replace(model=self._cameras[image.camera].model)
         sighting, pixels = Sighting(), None
         start = decoded = clock()

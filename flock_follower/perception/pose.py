@@ -239,9 +239,11 @@ def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Tr
 
 def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
-    lines = found.lines
+    lines, codes = found.lines, found.lines.model.codes
+    if len(codes) == 1:
+        return np.array([shows_code(image, lines.cells, codes[0], tracked)])
     return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code, tracked)
-                     for k, code in enumerate(lines.model.codes)])
+                     for k, code in enumerate(codes)])
 
 
 def _scale(found: EdgeFit) -> float:

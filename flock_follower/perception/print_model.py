@@ -31,12 +31,11 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import GrayImage, grey_levels
 from flock_follower.perception.markers import (
     correctable_cells,
     dictionary_words,
@@ -137,9 +136,9 @@ class CellCode:
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
-    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors``
-    of them may be misread. ``others`` (w, b): all other codewords of the dictionary, in all
-    rotations. ``windows``: cells that are compared with one another under uneven light.
+    rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread. ``others``
+    (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells that are
+    compared with one another under uneven light.
     """
 
     centers: Array
@@ -249,13 +248,6 @@ def _is_word(read: Array, code: CellCode) -> bool:
     return bool(code.bits.dot(read) > code.others.dot(read).max())
 
 
-def grey_levels(image: GrayImage, pixels: Array) -> Any:
-    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
-    at = pixels.astype(np.float32)[:, None]
-    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)
-
-
 def median(values: Any) -> float:
     """Return the upper median: np.median takes ten times as long."""
     ordered = values.copy()
@@ -310,14 +302,16 @@ class EdgeModel:
 
     def __post_init__(self) -> None:
         """Derive what depends on the edges' directions."""
-        object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
-        object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
-        object.__setattr__(self, 'counts', self.across.sum(axis=1).astype(float))
-        object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
-        object.__setattr__(self, 'narrowest', tuple(
-            float(self.room[one].min(initial=np.inf)) for one in self.across))
-        object.__setattr__(self, 'shares', np.full(len(self), 1.0 / max(len(self), 1)))
-        object.__setattr__(self, 'begins', DERIVATIVES * np.arange(len(self)))
+        across = np.array([[0], [1]]) == self.axis
+        derived = {
+            'bloom': -np.eye(2)[self.axis], 'across': across,
+            'counts': across.sum(axis=1).astype(float),
+            'examples': (int(self.axis.argmin()), int(self.axis.argmax())),
+            'narrowest': tuple(float(self.room[one].min(initial=np.inf)) for one in across),
+            'shares': np.full(len(self), 1.0 / max(len(self), 1)),
+            'begins': DERIVATIVES * np.arange(len(self))}
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         """Return the number of edge points."""

@@ -259,13 +259,13 @@ class Tracker:
             elif measurement.margin is not None and measurement.margin > MARGIN:
                 camera.unchecked[name] = MIRRORED_EVERY - 1
         for name, hypotheses in self._hypotheses.items():
-            delay = camera.delays[name]
-            time = self._schedule.time(name, camera, look.stamp + delay)
             for candidate in hypotheses.candidates:
+                delay = camera.delays[name]
                 view = self._view(look, delay)
                 if isinstance(view, Missing):
                     continue
-                expected = view.prior(candidate.track.predict(time))
+                expected = view.prior(candidate.track.predict(
+                    self._schedule.time(name, camera, look.stamp + delay)))
                 if self._schedule.in_view(name, look.model, expected.pose):
                     measurement = track(image, look.model, self._targets[name], expected, None,
                                         True)
@@ -360,11 +360,11 @@ class Tracker:
                 reference,
                 *view.passing(T_camera_body, reference, self._filters[name].predict(time)))
         T_smooth_body = view.T_smooth_camera @ T_camera_body
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
-        covariance = camera.noise.covariance(
-            turn.dot(measurement.covariance).dot(turn.T),
-            T_smooth_body.apply(reference) - view.own.travel)
+        turn, (place, attitude) = np.zeros((6, 6)), camera.noise.scales
+        turn[:3, :3] = place * view.T_smooth_camera.rotation
+        turn[3:, 3:] = attitude * view.T_smooth_camera.rotation
+        covariance = turn.dot(measurement.covariance).dot(turn.T)
+        covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
         outcome, candidate = self._hypotheses[name].take(
             time, T_smooth_body, reference, covariance, other and name in sighting.estimates)
         refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)

@@ -147,16 +147,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     me, tracking = at(memory.own, now), mode.state is State.TRACK
     # Commands that are not flown yet count as velocity; part was flown since the measurement.
     coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
-    neighbors = gathered(memory, me, [at(n, now) for n in memory.neighbors.values()], params,
-                         elapsed) if tracking else NOBODY
-    leader = sought(memory, neighbors, me, params) if tracking else None
-    flock = _flock(memory, now, tracking, leader, params)
-    memory = memory._replace(
-        flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
-        lost=_loss(memory, flock, me, tracking, leader, params),
-        home=me.position if memory.home is None else memory.home)
-    missed = leader or max((n for n in memory.flock.values() if n.member.role != AVOID and (
-        neighbors.faced is None)), key=lambda n: n.stamp, default=None)
+    memory, neighbors, leader, missed = _surroundings(memory, me, tracking, params, elapsed)
     altitude, vertical = _altitude(memory, mode, me, neighbors, missed, ground, coming, params,
                                    elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
@@ -185,6 +176,28 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
         command.reason, rejected, _warnings(memory, mode, me, neighbors, leader, params), bias,
         tuple(sorted(neighbors.edges)), tuple(sorted(neighbors.flock, key=lambda n: n.name)))
+
+
+def _surroundings(memory: Memory, me: OwnState, tracking: bool, params: PlannerParams,
+                  elapsed: float
+                  ) -> tuple[Memory, Neighborhood, Neighbor | None, Neighbor | None]:
+    """
+    Return the memory with all to keep clear of, and the neighbors at hand in TRACK, else none.
+
+    The last two are the leader to look for while others are followed, and that one or whoever
+    else is lost, if nobody is followed.
+    """
+    now = me.stamp
+    neighbors = gathered(memory, me, [at(n, now) for n in memory.neighbors.values()], params,
+                         elapsed) if tracking else NOBODY
+    leader = sought(memory, neighbors, me, params) if tracking else None
+    flock = _flock(memory, now, tracking, leader, params)
+    missed = leader or max((n for n in flock.values() if n.member.role != AVOID and (
+        neighbors.faced is None)), key=lambda n: n.stamp, default=None)
+    return memory._replace(
+        flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
+        lost=_loss(memory, flock, me, tracking, leader, params),
+        home=me.position if memory.home is None else memory.home), neighbors, leader, missed
 
 
 def _relative(memory: Memory, own: OwnState, now: float, params: PlannerParams, elapsed: float,
@@ -308,7 +321,7 @@ def _altitude(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     follows = params.altitude_mode == 'follow'
     level = neighbors.level
-    if level is None and missed is not None:
+    if level is None and missed is not None and not mode.blinded:
         level = _awaited(missed, memory, me.stamp, params)
         if level.stamp < me.stamp:
             level = level._replace(velocity=np.zeros(3), acceleration=None)

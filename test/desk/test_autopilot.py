@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The embedded autopilot with PX4's personality: motion, modes, masks, acknowledgements."""
+"""The embedded autopilots: motion, modes, masks, acknowledgements, faults, BRAKE, the command."""
 
 import math
 import os
@@ -21,11 +21,13 @@ import socket
 import subprocess
 import sys
 
-from embedded_flight import Flight, MASK_YAW, setpoint
+from embedded_flight import BLIND, Flight, MASK_YAW, odometry, setpoint
+from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk import autopilot
 from flock_desk.vehicles.embedded import STEP
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import GRAVITY
@@ -105,7 +107,7 @@ def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
     assert not flight.controller.armed and flight.vehicle.landed
 
 
-def test_setpoints_alone_end_the_failsafe():
+def test_setpoints_alone_end_the_failsafe_and_a_mode_that_is_chosen_ends_it_for_good():
     flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
     offboard(flight, setpoint())
     flight.fly(1.5)
@@ -113,11 +115,6 @@ def test_setpoints_alone_end_the_failsafe():
     assert flight.controller.chosen == 'OFFBOARD'
     flight.fly(0.1, setpoint())
     assert (flight.controller.mode, flight.controller.in_failsafe) == ('OFFBOARD', False)
-
-
-def test_a_mode_that_is_chosen_ends_the_failsafe_for_good():
-    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
-    offboard(flight, setpoint())
     flight.fly(1.5)
     assert flight.mode('AUTO.LOITER') == [0, 0] and not flight.controller.in_failsafe
     flight.fly(1.0, setpoint())
@@ -174,3 +171,83 @@ def test_the_process_flies_logs_and_stops_cleanly(tmp_path):
         np.testing.assert_allclose(logged['position'][-1], [0, 0, 2], atol=0.1)
         assert logged['setpoint_type_mask'].tolist() == [0x83F]
         np.testing.assert_allclose(logged['setpoint_acceleration'], [[0.5, 0, 0]])
+
+
+@pytest.mark.parametrize(('personality', 'mode'), [('px4', 'POSCTL'), ('arducopter', 'LOITER')])
+def test_the_pilot_climbs_so_long_after_the_first_setpoint(personality, mode):
+    flight = Flight(personality, altitude=1.5, faults=[
+        Fault('pilot', 2.0, mode=mode, climb=2.0, after='setpoint')])
+    flight.mode('GUIDED' if personality == 'arducopter' else 'AUTO.LOITER')
+    flight.fly(5.0)
+    flight.fly(1.9, setpoint())
+    assert flight.controller.mode != mode
+    flight.fly(8.0, setpoint())
+    assert flight.controller.mode == mode
+    assert flight.vehicle.position[2] == pytest.approx(3.5, abs=0.05)
+
+
+@pytest.mark.parametrize(('personality', 'mode'), [
+    ('px4', 'AUTO.LOITER'), ('arducopter', 'STABILIZE')])
+def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality, mode):
+    name = 'COM_OF_LOSS_T' if personality == 'px4' else 'GUID_TIMEOUT'
+    flight = Flight(personality, start='landed', parameters={name: 0.5},
+                    faults=[Fault('reboot', 3.0, duration=2.0)])
+    flight.fly(1.0)
+    flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32.0, 1e6)
+    assert flight.arm() == [0]
+    flight.fly(2.0)
+    flight.messages.clear()
+    flight.fly(1.98, setpoint())
+    assert flight.messages == [] and flight.arm() == []
+    flight.fly(1.1)
+    assert (flight.controller.mode, flight.controller.armed) == (mode, False)
+    assert flight.last('ATTITUDE_QUATERNION').time_boot_ms < 1200
+    assert flight.kinds().count('LOCAL_POSITION_NED') > 50
+    assert flight.controller.parameters[name] == 0.5
+
+
+def test_a_reboot_in_the_air_brings_it_down():
+    flight = Flight(altitude=30.0, faults=[Fault('reboot', 0.5, duration=3.0)])
+    flight.fly(2.5)
+    assert flight.vehicle.velocity[2] < -8.0
+
+
+@pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['--connect', '0.0.0.0:14540'], 'must be a loopback address'),
+    (['--connect', '8.8.8.8:1'], 'must be a loopback address'),
+    (['--connect', '14540'], 'must be HOST:PORT'),
+    (['--connect', '127.0.0.1:99999'], 'must be HOST:PORT'),
+    (['--param', 'GUID_TIMEOUT'], "param = 'GUID_TIMEOUT': must be NAME=NUMBER"),
+    (['--param', 'NO=1'], 'NO: must be one of COM_'),
+    (['--signing-key-file', '/nowhere'], "signing_key_file = '/nowhere': No such file")])
+def test_bad_arguments_are_one_line(arguments, complaint, capsys):
+    assert autopilot.main(arguments) == 1
+    error = capsys.readouterr().err
+    assert complaint in error and error.count('\n') == 1
+
+
+def test_brake_stops_quickly_and_holds_the_position():
+    flight = Flight('arducopter')
+    assert flight.mode('GUIDED') == [0]
+    flight.fly(2.0, setpoint(1.0, 0.0, 0.3))
+    assert flight.vehicle.velocity[0] > 1.5
+    assert flight.mode('BRAKE') == [0]
+    begun = flight.vehicle.position.copy()
+    flight.fly(1.0, setpoint(1.0, 0.0, 0.3))
+    assert flight.last_heartbeat().custom_mode == 17
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.25
+    assert flight.vehicle.position[0] - begun[0] < 0.9
+    flight.fly(2.0, setpoint(1.0))
+    held = flight.vehicle.position.copy()
+    flight.fly(10.0, setpoint(1.0))
+    np.testing.assert_allclose(flight.vehicle.position, held, atol=0.05)
+
+
+def test_brake_is_refused_without_a_position():
+    flight = Flight('arducopter', parameters=BLIND['arducopter'])
+    still = odometry((0.0, 0.0, 2.0))
+    flight.fly(1.5, still, rate=30.0)
+    flight.fly(7.5)
+    assert flight.mode('BRAKE') == [mavlink.MAV_RESULT_FAILED]
+    assert flight.texts()[-1] == 'Mode change to BRAKE failed: requires position'
+    assert flight.mode('LAND') == [0]

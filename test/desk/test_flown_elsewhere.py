@@ -111,7 +111,7 @@ def test_the_leader_comes_to_where_the_follower_is_once_it_is_in_offboard_mode(c
     flown.fly(0.2)
     frame = flown.frames[-1]
     # 1.5 m ahead of where it faced then, at its height, facing away from it as it did.
-    offset = frame.leader.position - flown.flight.truth(1_510_000_000).position
+    offset = frame.leader.position - flown.vehicle.at(1_510_000_000).position
     assert offset == pytest.approx([1.5 * math.sqrt(0.5), 1.5 * math.sqrt(0.5), 0.0], abs=0.05)
     assert frame.leader.position[2] == pytest.approx(2.0, abs=0.02)
     assert yaw_from_quaternion(frame.leader.quaternion) == pytest.approx(math.pi / 4, abs=1e-6)

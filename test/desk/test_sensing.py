@@ -22,7 +22,6 @@ import pytest
 from flock_desk.scenarios.courses import wind_course
 from flock_desk.scenarios.scenario import Wind
 from flock_desk.sensors.sensing import (
-    facing,
     in_view,
     PerceptionNoise,
     relative_noise,
@@ -60,10 +59,3 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
     lag = round(2.0 / 0.05)
     assert np.corrcoef(gusty[lag:, 0], gusty[:-lag, 0])[0, 1] == pytest.approx(
         np.exp(-1.0), abs=0.1)
-
-
-def test_a_marker_is_seen_from_its_front_only():
-    """It is on the leader's tail: from behind, and up to an angle from there."""
-    offsets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.5, 2.0, 0.0], [-2.0, 0.0, 0.0]])
-    assert facing(offsets, np.tile(np.eye(3), (4, 1, 1)), 1.22).tolist() == [
-        True, True, False, False]

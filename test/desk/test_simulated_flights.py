@@ -79,16 +79,6 @@ def test_without_odometry_it_flies_on_by_the_marker_and_returns_without_a_step()
     assert np.nanmax(steps[:, during(flown, 23.0, 25.0)[1:]]) <= 0.3
 
 
-def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
-    scenario = replace(load('outdoor'), duration=8.0)
-    together, again, alone = (fly(scenario, runs, True)
-                              for runs in (range(3), range(3), range(1, 2)))
-    for name in ('follower', 'velocity', 'command', 'state'):
-        assert np.array_equal(getattr(together, name), getattr(again, name), equal_nan=True)
-        assert np.array_equal(getattr(together, name)[1:2], getattr(alone, name), equal_nan=True)
-    assert not np.array_equal(together.follower[0], together.follower[1])
-
-
 def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
     scenario = replace(load('shuttle'), duration=25.0)
     law, guard = (measure(fly(scenario, RUNS, on)) for on in (False, True))

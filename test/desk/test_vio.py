@@ -21,7 +21,7 @@ import pytest
 
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly
-from flock_desk.sensors.vio import Due, odometry, true_odometry, Vio
+from flock_desk.sensors.vio import Due, odometry, true_odometry
 from flock_follower.geometry import (
     quaternion_conjugate,
     quaternion_multiply,
@@ -83,18 +83,6 @@ def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, r
     np.testing.assert_allclose(late[[0, 1, 2, 5]] / early[[0, 1, 2, 5]], 2.0, rtol=0.35)
     np.testing.assert_allclose(
         late[3:5], math.hypot(VioErrors().tilt, VioErrors().tilt_bias), rtol=0.25)
-
-
-def test_a_run_does_not_depend_on_those_beside_it():
-    position, velocity = np.zeros((3, 3)), np.tile([0.5, 0.1, 0.0], (3, 1))
-    together = Vio(position, velocity, [np.random.default_rng(k) for k in range(3)], VioErrors(),
-                   0.02)
-    alone = Vio(position[:1], velocity[:1], [np.random.default_rng(2)], VioErrors(), 0.02)
-    for k in range(1, 300):
-        together.step(0.02 * k * velocity, velocity)
-        alone.step(0.02 * k * velocity[:1], velocity[:1])
-    np.testing.assert_array_equal(together.position[2], alone.position[0])
-    np.testing.assert_array_equal(together.velocity[2], alone.velocity[0])
 
 
 @pytest.mark.parametrize(('rate', 'steps'), [(200.0, 1), (100.0, 1), (50.0, 2), (20.0, 5)])

@@ -28,7 +28,6 @@ from flock_follower.mavlink.parameter_check import (
     read_recommendations,
     Recommendation,
     RULES,
-    rules,
     unread,
 )
 
@@ -151,18 +150,3 @@ def test_what_is_dangerous_or_does_not_fuse_what_is_forwarded_forbids_offboard(
         assert bool(forwarding) == (value not in allowed)
         assert not forwarding or forwarding.startswith(f'{name} = {value:g}')
         assert ('require_failsafe' in forwarding) == (value not in allowed)
-
-
-@BOTH
-@pytest.mark.parametrize('forwarding', [False, True])
-def test_each_that_matters_has_to_be_read(dialect, forwarding):
-    assert unread(dialect, checked(needed=NEEDED, **ALLOWED[dialect.name]), forwarding) == ''
-    for rule in RULES[dialect.name]:
-        check = checked(needed=NEEDED, **ALLOWED[dialect.name] | {rule.name: None})
-        reported = unread(dialect, check, forwarding)
-        needed = forwarding or not rule.forwarding
-        assert reported.partition(':')[0] == (f'{rule.name} could not be read' if needed else '')
-    nothing_read = ParameterCheck([], bytewise=True)
-    assert obstacle(dialect, nothing_read, forwarding) == ''
-    names = ', '.join(rule.name for rule in rules(dialect, forwarding))
-    assert unread(dialect, nothing_read, forwarding).startswith(f'{names} could not be read: ')

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 from driven import Driven, overrides, START
@@ -264,6 +265,8 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
     elapsed, shift = 0.0, 0.0
     monkeypatch.setattr(rig.node, 'read_clocks', lambda: (
         START + round((elapsed + shift) * 1e9), 100.0 + elapsed))
+    monkeypatch.setattr(rig.node, 'get_clock', lambda: SimpleNamespace(
+        now=lambda: SimpleNamespace(nanoseconds=rig.node.read_clocks()[0])))
     rig.call('engage', data=True)
     for tick in range(100):
         elapsed = 0.1 * tick
@@ -272,11 +275,10 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
             shift = step  # what comes now was stamped before
         arrival = rig.node.read_clocks()[0]
         rig.node._even_clock.now()
-        for take, stamp, child, place in (
-                (rig.node._take_odom, stamps[0], 'base_link', (0.0, 0.0, 2.0)),
-                (rig.node._take_neighbor, stamps[1], 'leader', AHEAD)):
-            take(to_odometry(nanoseconds_to_stamp(stamp), 'odom', child, place,
-                             IDENTITY_QUATERNION, (0.0, 0.0, 0.0)), arrival)
+        for topic, stamp, child, place in (('odom', stamps[0], 'base_link', (0.0, 0.0, 2.0)),
+                                           ('neighbors', stamps[1], 'leader', AHEAD)):
+            rig.give(topic, to_odometry(nanoseconds_to_stamp(stamp), 'odom', child, place,
+                                        IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
         rig.node._tick()
         assert len(commands) == tick + 1
         sent = stamp_to_nanoseconds(commands[-1].header.stamp) + stamp_to_nanoseconds(

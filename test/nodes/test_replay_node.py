@@ -35,7 +35,7 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import Header, String
 
 from flock_desk.runs.processes import wait_until
@@ -45,7 +45,6 @@ from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.nodes.replay import Replay
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 
-REAL = Path(__file__).parents[3] / 'shared' / 'data' / 'real'
 START = 1_700_000_000_000_000_000
 PERIOD = 20_000_000  # ns between the messages of /stamps
 COUNT = 50
@@ -214,21 +213,6 @@ def test_ros1_topics_of_unknown_type_are_named_and_left_out(
     assert 'topic /zoo is not played: type zoo_msgs/msg/Animal does not exist' in (
         capfd.readouterr().err)
     assert deserialize_message(p.sent['mode'][0], String).data == 'hover'
-
-
-@pytest.mark.parametrize(('name', 'height'), [
-    ('ubiq_aruco_images.bag', 960), ('ubiq_aruco_marker.bag', 720)])
-def test_real_ros1_bags_arrive_as_ros2_messages(
-        player: Callable[..., Player], name: str, height: int) -> None:
-    if not (REAL / name).exists():
-        pytest.skip(f'{REAL / name} is not there')
-    p = player(REAL / name, 'rate:=10.0', 'duration:=0.5')
-    assert p.node.play() == 0
-    image = deserialize_message(p.sent['raspicam_node/image/compressed'][0], CompressedImage)
-    info = deserialize_message(p.sent['raspicam_node/camera_info'][0], CameraInfo)
-    assert image.header.frame_id == 'raspicam' and bytes(image.data[:3]) == b'\xff\xd8\xff'
-    assert (info.width, info.height, info.distortion_model) == (1280, height, 'plumb_bob')
-    assert info.k[8] == 1.0 and info.k[0] > 1000.0
 
 
 def test_as_a_process_it_serves_best_effort_and_late_subscribers_and_ends_on_sigterm(

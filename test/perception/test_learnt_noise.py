@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.learnt_noise import LEARNT, LearntMotion, LearntNoise, LEAST_SHARES
+from flock_follower.perception.learnt_noise import LEARNT, LearntMotion, LearntNoise, LEAST_SHARE
 from flock_follower.perception.neighbor_filter import NeighborFilter
 
 SIGHT = np.array([1.2, -1.6, 0.0])  # 2 m away
 ALONG, ACROSS = SIGHT / 2.0, np.array([0.8, 0.6, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 BASE = 0.001**2 * np.eye(3)  # m^2, what else there is
-POSE = np.diag([0.001] * 3 + [0.01] * 3)**2
 
 
 def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1) -> LearntNoise:
@@ -41,7 +40,7 @@ def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1
 
 def expected(learnt: LearntNoise) -> Array:
     """Return the covariance of the difference of two measurements, (3, 3)."""
-    return 2.0 * learnt.covariance(POSE, SIGHT)[:3, :3]
+    return 2.0 * (learnt.shares[0] * BASE + learnt.covariance(SIGHT)[:3, :3])
 
 
 def covariance(attitude: float, distance: float) -> Array:
@@ -64,17 +63,17 @@ def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
 
 
 @pytest.mark.parametrize(('white', 'shares'), [
-    (0.7, [0.7, 0.7]), (0.1, LEAST_SHARES), (2.0, [1.0, 1.0])])
+    (0.8, [0.8, 0.8]), (0.1, [LEAST_SHARE, LEAST_SHARE]), (2.0, [1.0, 1.0])])
 def test_the_share_of_a_poses_variance_that_is_noise_is_learnt_down_to_a_limit(
         white: float, shares: list[float]) -> None:
     learnt, rng = LearntNoise(1e-6), np.random.default_rng(3)
-    pose = np.diag([0.01] * 6)**2
     seen = []
     for k in range(8 * LEARNT):
         learnt.take(rng.normal(0.0, 0.01 * np.sqrt(2.0 * white), 6),
-                    2.0 * learnt.covariance(pose, SIGHT), SIGHT)
+                    2.0 * (np.diag(np.repeat(learnt.scales, 3) * 0.01)**2
+                           + learnt.covariance(SIGHT)), SIGHT)
         if k > 4 * LEARNT:
-            seen.append(learnt.shares)
+            seen.append([*learnt.shares])
     np.testing.assert_allclose(np.mean(seen, axis=0), shares, rtol=0.15)
     learnt.restart()
     assert learnt.shares == [1.0, 1.0]
@@ -82,7 +81,7 @@ def test_the_share_of_a_poses_variance_that_is_noise_is_learnt_down_to_a_limit(
 
 def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
     noise = fed(0.005, 0.0)
-    added = noise.covariance(np.zeros((6, 6)), SIGHT)
+    added = noise.covariance(SIGHT)
     assert ALONG @ added[:3, :3] @ ALONG < 1e-6
     assert UP @ added[:3, :3] @ UP == pytest.approx((2.0 * noise.attitude)**2)
     np.testing.assert_allclose(added[3:, 3:], noise.attitude**2 * np.eye(3))

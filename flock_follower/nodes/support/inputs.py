@@ -72,6 +72,10 @@ class EvenClock:
             self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
         return system - self._watch.shift
 
+    def dated(self, stamp: int, arrival: int) -> int:
+        """Return a stamp of a message, ns, on this clock, and no later than its arrival."""
+        return stamp if self.simulated else min(stamp, arrival) - self.shift
+
     def fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
         fresh = self.simulated or not self._watch.before_step(stamp)

@@ -329,7 +329,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
     """
     arguments = sys.argv if args is None else args
-    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
+    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments[1:]))
     if '-h' in own or '--help' in own:
         print(usage(sys.modules[factory.__module__]))
         return 0
