@@ -84,7 +84,7 @@ def main(args: list[str] | None = None) -> int:
         if not colon:
             parser.error(f'{item}: must be TOPIC:TYPE')
         topics[topic] = msgtype
-    return run(lambda: Recorder(options.bag, topics), [sys.argv[0], *ros_args], Recorder.record)
+    return run(lambda: Recorder(options.bag, topics), ros_args, Recorder.record)
 
 
 if __name__ == '__main__':

@@ -130,8 +130,9 @@ class ParameterCheck:
         self.values: dict[str, float] = {}
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
-        # When each was asked for last, s, and how often.
+        # When each was asked for last, s, and how often; those given up.
         self._asked = dict.fromkeys((*needed, *self._recommended), (-math.inf, 0))
+        self._given_up: set[str] = set()
         self._finished = False
 
     def step(self, now: float) -> list[str]:
@@ -141,6 +142,8 @@ class ParameterCheck:
         waiting = [name for name, (time, _) in unanswered.items() if now - time < RETRY_PERIOD]
         due = [name for name, (_, count) in unanswered.items()
                if name not in waiting and count < ATTEMPTS]
+        self._given_up = {name for name, (_, count) in unanswered.items()
+                          if name not in waiting and count >= ATTEMPTS}
         ask = due[:max(AT_ONCE - len(waiting), 0)]
         self._asked.update({name: (now, unanswered[name][1] + 1) for name in ask})
         self._finished = not waiting and not due
@@ -148,9 +151,8 @@ class ParameterCheck:
 
     def again(self, name: str) -> None:
         """Ask once more for one that was given up."""
-        time, count = self._asked.get(name, (0.0, 0))
-        if count >= ATTEMPTS:
-            self._asked[name] = time, 0
+        if name in self._given_up:
+            self._asked[name] = -math.inf, 0
 
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""

@@ -133,6 +133,7 @@ class Telemetry:
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
+        self._cells_known = False  # a BATTERY_STATUS of the first battery has come
         self.estimator: EstimatorStatus | None = None
         self.gps: GpsFix | None = None
         self.arrivals = Arrivals()
@@ -168,7 +169,8 @@ class Telemetry:
             self.gps = gps_fix(message, self.gps, now)
         # SYS_STATUS has no cells: it counts only until a BATTERY_STATUS has come.
         elif (kind == 'BATTERY_STATUS' and message.id == 0) or (
-                kind == 'SYS_STATUS' and 'BATTERY_STATUS' not in self.newest):
+                kind == 'SYS_STATUS' and not self._cells_known):
+            self._cells_known = kind == 'BATTERY_STATUS'
             self.battery = _battery(message, now)
 
     def recent(self, kind: str, oldest: float, now: float) -> Any | None:
@@ -229,8 +231,9 @@ class Telemetry:
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None if not fresh."""
-        message = self.recent('LOCAL_POSITION_NED', ESTIMATE_TIMEOUT, now)
-        return None if message is None or not math.isfinite(message.z) else -float(message.z)
+        local = self.local_position
+        fresh = local is not None and now - local.time <= ESTIMATE_TIMEOUT
+        return float(local.position[2]) if local is not None and fresh else None
 
     def sea_level_altitude(self, now: float) -> float | None:
         """Return the height above mean sea level, m; None if not fresh (no GPS)."""

@@ -154,7 +154,7 @@ def main(args: list[str] | None = None) -> int:
     options, ros_args = parser.parse_known_args(args)
     value = None if options.value is None else options.value == 'true'
     return run(lambda: Caller(options.service, value, options.timeout),
-               [sys.argv[0], *ros_args], spin=Caller.spin)
+               ros_args, spin=Caller.spin)
 
 
 if __name__ == '__main__':

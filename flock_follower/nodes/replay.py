@@ -319,8 +319,8 @@ def bag_argument(args: list[str]) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the bag, 1 for what cannot be played."""
-    arguments = sys.argv if args is None else ['replay', *args]
-    return run(lambda: Replay(bag_argument(arguments[1:])), arguments, Replay.play)
+    args = sys.argv[1:] if args is None else args
+    return run(lambda: Replay(bag_argument(args)), args, Replay.play)
 
 
 if __name__ == '__main__':

@@ -81,7 +81,7 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
 def _read(path: str | Path) -> Any:
     try:
         return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
 
 

@@ -148,7 +148,7 @@ NOISE_TIME: Final = 2.0
 MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
-FACTORS: Final = (0.05, 16.0)
+FACTORS: Final = (0.2, 16.0)
 #: After a longer gap, s, the mean restarts, and the factor is at least 1: ``FilterParams`` holds.
 GAP: Final = 0.3
 

@@ -345,7 +345,8 @@ class NeighborFilter:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
         quiet = [min(factor, 1.0) for factor in self._motion.factors]
         self.reset()
-        self._motion.factors = quiet  # a high one may come from what made the track restart
+        if moving is not None:  # a high factor may come from the cause of the restart
+            self._motion.factors = quiet
         to_body = POSE.T @ _to_body(body.rotation @ reference)
         full = to_body @ covariance @ to_body.T
         velocity: Array = np.zeros(3)

@@ -215,7 +215,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
                 memory = memory._replace(neighbors={}, flock={}, ranged={}, met={}, altitude=None,
-                                         home=None, lost=None)
+                                         home=None, lost=None, leader=None, looking=False)
             if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
                 memory = memory._replace(drag=_drag(memory, me, own, params))
             me = own

@@ -154,7 +154,7 @@ class Altitude(NamedTuple):
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
         if clear != speed:  # then only the speed can show that the thrust is wrong
-            error = 2.0 * (clear - rate) / w
+            error = 2.0 * (min(max(clear, -down), up) - rate) / w
         nominal, within = (2.0 * w * (each - rate)
                           for each in (clear, min(max(clear, -down), up)))
         vertical = acceptable = min(max(within, -strongest), strongest)

@@ -131,6 +131,18 @@ def test_a_silent_autopilot_is_asked_three_times_then_given_up_and_once_more_if_
     assert check.result() == (2, 0, 0, ())
 
 
+def test_a_needed_parameter_without_answer_does_not_hide_those_that_differ():
+    check, results = ParameterCheck([A], bytewise=False, needed=['GUID_TIMEOUT']), []
+    for tenth in range(100):
+        check.step(tenth / 10)
+        if tenth == 0:
+            check.take(answer('A', 7.0))
+        if tenth % 10 == 5:
+            results.append(check.result())
+            unread(ARDUPILOT, check, False)
+    assert any(result is not None and result.differing == 1 for result in results)
+
+
 # What forbids offboard.
 
 @pytest.mark.parametrize(('dialect', 'name', 'allowed', 'dangerous', 'not_fused'), [

@@ -93,6 +93,16 @@ def test_the_battery_is_read_in_volts_amperes_and_fractions(message, numbers, ce
     assert battery.temperature == pytest.approx(23.5 if cells else math.nan, nan_ok=True)
 
 
+def test_the_sum_of_all_batteries_counts_if_only_the_second_one_reports_cells():
+    telemetry = Telemetry()
+    for message in (
+            mavlink.MAVLink_battery_status_message(
+                1, 1, 1, 2350, [4100] + [65535] * 9, 100, 0, 0, 90),
+            mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15000, 100, 42, 0, 0, 0, 0, 0, 0)):
+        telemetry.update(message, 1.0)
+    assert telemetry.battery.remaining == pytest.approx(0.42)
+
+
 @pytest.mark.parametrize(('came', 'now', 'alive'), [
     ([], 0.0, False), ([(BEAT, 1.0)], 2.9, True), ([(BEAT, 1.0)], 3.1, False),
     # What streamed is missed after link_timeout, and HEARTBEAT beside other messages.

@@ -144,7 +144,7 @@ def test_a_neighbour_unseen_may_do_more_than_it_did() -> None:
     assert learnt.scale(1.0) == [1.0] * 3
 
 
-def test_a_track_that_restarts_keeps_the_motion_that_was_learnt() -> None:
+def test_a_track_that_begins_anew_does_not_keep_the_motion_that_was_learnt() -> None:
     tracker, rng = NeighborFilter(), np.random.default_rng(5)
     noise = np.diag([0.001] * 3 + [0.01] * 3)**2
     for k in range(300):
@@ -157,4 +157,4 @@ def test_a_track_that_restarts_keeps_the_motion_that_was_learnt() -> None:
     fresh.update(20.0, Transform(), np.zeros(3), noise)
     other = fresh.predict(20.1)
     assert first is not None and other is not None
-    assert np.all((other.covariance - first.covariance).diagonal()[12:] > 0.03)
+    assert np.allclose(first.covariance[:9, :9], other.covariance[:9, :9])

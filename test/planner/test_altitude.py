@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+import math
 from typing import Any
 
 from hypothesis import given
@@ -89,6 +90,20 @@ def test_a_wrong_thrust_is_offset_where_a_neighbor_leaves_no_speed_for_the_climb
         lowest = max(lowest, abs(height - 2.0))
     assert lowest < 0.25 and abs(speed) < 0.02
     assert altitude.thrust_bias == pytest.approx(-error, abs=0.05)
+
+
+@pytest.mark.parametrize(('at_floor', 'error'), [(True, -0.8), (True, -1.0), (False, 0.8)])
+def test_a_neighbor_that_presses_beyond_a_bound_of_the_altitude_does_not_unlearn_the_thrust(
+        at_floor: bool, error: float) -> None:
+    """The offset was discharged: it was 0.4 m below its floor after 2 s."""
+    lowest, highest = (2.0, 10.0) if at_floor else (0.0, 2.0)
+    altitude, height, speed = Altitude(2.0, lowest, highest, thrust_bias=-error), 2.0, 0.0
+    least, most = (-math.inf, -0.4) if at_floor else (0.4, math.inf)
+    for _ in range(60):
+        altitude, vertical = altitude.controlled(me(height, speed), PARAMS, PERIOD, least, most)
+        speed += PERIOD * (vertical + error)
+        height += PERIOD * speed
+        assert abs(height - 2.0) < 0.02
 
 
 def heights(*args: Any, **options: Any) -> list[float]:

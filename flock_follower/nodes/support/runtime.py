@@ -328,8 +328,8 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
     ``args`` None: the arguments of the process. With ``--help`` it prints the help and ends.
     """
-    arguments = sys.argv if args is None else args
-    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments[1:]))
+    arguments = sys.argv[1:] if args is None else args
+    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
     if '-h' in own or '--help' in own:
         print(usage(sys.modules[factory.__module__]))
         return 0
