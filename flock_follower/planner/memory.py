@@ -134,7 +134,7 @@ class Memory(NamedTuple):
     faced: str = ''
     """The neighbor that it faced then."""
     leader: Neighbor | None = None
-    """Last estimate of a leader that it has seen and faced."""
+    """Last estimate of a leader that it faced, seen or received."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
     met: Mapping[str, Neighbor] = NONE

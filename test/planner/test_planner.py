@@ -172,6 +172,7 @@ def test_odometry_that_jumps_takes_its_new_altitude_and_forgets_the_neighbors() 
     memory, jumped = tracking(), (0.0, 0.0, 2.35)
     memory, decision = step(memory, 0.1, True, own(0.1, jumped), [], PARAMS)
     assert [r.reason for r in decision.rejected] == ['odometry jumped']
+    assert memory.leader is None  # its place was in the frame before
     assert commanded(decision)[2] == pytest.approx(0.0)
     assert not memory.neighbors
     assert memory.altitude is not None and memory.altitude.held == 2.35
