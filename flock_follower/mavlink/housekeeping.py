@@ -218,9 +218,10 @@ class Housekeeping:
         if not alive:
             return
         self._request_streams(now)
-        if now - self._timesync_sent >= PERIOD and self._link.send(
-                self.timesync.question(round(now * 1e9))):
+        # Not sooner if it cannot be sent: the questions kept have to cover UNANSWERED_MAX.
+        if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now
+            self._link.send(self.timesync.question(round(now * 1e9)))
         self._send_origin(now)
         for name in self.parameters.step(now):
             self._link.request_parameter(name)

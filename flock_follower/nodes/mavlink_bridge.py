@@ -119,6 +119,10 @@ class _Call:
             self.outcome = Outcome(False, internal_error(error))
             raise
 
+    def refuse(self) -> None:
+        """End the call, because the setpoint thread ends before its turn."""
+        self.outcome = STOPPING
+
     def result(self) -> Outcome | None:
         """Return the outcome, None before."""
         return self.request.outcome if self.request is not None else self.outcome
@@ -281,7 +285,7 @@ class MavlinkBridge(FlockNode):
             'land': requests.land}
         call = _Call(Future())
         self._calls.append(call)
-        if not self._stream.submit(lambda: call.begin(ask[name])):
+        if not self._stream.submit(lambda: call.begin(ask[name]), call.refuse):
             call.outcome = ENDED
         self._answer_calls()
         response.success, response.message = await call.answer

@@ -184,16 +184,18 @@ def _surroundings(memory: Memory, me: OwnState, tracking: bool, params: PlannerP
     """
     Return the memory with all to keep clear of, and the neighbors at hand in TRACK, else none.
 
-    The last two are the leader to look for while others are followed, and that one or whoever
-    else is lost, if nobody is followed.
+    The last two are the leader to look for while others are followed, and the lost neighbor: that
+    leader, or the newest one of those lost if no neighbor is followed.
     """
     now = me.stamp
     neighbors = gathered(memory, me, [at(n, now) for n in memory.neighbors.values()], params,
                          elapsed) if tracking else NOBODY
     leader = sought(memory, neighbors, me, params) if tracking else None
     flock = _flock(memory, now, tracking, leader, params)
-    missed = leader or max((n for n in flock.values() if n.member.role != AVOID and (
-        neighbors.faced is None)), key=lambda n: n.stamp, default=None)
+    missed = leader
+    if leader is None and neighbors.faced is None:
+        missed = max((n for n in flock.values() if n.member.role != AVOID),
+                     key=lambda n: n.stamp, default=None)
     return memory._replace(
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         lost=_loss(memory, flock, me, tracking, leader, params),
