@@ -59,8 +59,8 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     return joined
 
 
-def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
-             params: FlockingParams, most: float) -> Array:
+def graph_law(offsets: Array, differences: Array, joined: NDArray[np.bool_],
+              others: NDArray[np.bool_], params: FlockingParams, most: float) -> Array:
     """
     Return the acceleration (n,), m/s^2, of one agent of a flock.
 
@@ -70,18 +70,18 @@ def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[
 
     :param offsets: the neighbors' positions minus the own one (m, n), m.
     :param differences: their velocities minus the own one (m, n), m/s.
-    :param share: (m,) 1 along an edge, 0 without one, in between while an edge changes.
+    :param joined: (m,) whether it shares an edge with the agent.
     :param others: (m,) not part of the flock: separation with the L of the pair.
     :param most: largest pull of one neighbor, m/s^2.
     """
-    joined = share[:, None]
     r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
     flock = np.vstack([np.zeros_like(differences[:1]), differences[~others]])
     scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
-    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
-                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
+    u: Array = np.sum(np.where(
+        joined[:, None], alignment(r2, params) * differences + pull * offsets,
+        -apart * fade(r2, params) * offsets), axis=0)
     return u
 
 

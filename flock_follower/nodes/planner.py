@@ -286,7 +286,7 @@ class Planner(FlockNode):
                   'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
                   'guarded_commands': self._guarded, 'limits': decision.limits,
                   'warnings': '; '.join(decision.warnings),
-                  'edges': ', '.join(decision.edges), 'known': len(decision.known)}
+                  'edges': ', '.join(decision.edges)}
         self.diagnostics.parts['tick'] = values
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
@@ -297,10 +297,9 @@ class Planner(FlockNode):
             values['odom_age_s'] = f'{now - memory.own.stamp:.3f}'
         for name, n in memory.neighbors.items():
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
-        for each in decision.known:
-            values[f'{each.name}_is'] = ', '.join([
-                each.member.role, 'heard' if each.received else 'seen',
-                *(['edge'] if each.name in decision.edges else [])])
+            values[f'{name}_is'] = ', '.join([
+                n.member.role, 'heard' if n.received else 'seen',
+                *(['edge'] if name in decision.edges else [])])
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked

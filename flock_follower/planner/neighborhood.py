@@ -24,13 +24,13 @@ it last looks where it was, to both sides, then all round. Meanwhile it follows 
 their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
 vehicle would turn to another follower, and the whole flock would hover without its leader.
 
-Warnings name motions that the follower cannot follow, and members of the flock whose position is
-unknown.
+Warnings name neighbors that the follower cannot follow, and vehicles of the neighbors' file whose
+position is unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 import math
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.limits import brake, limit_norm
-from flock_follower.planner.memory import Memory, SmoothedMotion
+from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
@@ -53,19 +53,15 @@ class Neighborhood(NamedTuple):
     """The neighbors at hand, all at one time, and their relations to the own vehicle."""
 
     flock: Sequence[Neighbor]
-    shares: Mapping[str, float]
-    """From 0 for none to 1 for an edge: each changes over the time of a handover."""
     edges: frozenset[str]
     """Names at the other ends of the own edges; others are only kept clear of."""
     faced: Neighbor | None
     """The neighbor that it faces and keeps in sight."""
     level: Neighbor | None
-    """The neighbor whose altitude it follows."""
-    peers: Sequence[Neighbor] = ()
-    """The neighbors at its edges, to meet at one altitude, if no leader is at hand."""
+    """The neighbor whose altitude it follows; None: it holds its altitude."""
 
 
-NOBODY = Neighborhood((), {}, frozenset(), None, None)
+NOBODY = Neighborhood((), frozenset(), None, None)
 
 
 def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
@@ -73,30 +69,27 @@ def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
     return max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0)
 
 
-def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: PlannerParams,
-             elapsed: float) -> Neighborhood:
+def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
+             params: PlannerParams) -> Neighborhood:
     """
     Return the relations of the neighbors at hand to the own vehicle.
 
-    :param memory: with the relations of the step before, ``elapsed`` seconds ago.
+    :param memory: with the relations of the step before.
     :param flock: all neighbors at hand, at one time; at least one of them can be followed.
     """
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
-        return Neighborhood(flock, {only.name: 1.0}, frozenset([only.name]), only, only)
+        return Neighborhood(flock, frozenset([only.name]), only, only)
     joined = edges(memory.edges, me, flock, params)
-    change, before = elapsed / max(params.handover_time, params.period), memory.shares
-    shares = {n.name: min(max(before.get(n.name, 0.0) + (
-        change if n.name in joined else -change), 0.0), 1.0) if before else float(n.name in joined)
-        for n in flock}
     follow = [n for n in flock if n.member.role != AVOID]
     leaders = [n for n in follow if n.member.role == LEADER]
     ends = [n for n in follow if n.name in joined]
     seen = [[n for n in some if not n.received] for some in (leaders, ends)]
     # Never turn away from a neighbor in sight to one that is only received.
     faced = _nearest(me, memory.faced, next(filter(None, [*seen, leaders, ends]), []))
-    return Neighborhood(flock, shares, joined, faced, _nearest(me, memory.faced, leaders) or faced,
-                        () if leaders or len(ends) < 2 else ends)
+    # Several followers without a leader would follow their own motion if they followed each other.
+    level = _nearest(me, memory.faced, leaders) or (faced if len(ends) < 2 else None)
+    return Neighborhood(flock, joined, faced, level)
 
 
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
@@ -125,35 +118,28 @@ def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]) -> Neighbor | N
         HELD if n.name == held else 1.0))
 
 
-KEPT_UP_WITH = 1.05  # times v_max: noise of a leader at v_max is no warning
-GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
-REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
+KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
 
 
-def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
+def reports(memory: Memory, neighbors: Neighborhood, me: OwnState,
             params: PlannerParams) -> list[str]:
-    """Return warnings of motions that the follower cannot follow."""
-    v_max, most = params.v_max, params.climb_rate
-    near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
+    """Return warnings of neighbors that it cannot follow, and of those whose place is unknown."""
+    v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
     for n in neighbors.flock:
-        motion, edge = motions[n.name], n.name in neighbors.edges
-        speed, climb = math.hypot(*motion.velocity), float(motion.velocity[2])
-        rate, distance = math.hypot(*motion.acceleration), apart(n, me, params)
-        climbs = edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most
+        edge, distance, speed = n.name in neighbors.edges, apart(n, me, params), math.hypot(
+            *n.velocity.tolist())
         found += [f'{n.name} {text}' for applies, text in (
             (edge and speed > KEPT_UP_WITH * v_max,
              f'at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up'),
-            (climbs, f'{"climbs" if climb > 0.0 else "descends"} at {abs(climb):.1f} m/s, '
-                     f'followed at {most:g} m/s at most: may get out of sight'),
-            (rate > REPORTED_ACCELERATION,
-             f'accelerates at {rate:.1f} m/s^2: the band is held up to about '
-             f'{GUARDED_ACCELERATION:g} m/s^2'),
             (distance < near,
              f'{distance:.2f} m away, the band begins at {near:.2f} m: too close'),
             (edge and distance > far,
              f'{distance:.2f} m away, the band ends at {far:.2f} m: too far')) if applies]
-    return found
+    missing = {name for name, each in params.vehicles.items() if each.role != AVOID}
+    missing -= memory.flock.keys()  # with those lost a moment ago
+    return [*found, *(f'{name} neither seen nor received, not kept clear of'
+                      for name in sorted(missing))]
 
 
 def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
@@ -179,23 +165,6 @@ def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
                key=lambda n: names.index(n.name) if n.name in names else len(names))
 
 
-def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
-            params: PlannerParams) -> list[str]:
-    """
-    Return a warning if a member of the flock has no known position, while others have.
-
-    Members are named by parameters, or were known in this flight up to ``resume_timeout`` ago.
-    """
-    missing = {name for name, member in params.vehicles.items() if member.role != AVOID}
-    missing.update(name for name, n in memory.met.items()
-                   if me.stamp - n.stamp <= params.resume_timeout)
-    missing -= memory.flock.keys()  # with those lost a moment ago
-    advice = '' if any(n.received for n in neighbors.flock) else (
-        ': more cameras or flock messages are needed for this formation')
-    return [f'{", ".join(sorted(missing))} neither seen nor received, not kept clear of{advice}'
-            ] if missing else []
-
-
 def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
             neighbors: Neighborhood, params: PlannerParams
             ) -> tuple[Array, tuple[Array, float] | None]:
@@ -215,13 +184,14 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     if len(flock) == 1:
         law = acceleration(offsets, differences, params.law)
     else:
-        share = np.array([neighbors.shares[n.name] for n in flock])
+        joined = np.array([n.name in neighbors.edges for n in flock])
         others = np.array([n.member.role == AVOID for n in flock])
-        law = graph_law(offsets, differences, share, others, params.law, params.a_max)
+        law = graph_law(offsets, differences, joined, others, params.law, params.a_max)
     fading = memory.fading
     if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
         return law, None  # too near already: at once
-    if memory.params is not params and memory.params != params:
+    begins = memory.params is not params and memory.params != params
+    if begins or memory.edges != neighbors.edges:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
     if fading is None:
         return law, None

@@ -137,15 +137,9 @@ def test_it_awaits_one_that_brakes_and_sinks_where_that_leads() -> None:
 @pytest.mark.parametrize(('distance', 'moved'), [(1.9, 1.0), (3.3, 0.53), (5.0, 0.0)])
 def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
                                                                 moved: float) -> None:
-    loss = Loss(np.array([1.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]), 4.0 + distance)
+    loss = Loss(np.array([1.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]), 4.0 + distance, 0.0, 0.0,
+                np.zeros(3), 'leader')
     assert retreat(loss, PARAMS) == pytest.approx(moved, abs=0.01)
-
-
-def test_it_follows_again_by_itself_within_resume_timeout() -> None:
-    follower = lost()
-    for _ in range(250):
-        follower.tick()
-    assert follower.tick(seen(follower.now, follower.position + AHEAD)).state is State.TRACK
 
 
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])

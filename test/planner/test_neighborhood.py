@@ -30,6 +30,7 @@ from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import edges, gathered
 from flock_follower.planner.params import AVOID, FOLLOWER, LEADER, Member, PlannerParams
+from flock_follower.planner.step import step
 
 PARAMS = PlannerParams()
 
@@ -77,24 +78,6 @@ def test_the_graph_is_connected_and_mutual_where_all_is_known(seed: int, count: 
         assert graph(joined).connected and mutual(joined)
 
 
-def changes(noise: float, hold: bool, seed: int = 1) -> int:
-    """Return how often an edge of nine in a lattice, or of a triangle, came or went in 20 s."""
-    rng = np.random.default_rng(seed)
-    triangle = 2.0 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.75 ** 0.5, 0.0]])
-    joined, changed = [{'1', '2'}, {'0', '2'}, {'0', '1'}], 0
-    for _ in range(200):
-        after = chosen(triangle + rng.normal(0.0, noise, (3, 3)), joined if hold else None)
-        changed += sum(len(a ^ b) for a, b in zip(joined, after))
-        joined = after
-    return changed
-
-
-def test_what_is_held_makes_noise_change_no_edge() -> None:
-    assert changes(0.01, hold=False) > 100
-    assert changes(0.01, hold=True) == 0
-    assert changes(0.05, hold=True) < 0.05 * changes(0.05, hold=False)
-
-
 @pytest.mark.parametrize(('nearer', 'kept'), [(1.0, True), (HELD - 0.01, True),
                                               (HELD + 0.01, False)])
 def test_an_edge_goes_when_somebody_is_clearly_nearer_to_both(nearer: float, kept: bool) -> None:
@@ -115,36 +98,29 @@ def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> Non
 def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}
-    neighbors = gathered(Memory(), own(), flock, PARAMS, 0.1)
+    neighbors = gathered(Memory(), own(), flock, PARAMS)
     assert neighbors.faced is flock[0] and neighbors.level is flock[0]
-
-
-def test_lengths_are_between_hulls() -> None:
-    """A big one in the middle is as near to both as its hull is."""
-    flock = [at('far', 3.0, 0.0, 0.0), at('big', 1.5, 2.7, 0.0)]
-    assert edges(set(), own(), flock, PARAMS) == {'far', 'big'}
-    flock[1] = at('big', 1.5, 2.7, 0.0, role=FOLLOWER, radius=0.5)
-    assert edges(set(), own(), flock, PARAMS) == {'big'}
-
-
-def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
-    def after(memory: Memory, *flock: Neighbor) -> Memory:
-        found = gathered(memory, own(), flock, PARAMS, 0.1)
-        return Memory(shares=found.shares, edges=found.edges)
-
-    a, b, c = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0), at('c', -2.0, 0.0, 0.0)
-    memory, shares = after(Memory(), a, b), []
-    assert memory == Memory(shares={'a': 1.0, 'b': 1.0}, edges=frozenset('ab'))
-    for _ in range(6):
-        memory = after(memory, a, b, c)
-        shares.append(memory.shares['c'])
-    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
-    assert after(memory, a) == Memory(shares={'a': 1.0}, edges=frozenset('a'))
 
 
 @pytest.mark.parametrize(('before', 'expected'), [('', 'b'), ('a', 'a'), ('b', 'b')])
 def test_whom_it_faces_changes_only_for_one_clearly_nearer(before: str, expected: str) -> None:
     a, b, near = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0), at('c', -1.5, 0.0, 0.0)
     for flock, found in (([a, b], expected), ([a, b, near], 'c')):
-        faced = gathered(Memory(faced=before), own(), flock, PARAMS, 0.1).faced
+        faced = gathered(Memory(faced=before), own(), flock, PARAMS).faced
         assert faced is not None and faced.name == found
+
+
+def test_a_change_of_edges_is_faded_in_over_the_time_of_a_handover() -> None:
+    """A follower at rest between its leader and one that was farther away before."""
+    params, memory, commands = PlannerParams(guard=False, v_max=5.0), Memory(), []
+    for tick in range(20):
+        now = 0.1 * tick
+        flock = [at('leader', 2.4, 0.0, 0.0), at('b', 0.0, 2.4, 0.0, received=True)]
+        moving = [n._replace(stamp=now, velocity=np.array([0.3, 0.2, 0.0])) for n in flock]
+        memory, decision = step(memory, now, True, own()._replace(stamp=now),
+                                moving[:1 if tick < 10 else 2], params)
+        commands.append(decision.acceleration)
+    steps = np.linalg.norm(np.diff(commands, axis=0), axis=1)
+    whole = np.linalg.norm(commands[-1] - commands[9])
+    assert whole > 0.1 and decision.edges == ('b', 'leader')
+    assert steps[9:14] == pytest.approx(whole / 5.0) and steps[14:] == pytest.approx(0.0)

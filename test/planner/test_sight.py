@@ -35,11 +35,7 @@ from flock_follower.planner.guard import ordered
 from flock_follower.planner.inputs import Expected
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import (
-    all_round,
-    FieldOfView,
-    View,
-)
+from flock_follower.planner.sight import FieldOfView, View
 
 PARAMS = PlannerParams(v_max=20.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -156,26 +152,6 @@ def seen_by(*names: str, k: list[float] = WIDE, model: str = 'plumb_bob') -> Vie
     """Return what cameras see together."""
     return tuple(FieldOfView.of_camera(info(k, model), FRONT_AND_SIDES[name], True)
                  for name in names)
-
-
-def test_cameras_go_all_round_only_where_their_images_overlap() -> None:
-    assert all_round(seen_by('front', 'left', 'right', 'back'))
-    assert not all_round(seen_by('front', 'left', 'right'))
-    assert not all_round(seen_by('front', 'back', 'left', 'right', k=K))
-    # 320 px to the side are 45 degrees through a pinhole, 57 through a fisheye lens.
-    for model, whole in (('plumb_bob', False), ('equidistant', True)):
-        k = [320.0, 0.0, 320.0, 0.0, 320.0, 240.0, 0.0, 0.0, 1.0]
-        assert all_round(seen_by(*FRONT_AND_SIDES, k=k, model=model)) is whole
-
-
-def test_all_round_nothing_passes_too_fast() -> None:
-    it = expected(np.array([1.5, 0.0, 0.0]), (0.0, 3.0, 0.0))
-    for names, count in ((('front', 'left', 'right', 'back'), 2), (('front', 'left'), 4)):
-        bounds = sight_bounds(it.position, np.zeros(3), it, 0.0, seen_by(*names), PARAMS)
-        assert len(bounds) == count
-    alone = FieldOfView.of_camera(info(WIDE), [0.0, 0.0, 0.0])
-    for a, b in zip(bounds, sight_bounds(it.position, np.zeros(3), it, 0.0, (alone,), PARAMS)):
-        assert a.normal == pytest.approx(b.normal) and a.least == pytest.approx(b.least)
 
 
 def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:

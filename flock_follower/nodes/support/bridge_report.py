@@ -43,8 +43,7 @@ SILENCE = 3.0  # s without an autopilot after which the node reports it
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
 SHOWN = 5.0  # s for which a clock mismatch is shown
 #: Bounds of the planner, those of the bridge that they lie in, and the direction that is wider.
-PLANNER_BOUNDS = {'altitude_min': ('height_min', -1.0), 'altitude_max': ('height_max', 1.0),
-                  'range_max': ('radius_max', 1.0)}
+PLANNER_BOUNDS = {'altitude_min': ('height_min', -1.0), 'altitude_max': ('height_max', 1.0)}
 #: Limits that planner and bridge are to have alike.
 LIMITS = ('a_max', 'v_max')
 HEIGHTS_DIFFER = 1.0  # m, between barometer and estimate, above which it is a warning
