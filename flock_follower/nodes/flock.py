@@ -109,11 +109,11 @@ class SharingNode(FlockNode):
 
     def _sender_problem(self, now: float) -> Problem | None:
         """Show the frame of every sender; return which clocks are implausible."""
-        senders = self._sharing.status(self._now())
+        senders, current = self._sharing.senders.values(), self._now()
         self.diagnostics.parts['senders'] = {
-            f'frame of {sender.name}': sender.why or (
-                f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
-            for sender in senders}
+            f'frame of {each.name}': each.unusable(current) or (
+                'known to {:.3f} m, {:.3f} rad'.format(*each.frame.stds) if each.frame else '')
+            for each in senders}
         odd = [f'{sender.name}: {sender.slow}' for sender in senders if sender.slow]
         return (WARN, '; '.join(odd)) if odd else None
 
