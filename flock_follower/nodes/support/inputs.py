@@ -139,7 +139,7 @@ class OwnOdometry:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
         self._node = node
         self._described = self._child = self._placed = ''
-        node.diagnostics.checks += [self._problem, self._axes_problem]
+        node.diagnostics.checks += [self._problem]
         configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
         self._static = None if configured else StaticChild(node, self._place)
 
@@ -185,7 +185,3 @@ class OwnOdometry:
         if twist.found == NONE or twist.wanted in ('child', 'odom'):
             return WARN, f'velocity of odom: {twist.describe}'
         return None
-
-    def _axes_problem(self, now: float) -> Problem | None:
-        fault = self.source.up.fault
-        return (WARN, f'axes of odom: {fault}') if fault else None
