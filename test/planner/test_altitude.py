@@ -155,12 +155,6 @@ def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
         pytest.approx(3.0 - INSIDE), pytest.approx(0.0, abs=1e-3))
 
 
-def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
-    altitude = Altitude.begun(me(0.6), 0.0, PARAMS)
-    assert followed(altitude, leader(0.2), 10.0).held == 0.6
-    assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
-
-
 def test_where_nobody_knows_the_ground_it_does_not_go_below_where_it_began() -> None:
     altitude = Altitude.begun(me(3.0), None, PARAMS)
     assert followed(altitude, leader(1.0), 10.0).held == 3.0

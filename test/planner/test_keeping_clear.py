@@ -95,22 +95,6 @@ def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: 
 COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 
 
-def test_it_leaves_the_path_of_one_that_was_coming() -> None:
-    """It ends beside the path, no farther away than the retreat."""
-    ticks = iter(range(100))
-
-    def bounds(p: Array, v: Array) -> list[Bound]:
-        k = next(ticks)
-        near = in_sight(expected(np.array([1.5 - 0.1 * k, 0.0, 0.0]), 0.05 * k, 0.5), p, v,
-                        False, False, PARAMS)
-        return ordered([retreating(each, COMING, p, v, PARAMS) for each in near],
-                       fences(COMING, p, v, PARAMS))
-
-    for position, _ in pushed(bounds, 0.0, steps=100):
-        assert COMING.retreated(position) < retreat(COMING, PARAMS) + 0.1
-    assert position[1] > 1.0
-
-
 def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> None:
     explicit = replace(PARAMS, altitude_max=20.0)
     back = -1.0 * AHEAD

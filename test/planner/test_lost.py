@@ -61,18 +61,6 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     assert min(heights) > 2.0 - 0.01  # never descending
 
 
-def test_it_does_not_catch_up_in_height_beside_a_closing_one_that_it_lost() -> None:
-    """The climb would take the speed with which it backs away."""
-    follower = Follower()
-    for tick in range(25):
-        follower.tick(seen(follower.now, [1.4 - 0.045 * tick, 0.0, 2.0 - 0.03 * tick],
-                           (-0.45, 0.0, -0.3)))
-    for _ in range(16):
-        follower.tick()
-        assert follower.velocity[0] < -0.42  # 0.29 where it sank at 0.3 m/s
-        assert abs(follower.velocity[2]) < 0.13
-
-
 def test_where_it_shall_not_retreat_it_stays() -> None:
     follower = lost(params=PlannerParams(retreat_max=0.0))
     for _ in range(100):

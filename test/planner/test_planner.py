@@ -245,18 +245,6 @@ def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
         assert decision.yaw == pytest.approx(-math.pi / 2)
 
 
-def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
-    memory, yaws = Memory(), []
-    for tick in range(40):
-        now = 0.1 * tick
-        memory, decision = step(memory, now, True, own(now, yaw=3.0),
-                                [leader(now, (-2.0, -1.0, 2.0))], PARAMS)
-        yaws.append(decision.yaw)
-    turned = np.mod(np.diff([3.0, *yaws]), 2.0 * math.pi)
-    assert np.max(turned) == pytest.approx(PARAMS.yaw_rate_max * PARAMS.period)
-    assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
-
-
 def test_seen_again_during_a_turn_it_turns_back_from_where_it_points() -> None:
     """Turning on to the yaw commanded last it lost the leader again."""
     memory = tracking()._replace(yaw=0.8, params=None)
