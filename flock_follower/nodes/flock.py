@@ -71,7 +71,7 @@ class SharingNode(FlockNode):
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False)
         self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
         self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
-        self.diagnostics.values['vehicle_name'] = parameters.current
+        self.diagnostics.sources.append(self._senders)
         self.get_logger().info(f'this is {parameters.current}')
         self._timer = self.create_timer(PERIOD, self._tick)
 
@@ -108,14 +108,16 @@ class SharingNode(FlockNode):
         return (WARN, f'nothing received from others: {why}') if why else None
 
     def _sender_problem(self, now: float) -> Problem | None:
-        """Show the frame of every sender; return which clocks are implausible."""
-        senders = self._sharing.status(self._now())
-        self.diagnostics.parts['senders'] = {
-            f'frame of {sender.name}': sender.why or (
-                f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
-            for sender in senders}
-        odd = [f'{sender.name}: {sender.slow}' for sender in senders if sender.slow]
+        """Return which clocks of senders are implausible."""
+        odd = [f'{sender.name}: {sender.slow}' for sender in self._sharing.status(self._now())
+               if sender.slow]
         return (WARN, '; '.join(odd)) if odd else None
+
+    def _senders(self, now: float) -> dict[str, str]:
+        """Return the frame of every sender for /diagnostics."""
+        return {f'frame of {sender.name}': sender.why or (
+            f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
+            for sender in self._sharing.status(self._now())}
 
     def _rivals(self, now: float) -> Problem | None:
         return rivals(self, RECEIVED_TOPIC, 'publish on {}')

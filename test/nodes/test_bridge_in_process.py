@@ -52,7 +52,7 @@ class Bench(Driven):
         super().__init__(MavlinkBridge(parameter_overrides=overrides(
             connection='udpin:127.0.0.1:0', **parameters)))
         self.bridge = self.node._bridge
-        self.node._outputs._odometry.get_subscription_count = lambda: 1
+        self.node._report._odometry.get_subscription_count = lambda: 1
         self.log: list[str] = []
         self.node.get_logger = lambda: SimpleNamespace(
             info=self.log.append, warning=self.log.append, error=self.log.append)
@@ -257,7 +257,7 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
     def wait(_: Any) -> None:
         stuck.append(threading.current_thread().name)
         assert released.wait(2.0 * DEADLINE)
-    bench.node._outputs._odometry.publish = wait
+    bench.node._report._odometry.publish = wait
     for logging in (False, True):
         if logging:
             bench.node.get_logger = lambda: SimpleNamespace(info=wait, warning=wait, error=wait)
@@ -269,7 +269,6 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
         bench.wait(lambda cycles=cycles: bench.count('cycle') >= cycles + 10)
         assert {*stuck} == {'publisher'}
         released.set()
-    bench.node.diagnostics.publish()
     assert bench.values['dropped: publishing took too long'] == 0
 
 
@@ -330,7 +329,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     bench.node._stream.stop()
     # Neither does anything leave, nor does anything come.
     last = bench.node._report._last.setpoint
-    bench.node._report.cycle(
+    bench.node._report.on_cycle(
         Cycle(last._replace(kind=COMMAND), False, None), time.monotonic())
     assert 'no setpoint was sent for 1.0 s' in bench.problems(ahead=1.0)
     assert 'autopilot lost on' in bench.problems(ahead=60.0)
@@ -340,7 +339,7 @@ def test_parameters_of_the_autopilot_that_differ_are_logged_once_and_shown(make_
     bench = make_bench()
     line = 'COM_OF_LOSS_T = 1, recommended 0.5: why'
     bench.bridge.housekeeping.parameters = SimpleNamespace(
-        result=lambda: SimpleNamespace(differing=1, answered=3, unanswered=0, lines=[line]))
+        result=lambda: SimpleNamespace(differing=1, answered=3, unanswered=0, lines=(line,)))
     bench.problems()
     bench.problems()
     assert bench.log.count(f'parameter {line}') == 1
@@ -352,10 +351,9 @@ def test_parameters_of_the_autopilot_that_differ_are_logged_once_and_shown(make_
 def test_limits_of_the_planner_that_differ_are_a_warning(make_bench):
     bench = make_bench()
     for values, said in (
-            ({'v_max': 0.5, 'a_max': 2.5, 'altitude_max': 100.0}, ''), ({'v_max': None}, ''),
+            ({'v_max': 0.5, 'a_max': 2.5}, ''), ({'v_max': None}, ''),
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
-            ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
-            ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than')):
+            ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge')):
         bench.node._report.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)

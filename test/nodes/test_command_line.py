@@ -33,7 +33,7 @@ from flock_desk.program import PROGRAMS
 from flock_follower.bags.bag import typestore
 from flock_follower.bags.writer import BagWriter
 from flock_follower.files import resource
-from flock_follower.nodes.support.parameters import ValidatedNode
+from flock_follower.nodes.support.runtime import FlockNode
 
 BRIDGE = 'connection:=udpin:127.0.0.1:0'
 SAMPLE = str(resource('bags/sample'))
@@ -43,7 +43,7 @@ def run(node: str, *arguments: str) -> int:
     """Run a node that ends by itself in this process; return its exit code."""
     named = [] if node in ('replay', 'flock_desk.recorder_node') else [node]
     with mock.patch.dict(os.environ), mock.patch.object(  # some set the transport of DDS
-            ValidatedNode, 'parameter_files', ()):
+            FlockNode, 'parameter_files', ()):
         return int(import_module(PROGRAMS.get(node, node)).main([*named, *arguments]))
 
 
