@@ -96,7 +96,6 @@ class Planner(FlockNode):
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._decision = Decision(State.IDLE)
         self._reported: tuple[State, bool] | None = None
-        self._guarded = self._limited = 0
         self._ticked = time.monotonic()
         self._even_clock = EvenClock(self)
         self._accelerations: dict[str, AccelerationState] = {}
@@ -263,7 +262,7 @@ class Planner(FlockNode):
         self._report(decision)
 
     def _report(self, decision: Decision) -> None:
-        """Publish the state if it has changed, and count what bounded the command."""
+        """Publish the state if it has changed."""
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
         reported = decision.state, self._loop.memory.given_up
@@ -273,8 +272,6 @@ class Planner(FlockNode):
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
         self._decision = decision
-        self._limited += bool(decision.limits)
-        self._guarded += decision.guarded
 
     def _values(self, _: float) -> dict[str, Any]:
         """Return the values of the newest tick for /diagnostics."""
@@ -284,8 +281,7 @@ class Planner(FlockNode):
         return {
             'state': decision.state.value, 'reason': decision.reason,
             'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
-            'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
-            'guarded_commands': self._guarded, 'limits': decision.limits,
+            'missed_ticks': self._loop.missed, 'limits': decision.limits,
             'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),
             **{f'{name}_age_s': f'{now - state.stamp:.3f}'
                for name, state in states.items() if state is not None},

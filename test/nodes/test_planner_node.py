@@ -184,7 +184,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     assert rig.values['leader_is'] == 'leader, seen' and rig.values['edges'] == 'leader'
     rig.run(0.9, (0.8, 0.0, 2.0))  # half a second of it is taken for a jump
     assert rig.values['warnings'].startswith('leader 0.80 m away')
-    assert rig.values['warnings'] in rig.problems() and rig.values['guarded_commands'] > 0
+    assert rig.values['warnings'] in rig.problems()
     rig.run(1.1, topic='neighbors/heard')
     assert rig.values['follower_2_is'] == 'follower, heard'
     assert rig.state == 'TRACK' and 'leader_is' not in rig.values
