@@ -19,17 +19,30 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 from driven import Driven, overrides, START
+from geometry_msgs.msg import TransformStamped
 from marker_images import make_camera, render, SIDE
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
 
-from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import from_odometry, MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds
+from flock_follower.geometry import (
+    quaternion_from_rpy,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    Transform,
+)
+from flock_follower.messages import (
+    from_odometry,
+    MOTION_TOPIC,
+    RELATIVE,
+    set_quaternion,
+    stamp_to_nanoseconds,
+)
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
@@ -306,6 +319,23 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
         'range outside min_range and max_range': 1, 'invalid odom': 1,
         'range stamped as one before, or earlier': 1}
     assert not r.found
+
+
+def test_the_child_frame_of_odom_is_placed_by_tf_static_and_wrong_axes_are_reported(
+        rig: Callable[..., Rig]) -> None:
+    r, imu = rig(), TransformStamped(child_frame_id='imu')
+    rolled = quaternion_from_rpy(np.pi / 2.0, 0.0, 0.0)
+    for k in range(20):
+        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
+                                   OWN.translation, rolled, np.zeros(3)))
+    assert 'axes of odom: base_link has y up instead of z' in r.problems()
+    imu.header.frame_id = 'base_link'
+    set_quaternion(imu.transform.rotation, rolled)
+    r.node._own._static.take(SimpleNamespace(transforms=[imu]))
+    for k in range(20, 60):
+        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
+                                   OWN.translation, rolled, np.zeros(3)))
+    assert 'axes of odom' not in r.problems()
 
 
 def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
