@@ -52,9 +52,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory_for_images,
-    IMAGES_BUFFER,
     receive_buffer_max,
-    shares_memory,
 )
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import (
@@ -144,10 +142,6 @@ class BlackBox(FlockNode):
         self.create_timer(ASK_PERIOD, self._ask, clock=STEADY)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
-        if shares_memory():
-            self.get_logger().warning(
-                'receives through shared memory: if it is started in flight, publishers may block '
-                f'for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} prevents that')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""

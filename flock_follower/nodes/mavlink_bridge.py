@@ -43,7 +43,6 @@ import sys
 import time
 from typing import Any
 
-from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
@@ -69,7 +68,6 @@ from flock_follower.messages import (
     from_trajectory,
     OdometryState,
     stamp_age,
-    stamp_to_nanoseconds,
 )
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import (
@@ -161,7 +159,6 @@ class MavlinkBridge(FlockNode):
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self._bridge, self._stream, self._publisher)
-        self._own = OwnOdometry(self, values)
         self._connect(values)
         self._publisher.start()
         self._stream.start()
@@ -176,7 +173,7 @@ class MavlinkBridge(FlockNode):
         """Create the subscriptions, timers and services."""
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command,
                        COMMANDS_QOS, required=False, informed=True)
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, best_effort(200), required=(
+        self._own = OwnOdometry(self, values, self._take_odom, self._even_clock, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
         self.create_timer(1.0 / rate, self._hand_over_odom, clock=STEADY)
@@ -209,8 +206,6 @@ class MavlinkBridge(FlockNode):
         if not self._even_clock.fresh('command/trajectory', command.stamp):
             return
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
-        if command.stamp > 0:
-            self._report.stamped('command/trajectory', source_age)
 
         def take() -> None:
             if refused := self._bridge.gate.take_command(command, age, now, source_age):
@@ -244,27 +239,17 @@ class MavlinkBridge(FlockNode):
         self._stream.submit(lambda: self._bridge.ground_station.take_distance(
             message.header.frame_id, message.range, time.monotonic()))
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        self._even_clock.now()
-        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
-            return
-        waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
-        now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
-        shift = self._even_clock.shift
-        state = self._own.take(message, arrival - shift, shift)
-        if state is None:
-            return
-        age = stamp_age(state.stamp, arrival - shift)
-        if state.stamp > 0:
-            self._report.stamped('odom', age)
+    def _take_odom(self, state: OdometryState, arrival: int) -> None:
+        # Never in the future, if the clock was set.
+        now = time.monotonic() - max((self._even_clock.now() - arrival) * 1e-9, 0.0)
         self._odom_frame = state.frame
         self._report.place = state, now
-        self._new_odom.append((state, age, now))
+        self._new_odom.append((state, stamp_age(state.stamp, arrival), now))
 
     def _hand_over_odom(self) -> None:
         """Take the odometry that waits, and hand it over; answer the services."""
         self._answer_calls()
-        self._poll_odom()
+        self._own.poll()
         taken, self._new_odom = self._new_odom, []
         if taken and not self._stream.submit(lambda: self._use_odom(taken)):
             self.diagnostics.reject('odom not taken', TOO_MANY)

@@ -99,12 +99,13 @@ class Planner(FlockNode):
         self._ticked = time.monotonic()
         self._even_clock = EvenClock(self)
         self._accelerations: dict[str, AccelerationState] = {}
+        self._own = OwnOdometry(self, values, self._take_odom, self._even_clock)
 
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
             self._poll_states(Odometry, MOTION_TOPIC, from_odometry, self._take_motion, 200),
-            self.poll(Odometry, 'odom', self._take_odom, best_effort(200)),
+            self._own.poll,
             self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
                               from_acceleration, self._take_acceleration, 100),
             # Images without a leader in them: a silent publisher is no fault.
@@ -127,7 +128,6 @@ class Planner(FlockNode):
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
         self.diagnostics.sources.append(self._values)
-        self._own = OwnOdometry(self, values)
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
@@ -157,15 +157,10 @@ class Planner(FlockNode):
         return self.poll(kind, topic, taken, best_effort(depth), required=required,
                          sporadic=sporadic)
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        shift = self._even_clock.shift
-        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
-            return
-        state = self._own.take(message, arrival - shift, shift)
-        if state is not None:
-            if not self._even_clock.simulated:
-                state = state._replace(stamp=min(state.stamp, arrival - shift))
-            self._loop.take_odometry(state, arrival - shift)
+    def _take_odom(self, state: OdometryState, arrival: int) -> None:
+        if not self._even_clock.simulated:
+            state = state._replace(stamp=min(state.stamp, arrival))
+        self._loop.take_odometry(state, arrival)
 
     def _take_motion(self, state: OdometryState, arrival: int) -> None:
         self._loop.take_odometry(state, arrival)

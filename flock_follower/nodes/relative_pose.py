@@ -59,8 +59,6 @@ from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
 
-# What comes between two images must not be lost: 200 messages are 1 s at 200 Hz.
-ODOM_QOS = best_effort(200)
 POLL_PERIOD = 0.1  # s between two looks at odometry where no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
@@ -77,9 +75,9 @@ class _Camera:
         self._node = node
         node.subscribe(CompressedImage if transport == 'compressed' else Image,
                        values.images(transport), partial(node.take_image, self), best_effort(),
-                       of=self.of, largest=None)
+                       largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
-                       best_effort(), of=self.of)
+                       best_effort())
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
@@ -114,9 +112,8 @@ class RelativePose(FlockNode):
 
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
-                                    awaited=self._awaited)
-        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
+        self._own = OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited)
+        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
                                       required=False, awaited=self._awaited)
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
@@ -126,7 +123,6 @@ class RelativePose(FlockNode):
         self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
         self.diagnostics.checks += [self._sight_problem, self._duplicate_problem]
         self.diagnostics.sources.append(self._learnt)
-        self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=STEADY)
@@ -149,17 +145,12 @@ class RelativePose(FlockNode):
     def poll_odom(self) -> None:
         """Take the odometry that waits, and before it the motion that is flown on without it."""
         self._poll_motion()
-        self._poll_odom()
+        self._own.poll()
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
-        self._use_odometry(from_odometry(message))
+        self._use_odometry(from_odometry(message), arrival)
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        state = self._own.take(message, arrival)
-        if state is not None:
-            self._use_odometry(state)
-
-    def _use_odometry(self, state: OdometryState) -> None:
+    def _use_odometry(self, state: OdometryState, arrival: int) -> None:
         if self._perceiver.take_odometry(state):
             self.diagnostics.reject(*JUMPED)
         self._process_pending()

@@ -382,8 +382,8 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
     assert len(r.found) == 3
     assert r.counters == {'no usable camera_info of camera left': 1}
     reported = r.problems(ahead=4.0)
-    assert 'no /left/camera_info of camera left for 4 s' in reported
-    assert 'no /left/image_raw of camera left for 4 s' in reported
+    assert 'no /left/camera_info for 4 s' in reported
+    assert 'no /left/image_raw for 4 s' in reported
     assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
     assert 'no image of camera front processed' not in reported
     assert r.values['camera front'] == '640x480 plumb_bob' and 'camera left' not in r.values

@@ -55,8 +55,6 @@ PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is u
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
 PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
-CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
-SHOWN = 5.0  # s for which a clock mismatch is shown
 STUCK = 0.2  # s without a setpoint that was due
 #: Limits that planner and bridge are to have alike.
 LIMITS = ('a_max', 'v_max')
@@ -76,7 +74,6 @@ class BridgeReport:
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._last: Cycle | None = None
         self._stuck_since = math.inf
-        self._mismatch = (-math.inf, '')
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
         self._last_estimate = -math.inf
@@ -95,7 +92,7 @@ class BridgeReport:
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
                 (ERROR, self._link_fault), (ERROR, self._unreceived), (ERROR, self._ended),
-                (ERROR, self._clock_fault), (ERROR, self._forwarding_fault),
+                (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, self._too_slow),
                 (WARN, bridge.gate.misaligned), (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
@@ -109,13 +106,6 @@ class BridgeReport:
     def refused(self, reason: str, detail: str) -> None:
         """Record a dropped input."""
         self._events.append(lambda: self._diagnostics.reject(reason, detail))
-
-    def stamped(self, name: str, age: float) -> None:
-        """Note stamps of another clock, by their age, s."""
-        if abs(age) > CLOCK_MISMATCH:
-            self._mismatch = (time.monotonic(), f'{name} is stamped {abs(age):.0f} s in the '
-                              f'{"past" if age > 0 else "future"}: does use_sim_time differ '
-                              'between the nodes, or the clock between the machines?')
 
     # The setpoint thread.
 
@@ -338,10 +328,6 @@ class BridgeReport:
             f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
             'mavlink_bridge: the lower one acts' for name in LIMITS
             if values.get(name) not in (None, getattr(limits, name)))
-
-    def _clock_fault(self, now: float) -> str:
-        seen, what = self._mismatch
-        return what if now - seen < SHOWN else ''
 
     def _forwarding_fault(self, now: float) -> str:
         forwarder = self._bridge.forwarder

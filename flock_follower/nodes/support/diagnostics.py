@@ -117,13 +117,12 @@ class Input:
 
     :param required: whether silence is a fault. :param sporadic: it is none while a publisher is
         there that sends nothing.
-    :param of: qualifies the topic in the text, as ' of camera left'.
     """
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile, required: bool,
-                 sporadic: bool, of: str) -> None:
+                 sporadic: bool) -> None:
         self._node, self._type_name, self._qos = node, type_name, qos
-        self._required, self._sporadic, self._of = required, sporadic, of
+        self._required, self._sporadic = required, sporadic
         self._since = time.monotonic()
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
@@ -139,7 +138,7 @@ class Input:
         reason = self._reason() if self._required and silent > SILENCE else ''
         if not reason:
             return None
-        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {reason}'
+        return ERROR, f'no {self.topic} for {silent:.0f} s: {reason}'
 
     def _reason(self) -> str:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -178,11 +177,11 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         node.create_timer(1.0, self.publish, clock=STEADY)
 
-    def watch(self, topic: str, msg_type: Any, qos: QoSProfile, required: bool, sporadic: bool,
-              of: str) -> Input:
+    def watch(self, topic: str, msg_type: Any, qos: QoSProfile, required: bool,
+              sporadic: bool) -> Input:
         """Return an :class:`Input` whose silence shows in the status."""
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
-        watched = Input(self._node, topic, type_name, qos, required, sporadic, of)
+        watched = Input(self._node, topic, type_name, qos, required, sporadic)
         self.checks.append(watched.problem)
         self.rates[f'{topic}_hz'] = watched.rate
         return watched

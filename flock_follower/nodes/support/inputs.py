@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.geometry import Transform
-from flock_follower.messages import OdometryState, to_array
+from flock_follower.messages import OdometryState, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.support.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
@@ -113,40 +113,44 @@ class StaticChild:
 
 class OwnOdometry:
     """
-    Reads a node's ``odom``; counts dropped messages, and reports the frames in use.
+    Subscribes ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
+    :param use: is called with the own state, of base_link, and the arrival of its message, ns;
+        both on the node's clock, or on ``clock`` if one is given.
     :raises ValueError: if a parameter is out of range.
     """
 
-    def __init__(self, node: FlockNode, values: Mapping[str, Any]) -> None:
+    def __init__(self, node: FlockNode, values: Mapping[str, Any],
+                 use: Callable[[OdometryState, int], None], clock: EvenClock | None = None,
+                 depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
-        self._node, self._placed = node, ''
+        self._node, self._use, self._clock, self._placed = node, use, clock, ''
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
         configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
         self._static = None if configured else StaticChild(node)
+        self.poll = node.poll(Odometry, 'odom', self._take, best_effort(depth), **options)
+        """Takes the messages that wait, see ``FlockNode.poll``."""
 
-    def take(self, message: Odometry, arrival: int, shift: int = 0) -> OdometryState | None:
-        """
-        Return the own state, of base_link; None if the message repeats the last one.
-
-        :param arrival: when it came, ns of the node's clock.
-        :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
-            ``arrival`` and the stamp returned are on one that goes on evenly (``EvenClock``).
-        :raises ValueError: if the message is invalid.
-        """
-        child = message.child_frame_id
+    def _take(self, message: Odometry, arrival: int) -> None:
+        child, shift = message.child_frame_id, 0
+        if self._clock is not None:
+            self._clock.now()
+            shift = self._clock.shift
+            if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
+                return
         if self._static and child != self._placed and (
                 pose := self._static.transform(child)) is not None:
             self._placed = child  # a static transform is passed once
             self.source.place_child(pose)
             self._node.get_logger().info(f'{child} is at {pose.translation.round(3).tolist()} m '
                                          f'on {BASE} by tf_static')
-        state = self.source.take(message, arrival, shift)
+        state = self.source.take(message, arrival - shift, shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
-        return state
+        if state is not None:
+            self._use(state, arrival - shift)
 
     def _values(self, now: float) -> dict[str, str]:
         source = self.source

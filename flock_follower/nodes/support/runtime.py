@@ -141,8 +141,8 @@ class FlockNode(Node):
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
 
     def subscribe(self, msg_type: type[Message], topic: str, callback: Callable[..., None],
-                  qos: QoSProfile, *, required: bool = True, of: str = '',
-                  informed: bool = False, largest: int | None = SMALL_MESSAGE) -> Subscription:
+                  qos: QoSProfile, *, required: bool = True, informed: bool = False,
+                  largest: int | None = SMALL_MESSAGE) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
@@ -154,7 +154,7 @@ class FlockNode(Node):
         """
         take = self._taker(
             msg_type, topic, callback if informed else lambda message, _: callback(message),
-            qos, required, False, of, largest)
+            qos, required, False, largest)
         return self.create_subscription(
             msg_type, topic, lambda message, info: take(message, info), qos,
             raw=largest is not None)
@@ -179,7 +179,7 @@ class FlockNode(Node):
             callback(message, self.get_clock().now().nanoseconds if simulated
                      else self.arrival(info))
 
-        take = _guarded(self._taker(msg_type, topic, taken, qos, required, sporadic, '', largest),
+        take = _guarded(self._taker(msg_type, topic, taken, qos, required, sporadic, largest),
                         lambda error: self._caught(f'on {topic}', error))
         handle = self.create_subscription(
             msg_type, topic, lambda message, info: take(message, info), qos,
@@ -191,10 +191,10 @@ class FlockNode(Node):
         return poll
 
     def _taker(self, msg_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
-               qos: QoSProfile, required: bool, sporadic: bool, of: str,
+               qos: QoSProfile, required: bool, sporadic: bool,
                largest: int | None) -> Callable[[Any, Any], None]:
         """Return a function of a message, as bytes if its size is bounded, and its info."""
-        watched = self.diagnostics.watch(topic, msg_type, qos, required, sporadic, of)
+        watched = self.diagnostics.watch(topic, msg_type, qos, required, sporadic)
         read = READERS.get(msg_type, functools.partial(_deserialize, msg_type))
 
         def take(message: Any, info: Any) -> None:
