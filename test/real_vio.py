@@ -178,7 +178,7 @@ def seen_tags(recording: Recording, read: Read,
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
         if change := offset.take(str(tag.number), time, pose.translation, T_base_camera,
                                  buffer):
-            view = View.of(own, T_base_camera, 0.0)
+            view = View.of(own, T_base_camera)
             for other in filters.values():
                 if other.newest is not None:
                     other.shift(change * view.moving(other.newest.position - own.travel))

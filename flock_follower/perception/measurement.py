@@ -22,7 +22,6 @@ upright.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -147,10 +146,3 @@ def widened(measurement: Measurement, best: Choice) -> Measurement:
     return measurement._replace(
         T_camera_body=moved(pose, at, mean),
         covariance=measurement.covariance + square - np.outer(mean, mean))
-
-
-def likeliest(several: Sequence[Measurement], expected: Transform | None) -> Measurement:
-    """Return the likeliest measurement of one neighbour: prints and reflections happen."""
-    # A print on the wall behind is farther away.
-    place = np.zeros(3) if expected is None else expected.translation
-    return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))

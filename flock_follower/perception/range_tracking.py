@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -156,13 +156,8 @@ class Ranging:
         insort(self._waiting, (stamp, measured), key=lambda waiting: waiting[0])
         return None
 
-    def due(self, clock: Callable[[str, float], float]) -> Iterator[Ranged | Rejection]:
-        """
-        Use every range that the odometry has reached; yield what becomes of it.
-
-        :param clock: returns, of a neighbour's name and a stamp of the odometry, s, what the
-            clock of that neighbour's filter shows.
-        """
+    def due(self) -> Iterator[Ranged | Rejection]:
+        """Use every range that the odometry has reached; yield the result."""
         while self._waiting:
             stamp, measured = self._waiting[0]
             own = self._odometry.at(stamp, extrapolate=False)
@@ -174,7 +169,7 @@ class Ranging:
                 continue
             body = own.smooth_pose
             variance = measured.variance or self.params.range_noise ** 2
-            placed = PlacedRange(clock(measured.name, stamp), measured.distance, variance,
+            placed = PlacedRange(stamp, measured.distance, variance,
                              body.apply(self._tag))
             estimate = self._series[measured.name].take(placed, own)
             if estimate is not None:

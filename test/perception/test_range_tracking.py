@@ -78,7 +78,7 @@ class Rig:
         detour = self.rng.uniform(0.0, 1.0) if self.rng.random() < self.outliers else 0.0
         measured = distance + self.bias + self.rng.normal(0.0, self.noise) + detour
         assert self.ranging.take(RangeState(round(t * 1e9), 'leader', measured), t) is None
-        for outcome in self.ranging.due(lambda _, t: t):
+        for outcome in self.ranging.due():
             assert isinstance(outcome, Ranged)
             found = outcome.estimate
             sight = found.position - self.own
@@ -177,11 +177,11 @@ def test_a_range_waits_for_its_odometry() -> None:
     rig.fly(1.0, True)
     rig.fly(1.0, False)
     assert rig.ranging.take(state(2.03), 2.03) is None
-    assert list(rig.ranging.due(lambda _, t: t)) == []
+    assert list(rig.ranging.due()) == []
     for t in (2.02, 2.04):
         rig.odometry.add(OdometrySample(t, rig.own, quaternion_from_yaw(0.0), np.zeros(3),
                                         np.zeros(3)))
-    found = list(rig.ranging.due(lambda _, t: t))
+    found = list(rig.ranging.due())
     assert [outcome.stamp for outcome in found if isinstance(outcome, Ranged)] == [2_030_000_000]
 
 

@@ -32,11 +32,11 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.look import straightened
+from flock_follower.perception.look import row_delay, straightened
 from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import target, track
-from flock_follower.perception.time_offset import row_delay
+from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 
 CAMERA = make_camera()
@@ -118,7 +118,8 @@ def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(known: boo
     """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""
     config = NeighborConfig(DICTIONARY, (NEIGHBOR,))
     mounting = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    tracker = Tracker(config, mounting, readout_time=READOUT if known else 0.0)
+    camera = MountedCamera(mounting, readout_time=READOUT if known else 0.0)
+    tracker = Tracker(config, {'': camera})
     leader = Transform(rotation_vector_to_matrix([0.0, 0.15, 0.3]), np.array([2.2, 0.0, 0.0]))
     speeds, ranges = [], []
 

@@ -150,7 +150,6 @@ def test_images_without_odometry_are_dropped_with_the_reason(image: GrayImage) -
     tracker.feed_odometry(own(0.0))
     assert tracker.missing(0.0) is None
     assert tracker.missing(0.02) is Missing.TOO_NEW
-    assert tracker.missing(0.02, extrapolate=True) is None
 
 
 def test_time_that_jumps_back_restarts_the_tracks(image: GrayImage) -> None:
