@@ -35,7 +35,7 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Tran
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import ippe, marker_corners, refine
+from flock_follower.perception.corners import ippe, marker_corners, refine
 from flock_follower.perception.look import View
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.time_offset import TimeOffset

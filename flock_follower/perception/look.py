@@ -34,7 +34,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners, refine
+from flock_follower.perception.corners import marker_corners, refine
 from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY

@@ -286,7 +286,7 @@ def parse(document: Any) -> NeighborConfig:
     ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
     neighbors = tuple(_parse_neighbor(where, entry, ids)
                       for where, entry in _entries('neighbors', document['neighbors']))
-    taken: set[str | int] = set()
+    taken: set[object] = set()
     for i, neighbor in enumerate(neighbors):
         for key, value in (('name', neighbor.name),
                            *(('marker_id', marker.marker_id) for marker in neighbor.markers)):

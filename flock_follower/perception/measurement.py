@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception.edge_fit import moved
+from flock_follower.perception.edges import moved
 
 #: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
 SIGMA_HISTORY = 0.1

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import NeighborConfig
 from flock_follower.perception.tracker import Sighting

@@ -23,7 +23,7 @@ roi      a neighbour not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, at a limited rate
 =======  ==========================================================================
 
-Once a second the whole image is searched even if no neighbour is missing: see ``hypotheses``.
+Once a second the whole image is searched even if none is missing: see ``hypotheses``.
 """
 
 from __future__ import annotations
@@ -48,14 +48,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.look import (
-    Look,
-    reported,
-    row_delay,
-    Sighting,
-    straightened,
-    View,
-)
+from flock_follower.perception.look import Look, reported, row_delay, Sighting, straightened, View
 from flock_follower.perception.markers import Detections, NeighborConfig
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (

@@ -35,7 +35,7 @@ from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
 

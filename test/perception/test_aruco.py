@@ -24,7 +24,7 @@ import pytest
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 
 
 def poses(distance: float, count: int) -> list[Transform]:

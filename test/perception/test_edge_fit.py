@@ -30,10 +30,10 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import edges
+from flock_follower.perception import edge_fit
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit
-from flock_follower.perception.edges import Found, Lines
+from flock_follower.perception.edges import MAX_INFLATION, normal_covariance, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.measurement import WIDENING
@@ -181,30 +181,37 @@ def test_poses_out_of_sight_are_none(place: tuple[float, float, float]) -> None:
         assert fit(SHOWN, CAMERA, MODEL, Transform(HERE.rotation, np.array(place))) is None
 
 
-
-
-def seen_in_part(monkeypatch: pytest.MonkeyPatch, seen: Any) -> None:
-    """Let only some edges (n,), bool, be found."""
-    find = edges.find
-
-    def in_part(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
-        found = find(image, lines, spacing)
-        return None if found is None else found._replace(found=found.found & seen)
-
-    monkeypatch.setattr(edges, 'find', in_part)
-
-
 @pytest.mark.parametrize('axis', [0, 1])
+@pytest.mark.parametrize('others', [0, 2])
 def test_a_fit_that_rests_on_edges_of_one_axis_is_none(monkeypatch: pytest.MonkeyPatch,
-                                                       axis: int) -> None:
+                                                       axis: int, others: int) -> None:
+    find, seen = edge_fit._find, MODEL.axis == axis
+    seen[np.flatnonzero(~seen)[:others]] = True
+
+    def in_part(*arguments: Any) -> Any:
+        found = find(*arguments)
+        return found and found._replace(found=found.found & seen)
+
+    monkeypatch.setattr(edge_fit, '_find', in_part)
     for turn in ((0.0, 0.0, 0.0), (0.4, 0.3, 0.2)):
         truth = facing((0.02, 0.01, 1.2), turn)
-        image = render(CAMERA, {3: truth})
-        with monkeypatch.context() as patch:
-            seen_in_part(patch, MODEL.axis == axis)
-            assert fit(image, CAMERA, MODEL, truth) is None
-        few = MODEL.axis == axis
-        few[np.flatnonzero(~few)[:2]] = True  # two of the other axis
-        with monkeypatch.context() as patch:
-            seen_in_part(patch, few)
-            assert fit(image, CAMERA, MODEL, truth) is None
+        assert fit(render(CAMERA, {3: truth}), CAMERA, MODEL, truth) is None
+
+
+def test_nearly_dependent_equations_are_refused_before_their_variances_are_rounding() -> None:
+    units = np.array([1.0, 1e-3, 1e4, 1.0, 1e2, 1e-4])  # far apart
+    for away in (1.0, 1e-3, 1e-5, 1e-6, 1e-7, 1e-9, 0.0):  # two unknowns act alike but for that
+        design = np.random.default_rng(5).normal(0.0, 1.0, (40, 6))
+        design[:, 1] = design[:, 0] + away * design[:, 1]
+        matrix = (design * units).T @ (design * units)
+        inverse = normal_covariance(matrix)
+        # The variance of either unknown is that of one alone over away^2.
+        assert (inverse is None) == (2.0 / away**2 > MAX_INFLATION if away else True), away
+        if inverse is not None:
+            np.linalg.cholesky(inverse)
+        if away == 1.0:
+            x = solve_normal(matrix, matrix @ (1.0 / units))
+            assert x is not None and inverse is not None
+            np.testing.assert_allclose(x * units, np.ones(6), rtol=1e-9)
+            np.testing.assert_allclose(inverse @ matrix * units[:, None] / units, np.eye(6),
+                                       atol=1e-9)

@@ -32,7 +32,7 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.time_offset import MountedCamera
