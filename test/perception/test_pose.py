@@ -263,7 +263,6 @@ SIDEWAYS = Transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0
                      np.array([0.0, -0.3, 0.0]))  # faces right: seen edge on from behind
 WINGED = target(MarkedNeighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
                                     Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
-PORT_ALONE = target(MarkedNeighbor('winged', WINGED.neighbor.markers[:1]), DICTIONARY)
 #: T_camera_body of a neighbour ahead, a little above, turned by 14 degrees.
 AHEAD = Transform(rotation_vector_to_matrix([0.0, 0.25, 0.0])
                   @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
@@ -279,20 +278,6 @@ def scene(*marker_ids: int, pose: Transform = AHEAD, seed: int = 0) -> GrayImage
 def near(pose: Transform) -> Transform:
     return turned(Transform(pose.rotation, pose.translation + np.array([0.006, -0.005, 0.02])),
                   0.01, -0.015, 0.01)
-
-
-def test_several_markers_together_are_better_than_one() -> None:
-    errors: dict[str, list[Array]] = {'joint': [], 'single': []}
-    for seed in range(6):
-        image = scene(0, 1, seed=seed)
-        both = tracked(image, CAMERA, WINGED, near(AHEAD))
-        one = tracked(image, CAMERA, PORT_ALONE, near(AHEAD))
-        errors['joint'].append(error(both, AHEAD)[3:])
-        errors['single'].append(error(one, AHEAD)[3:])
-        shares = np.sqrt(np.diag(both.covariance) / np.diag(one.covariance))
-        assert np.all(shares[3:5] < 0.75)
-    joint, single = (np.sqrt(np.mean(np.square(each))) for each in errors.values())
-    assert joint < 0.7 * single
 
 
 def seen_from_its_right(angle: float) -> Transform:

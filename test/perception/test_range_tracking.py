@@ -204,10 +204,3 @@ def test_an_antenna_beside_the_body_counts_where_the_attitude_is_known() -> None
     assert apart.update_range(2.1, 1.5, np.zeros(3), 0.01, tag) is UpdateOutcome.USED
     assert apart.newest is not None
     assert apart.newest.position[0] == pytest.approx(2.0, abs=0.01)
-
-
-@pytest.mark.parametrize(('name', 'value'), [
-    ('tag_position', (6.0, 0.0, 0.0)), ('range_noise', 0.0), ('range_noise', float('nan'))])
-def test_bad_parameters_are_refused_by_name(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f'{name} = '):
-        RangingParams(**{name: value})  # type: ignore[arg-type]
