@@ -129,7 +129,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
         return _measurement(sought, found, None)
     chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
     if len(found.lines.model.codes) > 1:
-        return _measurement(sought, found, Choice(chosen, [], math.inf))
+        return _measurement(sought, found, Choice(chosen, math.inf))
     best = choose([chosen, *_mirrored(camera, found)], expected)
     if best.chosen.fit is None:
         again = fit(image, camera, found.lines.model, best.chosen.pose, spacing)
@@ -160,7 +160,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
         joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
         if joint is not None and len(joint.lines.model.codes) > 1:
-            found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), [], math.inf)
+            found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), math.inf)
     return _measurement(sought, found, best)
 
 

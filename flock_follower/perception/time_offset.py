@@ -91,13 +91,10 @@ class TimeOffset:
 
     @property
     def describe(self) -> str:
-        """Return the estimate and how it is used, as text."""
-        if self.fixed:
-            return f'{1e3 * self.applied:.1f} ms, as configured'
-        known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
-        if self._found:
-            return f'{known}, applied'
-        return f'{known}, not applied; {1e3 * self.applied:.1f} ms is applied'
+        """Return the applied offset and the estimate, as text."""
+        known = '' if self.fixed else (
+            f'; estimated {1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms')
+        return f'{1e3 * self.applied:.1f} ms applied{known}'
 
     def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
              odometry: OdometryBuffer) -> float:
