@@ -47,7 +47,7 @@ from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
 
@@ -315,9 +315,9 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
     r.range(1.0, 0.1, min_range=0.3, max_range=50.0)
     r.odom(1.1, velocity=np.full(3, np.nan))
     assert r.counters == {
-        'range without odometry': 1, 'range of an unknown neighbour': 1, 'range not finite': 1,
-        'range outside min_range and max_range': 1, 'invalid odom': 1,
-        'range stamped as one before, or earlier': 1}
+        'range without odometry': 1, 'range of an unknown neighbour': 1,
+        'range outside its limits': 2, 'invalid odom': 1,
+        'range stamp repeated, too old or ahead of the odometry': 1}
     assert not r.found
 
 
