@@ -282,26 +282,39 @@ def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, co
              link_age: float, unplaced: str, relative: Relative, place: Location,
              airborne: bool) -> str:
     """Return why a command may not pass, or ''."""
+    if not link_age <= limits.link_timeout:  # written so that NaN fails
+        return 'link lost'
+    if command is not None and command.relative:
+        reason = _marker_refusal(limits, relative, place, airborne)
+    else:
+        reason = _odometry_refusal(limits, known)
+    if reason or unplaced:
+        return reason or unplaced
+    if command is None:
+        return 'no command'
+    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
+        return 'command not finite'
+    return '' if fresh(command_age, limits.planner_timeout) else 'command stale'
+
+
+def _odometry_refusal(limits: GateLimits, known: KnownMotion) -> str:
+    """Return why a command may not rest on the odometry, or ''."""
     judge, _ = known.source_first
-    source, contradiction = f'velocity from {known.source}', known.contradiction(limits)
-    by_odometry = (
-        (judge.fresh_velocity(limits) is None,
-         f'no {source}' if math.isinf(judge.velocity_age) else f'{source} stale'),
-        (contradiction, contradiction))
-    by_marker = (
+    if judge.fresh_velocity(limits) is not None:
+        return known.contradiction(limits)
+    never = math.isinf(judge.velocity_age)
+    return f'no velocity from {known.source}' if never else f'velocity from {known.source} stale'
+
+
+def _marker_refusal(limits: GateLimits, relative: Relative, place: Location,
+                    airborne: bool) -> str:
+    """Return why a command may not rest on the marker alone, or ''."""
+    return first_reason(
         (not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout),
          'relative command not permitted'),
         (not fresh(relative.marker_age, OLDEST_MARKER), 'marker lost'),
         (place.height is None or not math.isfinite(place.height + place.climb_rate), 'no height'),
         (not airborne, 'on the ground'))
-    return first_reason(
-        (not link_age <= limits.link_timeout, 'link lost'),  # written so that NaN fails
-        *(by_marker if command is not None and command.relative else by_odometry),
-        (unplaced, unplaced),
-        (command is None, 'no command'),
-        (command is not None and (finite_vector(command.acceleration) is None
-                                  or not math.isfinite(command.yaw)), 'command not finite'),
-        (not fresh(command_age, limits.planner_timeout), 'command stale'))
 
 
 def _relative(full: GateLimits, command: Command, against: Array, place: Location,

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
+Texts of the autopilot: STATUSTEXT messages, and the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
@@ -47,18 +47,6 @@ _STICKS: Final[str] = 'check_modes_manual_control'
 #: The worst level of a check that is only a remark.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
-#: Actions of PX4's failsafe, by the number in the EVENT.
-_FAILSAFES: Final[tuple[str, ...]] = (
-    'nothing', 'a warning', 'Position', 'Altitude', 'Stabilized', 'Hold', 'Return', 'Land',
-    'Descend', 'disarming', 'termination')
-#: Its parts, by the number in the EVENT.
-_PARTS: Final[Mapping[int, str]] = MappingProxyType({
-    1: 'barometer', 2: 'airspeed', 3: 'GPS', 4: 'optical flow', 5: 'vision', 6: 'distance sensor',
-    7: 'transmitter', 8: 'motors', 10: 'logging', 11: 'battery', 12: 'communication',
-    13: 'rate controller', 14: 'attitude controller', 15: 'position controller',
-    16: 'attitude estimate', 17: 'position estimate', 18: 'mission', 19: 'avoidance',
-    20: 'system', 21: 'camera', 22: 'gimbal', 23: 'payload', 24: 'global position',
-    25: 'storage', 26: 'parachute', 27: 'compass', 28: 'accelerometer', 29: 'gyroscope'})
 #: Texts of the events that are reported.
 _MEANINGS: Final[Mapping[str, str]] = MappingProxyType({
     'check_modes_angular_velocity': 'no angular velocity',
@@ -180,15 +168,13 @@ class ArmingChecks:
                 self._failures = tuple(self._coming)
             self._coming = None
         elif name in _ENTERS:
-            action = dict(enumerate(_FAILSAFES)).get(arguments[4], f'action {arguments[4]}')
-            return f'failsafe: {action}'
+            return f'failsafe: action {arguments[4]} of PX4'
         elif name.startswith('commander_'):
             return _MEANINGS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
-            modes, part = struct.unpack_from('<IB', arguments)
-            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ') or (
-                f'{_PARTS.get(part, f"part {part}")}: event {message.number % 2**24}')
-            self._coming.append(Failure(text, modes, level))
+            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ')
+            self._coming.append(Failure(text or f'event {message.number % 2**24}',
+                                        int.from_bytes(arguments[:4], 'little'), level))
         return ''
 
     def against(self, mode: str) -> list[str]:
@@ -201,77 +187,46 @@ class ArmingChecks:
                      or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
 
 
-#: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
-CHUNK: Final[int] = 50
-#: A text whose next chunk does not come within this, s, is taken as it is.
-CHUNK_TIMEOUT: Final[float] = 0.4
-#: A text of more chunks than this, and more unfinished texts than this, are taken as they are.
-MOST_CHUNKS: Final[int] = 20
-MOST_UNFINISHED: Final[int] = 5
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
-#: Replaces a lost chunk.
-GAP: Final[str] = '...'
 
 
 class AutopilotText(NamedTuple):
-    """One whole text."""
+    """One text, or one chunk of 50 characters of a longer one."""
 
     time: float
-    """Time of completion, s."""
+    """Time of reception, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str
 
 
-class _Unfinished(NamedTuple):
-    time: float
-    """Time of its newest chunk, s."""
-    severity: int
-    text: str
-    next_chunk: int
-
-
 class StatusTexts:
-    """
-    The recent texts; ``add`` takes messages, ``since`` and ``new`` return whole texts.
-
-    Every chunk that arrives is reported, with ``GAP`` if another one was lost. Nothing waits for
-    long: a text of just 50 characters, or a multiple, may come without a chunk that ends it.
-    """
+    """The recent texts; ``add`` takes messages, ``since`` and ``new`` return texts."""
 
     def __init__(self) -> None:
         self.checks = ArmingChecks()
         self._has_texts = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
-        self._unfinished: dict[int, _Unfinished] = {}
 
     def add(self, message: Any, now: float) -> None:
         """Take a STATUSTEXT."""
         self._has_texts = True
-        self._expire(now)
-        severity, text, number = message.severity, str(message.text), message.id
-        if not number:
-            self._finish(severity, text, now)
-            return
-        if number in self._unfinished and message.chunk_seq < self._unfinished[number].next_chunk:
-            self._give_up(number, now)  # its end was lost, another text begins
-        _, severity, before, due = self._unfinished.pop(number, (now, severity, '', 0))
-        whole = before + (GAP if message.chunk_seq != due else '') + text
-        if len(text) < CHUNK or message.chunk_seq + 1 >= MOST_CHUNKS:
-            self._finish(severity, whole, now)
-            return
-        self._unfinished[number] = _Unfinished(now, severity, whole, message.chunk_seq + 1)
-        if len(self._unfinished) > MOST_UNFINISHED:
-            self._give_up(next(iter(self._unfinished)), now)
+        self._take(message.severity, str(message.text), now)
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its text is used only if no STATUSTEXTs come."""
         text = self.checks.take(message)
         if text and not self._has_texts:
-            self._finish(message.log_levels & 0xF, text, now)
+            self._take(message.log_levels & 0xF, text, now)
+
+    def _take(self, severity: int, text: str, now: float) -> None:
+        # PX4 ends texts with a tab if it also sends them as events.
+        taken = AutopilotText(now, severity, text.strip('\x00\t\n '))
+        self._texts.append(taken)
+        self._new.append(taken)
 
     def why(self, time: float, mode: str) -> list[str]:
         """Return the texts since ``time``, and the newest failed checks for a mode."""
@@ -280,7 +235,7 @@ class StatusTexts:
     def unready(self, now: float, mode: str) -> str:
         """Return recent texts and the newest failed checks against arming in a mode, or ''."""
         reported = [text.text.partition(PREARM)[2] for text in list(self._texts)
-                if PREARM in text.text and now - text.time <= PREARM_PERIOD]
+                    if PREARM in text.text and now - text.time <= PREARM_PERIOD]
         return '; '.join(dict.fromkeys([*reported, *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
@@ -288,25 +243,8 @@ class StatusTexts:
         return list(dict.fromkeys(
             text for t, severity, text in self._texts if t >= time and severity <= worst))
 
-    def new(self, now: float) -> list[AutopilotText]:
-        """Return the texts that were completed, or given up, since the last call."""
-        self._expire(now)
+    def new(self) -> list[AutopilotText]:
+        """Return the texts since the last call."""
         texts = list(self._new)
         self._new.clear()
         return texts
-
-    def _expire(self, now: float) -> None:
-        for number in [number for number, unfinished in self._unfinished.items()
-                       if now - unfinished.time > CHUNK_TIMEOUT]:
-            self._give_up(number, now)
-
-    def _give_up(self, number: int, now: float) -> None:
-        """Take a text as it is; whether more was to come is not known."""
-        unfinished = self._unfinished.pop(number)
-        self._finish(unfinished.severity, unfinished.text + GAP, now)
-
-    def _finish(self, severity: int, text: str, now: float) -> None:
-        # PX4 ends texts with a tab if it also sends them as events.
-        whole = AutopilotText(now, severity, text.strip('\x00\t\n '))
-        self._texts.append(whole)
-        self._new.append(whole)

@@ -292,17 +292,17 @@ class Path:
                          for column in zip(*places)])
 
 
-def difference(one: Path, other: Path, turn: float, now: float) -> Array | None:
+def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     """
     Return the displacement (3,) of ``one`` less that of ``other``, m, over the last WINDOW.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
-    :returns: None if they do not overlap, or one of them is not of now.
+    :returns: zeros if they do not overlap, or one of them is not of now.
     """
     (first, last), (other_first, other_last) = one.span, other.span
     start, end = max(first, other_first, now - WINDOW), min(last, other_last)
     if end <= start or now - end > LONGEST_GAP:
-        return None
+        return np.zeros(3)
     moved = one.between(start, end)
     cos, sin = math.cos(turn), math.sin(turn)
     moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
@@ -351,13 +351,16 @@ def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
-    compared = [(height, BAROMETER_STD, 0.0, slice(2, 3), 'barometer')]
+    reason = ''
     if autopilot is not None:
-        compared.insert(0, (autopilot.path, autopilot.std, -turn, slice(0, 2), 'autopilot'))
-    for path, std, turned, axes, other in compared:
-        off = difference(odom.path, path, turned, now)
-        far = 0.0 if off is None else float(np.linalg.norm(off[axes]))
-        if far > max(TOLERANCE, 3.0 * math.hypot(odom.std, std)):
-            return (f'displacements of odom and of the {other} differ by {far:.1f} m in '
-                    f'{WINDOW:g} s')
-    return ''
+        off = difference(odom.path, autopilot.path, -turn, now)[:2]
+        reason = _apart(off, math.hypot(odom.std, autopilot.std), 'autopilot')
+    off = difference(odom.path, height, 0.0, now)[2:]
+    return reason or _apart(off, math.hypot(odom.std, BAROMETER_STD), 'barometer')
+
+
+def _apart(off: Array, std: float, other: str) -> str:
+    """Return that displacements differ by ``off``, m, with a standard deviation, m, or ''."""
+    far = float(np.linalg.norm(off))
+    return '' if not far > max(TOLERANCE, 3.0 * std) else (
+        f'displacements of odom and of the {other} differ by {far:.1f} m in {WINDOW:g} s')

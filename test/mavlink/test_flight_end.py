@@ -162,16 +162,6 @@ def test_a_hold_that_the_bridge_requested_is_not_repeated_once_nothing_is_receiv
 
 
 @pytest.mark.slow
-@BOTH
-def test_a_landing_follows_if_it_was_asked_for_and_nobody_interferes(personality):
-    flight = Flight(personality, bridge={'end': EndParams(leader_lost_action=LAND)}).follow(1.0)
-    flight.planner = None
-    for mode, seconds in ((flight.modes.hold, 6.0), (flight.modes.land, 8.0)):
-        flight.fly_until(lambda mode=mode: flight.mode == mode, seconds)
-        assert flight.mode == mode
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(('personality', 'action'), [('px4', LAND), ('arducopter', HOLD)])
 def test_a_low_battery_ends_the_flight_and_bars_the_next(personality, action):
     flight = Flight(personality, bridge={'end': EndParams(battery_action=action)}, faults=[

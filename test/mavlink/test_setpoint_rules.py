@@ -177,19 +177,6 @@ def test_without_any_velocity_it_is_level_then_silent(ages, kind, reason):
 # Limits.
 
 
-def test_the_acceleration_is_shortened_as_a_vector():
-    setpoint = judge(GateLimits(v_max=20.0),
-                     command=FORWARD._replace(acceleration=(30.0, 40.0, 0.0)))
-    same(setpoint, COMMAND, '', (1.5, 2.0, 0.0), 1.0, 'a_max')
-
-
-def test_the_speed_predicted_over_the_horizon_is_limited():
-    fast = SLOW._replace(velocity=(0.3, 0.0, 0.0))
-    same(judge(GateLimits(v_max=0.4), odom=fast), COMMAND, '', (0.1 / 0.3, 0.0, 0.0), 1.0,
-         'v_max')
-    same(judge(GateLimits(speed_horizon=0.1), odom=fast), COMMAND, '', (1.0, 0.0, 0.0), 1.0)
-
-
 def test_the_yaw_is_wrapped():
     setpoint = judge(command=Command((0.1, 0.0, 0.0), 4.0))
     assert setpoint.yaw == pytest.approx(4.0 - 2 * math.pi)

@@ -204,11 +204,11 @@ def test_a_jump_that_the_velocity_does_not_match_is_counted_and_taken_out():
 
 def test_what_is_old_or_interrupted_is_not_compared():
     first, second = paths(8.0, lambda t: (t, 0.0, 0.0), still)
-    assert difference(first, second, 0.0, 8.6) is None
-    assert difference(first, Path(), 0.0, 8.0) is None
+    assert not difference(first, second, 0.0, 8.6).any()
+    assert not difference(first, Path(), 0.0, 8.0).any()
     for path in (first, second):
         path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
-    assert difference(first, second, 0.0, 9.0) is None
+    assert not difference(first, second, 0.0, 9.0).any()
 
 
 @pytest.mark.parametrize(('axis', 'drift', 'std', 'height', 'contradicts'), [

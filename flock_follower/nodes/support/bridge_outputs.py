@@ -97,7 +97,7 @@ class BridgeOutputs:
             self._publish(self._states, lambda: String(data=state))
         if state != before:
             self._log(f'state: {state}')
-        for text in self._bridge.texts.new(now):
+        for text in self._bridge.texts.new():
             self._log(f'autopilot: {text.text}',
                       warning=text.severity <= mavlink.MAV_SEVERITY_WARNING)
         status, dialect = self._bridge.telemetry.status, self._bridge.telemetry.dialect
@@ -157,9 +157,8 @@ class BridgeOutputs:
         message = BatteryState(
             voltage=battery.voltage, percentage=battery.remaining, present=True,
             # In ROS a current that discharges is negative.
-            current=-battery.current, temperature=battery.temperature,
-            charge=math.nan, capacity=math.nan, design_capacity=math.nan,
-            cell_voltage=list(battery.cell_voltages))
+            current=-battery.current, temperature=math.nan,
+            charge=math.nan, capacity=math.nan, design_capacity=math.nan)
         message.header.stamp = self._node.get_clock().now().to_msg()
         if battery.current > 0.0:
             message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING

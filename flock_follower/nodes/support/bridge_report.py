@@ -75,13 +75,11 @@ class BridgeReport:
         node.create_timer(PLANNER_PERIOD, lambda: self.planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._logged: dict[Request, bool] = {}  # whether its result is logged, too
         self._bytes = (self._start, 0, 0)
-        alive, housekeeping = self._while_alive, bridge.housekeeping
+        alive = self._while_alive
         diagnostics.checks += [
             self._collect,
             partial(_problem, ERROR, self._link_fault),
-            partial(_problem, ERROR, alive(housekeeping.unreceived)),
             partial(_problem, WARN, alive(self._estimate_fault)),
-            partial(_problem, WARN, alive(housekeeping.too_slow)),
             partial(_problem, WARN, bridge.gate.misaligned),
             self._envelope_problem,
             partial(_problem, ERROR, self._clock_fault),
@@ -206,11 +204,8 @@ class BridgeReport:
             values[f'bytes_per_s_{way}'] = round(rate)
             if link.transport.capacity:
                 values[f'line_{way}_percent'] = f'{100.0 * rate / link.transport.capacity:.0f}'
-        for name, (hertz, _) in bridge.housekeeping.rates(now).items():
+        for name, hertz in bridge.housekeeping.rates(now).items():
             values[f'{name}_hz'] = f'{hertz:.1f}'
-        if (best := bridge.housekeeping.timesync.best) is not None:
-            values['timesync_offset_ms'] = f'{best.offset * 1e-6:.3f}'
-            values['timesync_round_trip_ms'] = f'{best.way * 1e-6:.3f}'
         if (forwarder := bridge.forwarder) is not None:
             values['odometry_resets'] = forwarder.reset_counter
             values.update({f'odometry: {k}': n for k, n in forwarder.counters.copy().items()})
@@ -334,8 +329,7 @@ class BridgeReport:
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard and not (
-            bridge.requests.takeoff_explains_mode(now))
+        unserved = status is not None and status.offboard
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
