@@ -231,7 +231,7 @@ class Gate:
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
         what = self._known(now).contradiction(self.limits)
-        more = (f' by {self.velocity_difference:.2f} m/s, more than '
+        more = (f' by {self._comparison.difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
         # Displacements are compared in each cycle.
         return f'{what}{more}' if what == VELOCITIES_DISAGREE else what or self._displaced
@@ -242,11 +242,6 @@ class Gate:
         return '' if abs(difference) <= self.limits.yaw_disagreement else (
             f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
             'their frames are not aligned, commands would go the wrong way')
-
-    @property
-    def velocity_difference(self) -> float:
-        """Return the average difference between the velocities of odom and autopilot, m/s."""
-        return self._comparison.difference
 
     @property
     def wind(self) -> float:

@@ -18,8 +18,8 @@ Texts of the autopilot: STATUSTEXT messages, and the EVENTs of PX4.
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
 with the modes concerned, between two summaries. PX4 sends them after a change, and after
-MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
-here. Measured on 1.16.
+MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``config/px4_events.txt`` has
+the names and texts. Measured on 1.16.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
+
+from flock_follower.files import resource
 
 #: The message; common.xml has it, no pymavlink yet.
 MESSAGE_ID: Final[int] = 410
@@ -47,56 +49,6 @@ _STICKS: Final[str] = 'check_modes_manual_control'
 #: The worst level of a check that is only a remark.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
-#: Texts of the events that are reported.
-_MEANINGS: Final[Mapping[str, str]] = MappingProxyType({
-    'check_modes_angular_velocity': 'no angular velocity',
-    'check_modes_attitude': 'no attitude estimate',
-    'check_modes_local_pos': 'no valid position estimate',
-    'check_modes_global_pos': 'no global position (neither GPS nor an origin)',
-    'check_modes_local_alt': 'no valid altitude estimate',
-    'check_modes_mission': 'no mission',
-    'check_modes_offboard_signal': 'no setpoint stream',
-    'check_modes_home_position': 'no home position',
-    _STICKS: 'no transmitter',
-    'check_modes_cannot_takeoff': 'it does not arm in this mode',
-    'check_rc_dl_no_dllink': 'no ground station',
-    'check_system_arm_auth_failed': 'arm authorization denied',
-    'check_system_safety_button': 'press the safety button',
-    'check_man_control_kill_engaged': 'the kill switch is on',
-    'commander_arm_denied_throttle_center': 'arming denied: throttle above its centre',
-    'commander_arm_denied_throttle_high': 'arming denied: throttle too high',
-    'commander_arm_denied_calibrating': 'arming denied: calibrating',
-    'commander_disarm_denied_not_landed': 'disarming denied: not landed',
-    'commander_gcs_lost': 'the ground station is lost',
-    'commander_mission_comp_lost': 'this computer is lost',
-    'commander_rc_lost': 'the transmitter is lost',
-})
-#: More of its checks, 'check_' left out; the name has the words.
-_MORE: Final[str] = """
-accel_missing accel_no_data accel_not_calibrated armable_configuration avionics_power_high
-avionics_power_low avionics_power_missing avionics_power_redundancy baro_missing baro_no_data
-battery_critical battery_disconnected battery_emergency battery_fault battery_low battery_missing
-battery_rem_flight_time_low battery_unhealthy cpuload_too_high distance_sensor_invalid
-distance_sensor_missing escs_fault escs_offline escs_telem_missing estimator_gnss_fault
-estimator_gps_fix_too_low estimator_gps_generic estimator_gps_hor_pos_drift_too_high
-estimator_gps_hor_pos_err_too_high estimator_gps_hor_speed_drift_too_high
-estimator_gps_jamming_critical estimator_gps_not_fusing estimator_gps_num_sats_too_low
-estimator_gps_pdop_too_high estimator_gps_speed_acc_too_low estimator_gps_spoofed
-estimator_gps_vert_pos_drift_too_high estimator_gps_vert_pos_err_too_high
-estimator_gps_vert_speed_drift_too_high estimator_heading_not_stable estimator_hgt_not_stable
-estimator_high_accel_bias estimator_high_gyro_bias estimator_hor_pos_not_stable
-estimator_hor_vel_not_stable estimator_low_position_accuracy estimator_mag_fault
-estimator_mag_interference estimator_missing_data estimator_vert_vel_not_stable
-external_modes_unavailable external_modes_unresponsive failure_detector_alt
-failure_detector_arm_esc failure_detector_ext failure_detector_imbalanced_prop
-failure_detector_motor failure_detector_pitch failure_detector_roll flight_time_limit gf_no_home
-gf_violation_custom_gf gf_violation_max_alt gf_violation_max_hor_dist gyro_missing gyro_no_data
-gyro_not_calibrated hardfault_present imu_accel_inconsistent imu_gyro_inconsistent mag_consistency
-mag_fault mag_missing mag_no_data mag_not_calibrated mag_sys_has_mag_missing
-man_control_rtl_engaged missing_cpuload missing_fmu_sdcard missing_system_power mission_failure
-navigator_failure_hagl optical_flow_sensor_invalid ram_usage_too_high rc_dz_too_high
-rc_max_too_high rc_min_too_small rc_trim_too_high rc_trim_too_small system_flight_term_active
-system_no_global_pos system_no_home_pos system_usb_connected wind_too_high"""
 _ENTERS: Final[tuple[str, ...]] = (
     'commander_failsafe_enter', 'commander_failsafe_enter_generic',
     'commander_failsafe_enter_autopilot_disengaged', 'commander_failsafe_enter_hold',
@@ -111,9 +63,17 @@ def event_number(name: str) -> int:
     return value % 2**24
 
 
+def _read_texts() -> dict[str, str]:
+    """Return the text of each event by its name."""
+    lines = resource('config/px4_events.txt').read_text(encoding='utf-8').splitlines()
+    found = (line.partition(': ') for line in lines if not line.startswith('#'))
+    return {name: text or name.removeprefix('check_').replace('_', ' ')
+            for name, _, text in found}
+
+
+_TEXTS: Final[Mapping[str, str]] = MappingProxyType(_read_texts())
 _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
-    {event_number(name): name for name in (
-        *_MEANINGS, *_ENTERS, _BEGIN, _END, *(f'check_{text}' for text in _MORE.split()))})
+    {event_number(name): name for name in (*_TEXTS, *_ENTERS, _BEGIN, _END)})
 
 
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
@@ -170,10 +130,9 @@ class ArmingChecks:
         elif name in _ENTERS:
             return f'failsafe: action {arguments[4]} of PX4'
         elif name.startswith('commander_'):
-            return _MEANINGS[name]
+            return _TEXTS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
-            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ')
-            self._coming.append(Failure(text or f'event {message.number % 2**24}',
+            self._coming.append(Failure(_TEXTS.get(name, f'event {message.number % 2**24}'),
                                         int.from_bytes(arguments[:4], 'little'), level))
         return ''
 
@@ -184,7 +143,7 @@ class ArmingChecks:
                 # For every mode come remarks, too, that keep it from nothing,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which keeps it from the pilot's.
-                     or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
+                     or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
 
 
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.

@@ -161,8 +161,7 @@ class MavlinkBridge(FlockNode):
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
-        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
-                                    self._publisher)
+        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._publisher)
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 

@@ -32,7 +32,6 @@ from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
-from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
@@ -55,11 +54,10 @@ class BridgeReport:
     """Collects events of the setpoint thread and reports them from the executor's thread."""
 
     def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
-                 stream: SetpointThread, publisher: PublisherThread) -> None:
+                 publisher: PublisherThread) -> None:
         self._node = node
         self._diagnostics = diagnostics
         self._bridge = bridge
-        self._stream = stream
         self._publisher = publisher
         self._start = time.monotonic()
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
@@ -177,9 +175,7 @@ class BridgeReport:
             'limited_by': setpoint.limited if setpoint else '',
             'without_odometry_s': '' if math.isnan(alone) else f'{alone:.1f}',
             'setpoints_sent': self._diagnostics.rate('stream').count,
-            'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
-            'velocity_difference_m_s': f'{gate.velocity_difference:.2f}',
             'wind_m_s2': f'{gate.wind:.2f}',
             'height_m': 'unknown' if place.height is None else f'{place.height:.2f}',
             'height_source': 'unknown' if altitude is None else altitude.source,
@@ -207,7 +203,6 @@ class BridgeReport:
         for name, hertz in bridge.housekeeping.rates(now).items():
             values[f'{name}_hz'] = f'{hertz:.1f}'
         if (forwarder := bridge.forwarder) is not None:
-            values['odometry_resets'] = forwarder.reset_counter
             values.update({f'odometry: {k}': n for k, n in forwarder.counters.copy().items()})
         values.update({f'ignored: {k}': n for k, n in link.ignored.copy().items()})
         return values
