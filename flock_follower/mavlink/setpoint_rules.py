@@ -254,7 +254,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                       airborne)
     if not reason and command is not None and command.relative:
         return _relative(full, command, against, place, offset)
-    velocity = known.source_first[0].fresh_velocity(limits)
+    velocity = known.velocity
     if not reason and command is not None and velocity is not None:
         bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
         axis = _direction(command.separation_axis)
@@ -263,9 +263,9 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                         axis, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
-    estimated = known.braking_velocity(limits)
+    estimated = known.braking
     if estimated is None:
-        kind = NONE if known.blind(limits) and not relative.begins else LEVEL
+        kind = NONE if known.blind and not relative.begins else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
@@ -287,7 +287,7 @@ def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, co
     if command is not None and command.relative:
         reason = _marker_refusal(limits, relative, place, airborne)
     else:
-        reason = _odometry_refusal(limits, known)
+        reason = _odometry_refusal(known)
     if reason or unplaced:
         return reason or unplaced
     if command is None:
@@ -297,13 +297,13 @@ def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, co
     return '' if fresh(command_age, limits.planner_timeout) else 'command stale'
 
 
-def _odometry_refusal(limits: GateLimits, known: KnownMotion) -> str:
+def _odometry_refusal(known: KnownMotion) -> str:
     """Return why a command may not rest on the odometry, or ''."""
-    judge, _ = known.source_first
-    if judge.fresh_velocity(limits) is not None:
-        return known.contradiction(limits)
-    never = math.isinf(judge.velocity_age)
-    return f'no velocity from {known.source}' if never else f'velocity from {known.source} stale'
+    if known.velocity is not None:
+        return known.contradiction
+    if known.never:
+        return f'no velocity from {known.source}'
+    return f'velocity from {known.source} stale'
 
 
 def _marker_refusal(limits: GateLimits, relative: Relative, place: Location,
