@@ -248,11 +248,6 @@ class Gate:
         """Return the acceleration by the wind that setpoints offset, m/s^2."""
         return float(np.linalg.norm(self._wind))
 
-    @property
-    def jumps(self) -> int:
-        """Return how often a position or a height has jumped."""
-        return self.heights.steps + sum(source.path.jumps for source in self._sources.values())
-
     def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
         return '' if now - self._disturbance.excess_since <= longer else (

@@ -244,7 +244,6 @@ class Path:
     """The positions (3,), m, of one source, without jumps; times are monotonic, s."""
 
     def __init__(self) -> None:
-        self.jumps = 0
         self.position: Array | None = None
         """The newest, m, in a frame that is the source's but for the jumps."""
         self._time = -math.inf
@@ -266,7 +265,6 @@ class Path:
         if self.position is not None and velocity is not None and elapsed <= LONGEST_GAP:
             surprise = shifted - self.position - velocity * elapsed
             if math.hypot(*surprise.tolist()) > POSITION_JUMP:
-                self.jumps += 1
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
         self.position, self._time = shifted, now
