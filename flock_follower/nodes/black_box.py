@@ -252,7 +252,7 @@ class BlackBox(FlockNode):
             if now < self._retry:
                 raise OSError(0, self._fault)
             if self._recording is None:
-                self._recording = FlightRecording(self._folder, self._limits, now, time.time())
+                self._recording = FlightRecording(self._folder, self._limits)
             for name, text in list(self._notes.items()):
                 if self._noted.get(name) != text:
                     self._recording.note(name, text)
