@@ -61,7 +61,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def verdict(seen: Observations) -> tuple[bool, str]:
     """Return whether ``check`` permits the flight, and its findings as text."""
     findings = judge_all(seen)
-    return ready(findings), table(seen, findings, colours=sys.stdout.isatty())
+    return ready(findings), table(seen, findings)
 
 
 if __name__ == '__main__':

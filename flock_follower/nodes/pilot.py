@@ -183,7 +183,7 @@ class Pilot(Node):
 
     def _check(self) -> None:
         """Run the command ``check`` here; no key is read for its duration of some seconds."""
-        observer = Observer(self._seconds, self.get_namespace(), {}, None, '')
+        observer = Observer(self._seconds, self.get_namespace(), {}, '')
         self._checking = True
         try:
             ready, text = self._verdict(observer.observe())
