@@ -36,7 +36,7 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from flock_follower.bags.description import incomplete, mcap_files, METADATA
-from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
+from flock_follower.bags.message_types import migration_obstacle, typestore
 from flock_follower.bags.unfinished import has_end, UnfinishedReader
 
 _UNREADABLE = 'corrupt, truncated or unsupported'
@@ -107,7 +107,7 @@ class Bag(AbstractContextManager['Bag']):
                 self.skipped[name] = why
             else:
                 self.topics[name] = Topic(
-                    name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
+                    name, connections[0].msgtype, sum(c.msgcount for c in connections),
                     any(map(_latched, connections)))
         self._connections = groups
 
@@ -239,7 +239,7 @@ def _latched(connection: Connection) -> bool:
 
 def _unreadable(connections: list[Connection]) -> str | None:
     """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
-    msgtypes = sorted({ros2_type(c.msgtype) for c in connections})
+    msgtypes = sorted({c.msgtype for c in connections})
     if len(msgtypes) > 1:
         return f'several types on one topic ({", ".join(msgtypes)})'
     for connection in connections:
