@@ -148,7 +148,10 @@ class Collector:
         except ValueError:
             camera = None  # reported with the calibration
         for picture, pixels in self._kept:
-            found = everywhere(pixels, config.dictionary, [of.marker for of in markers.values()])
+            found = everywhere(pixels, config.dictionary)
+            if not markers.keys() & set(found.ids.tolist()):  # thoroughly, which takes longer
+                found = everywhere(pixels, config.dictionary,
+                                   [of.marker for of in markers.values()])
             picture.markers = _sides(found)
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):
@@ -179,6 +182,8 @@ def sightings(stamp: float, image: GrayImage, camera: CameraModel, found: Detect
     """
     rows, by_marker = [], config.by_marker()
     for number, corners in zip(found.ids.tolist(), found.corners):
+        if number not in by_marker:
+            continue
         neighbor, marker = by_marker[number]
         measured = locate(image, camera, target(neighbor, config.dictionary),
                           neighbor.markers.index(marker), corners, PosePrior())

@@ -68,17 +68,14 @@ PRIOR = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (ROWS * COLUMNS)])
 #: near walls looks like a longer focal length, unless it pitches by this share of its yaw.
 WIDENED, ZOOM_ERROR, DEPTHS, BOTH = 2.0, 0.03, 1.0, 0.2
 _PASSES, _FAR = 8, 2.0
-
+#: s: between attitudes farther apart the rotation is unknown.
+LONGEST = 0.3
 
 
 class OwnPath:
-    """
-    The own motion between the states of an odometry, in order.
+    """The own motion between the states of an odometry, in order."""
 
-    :param longest: the attitude is known between two states that are at most so many s apart.
-    """
-
-    def __init__(self, states: Sequence[OdometryState], longest: float = 0.3) -> None:
+    def __init__(self, states: Sequence[OdometryState]) -> None:
         quaternions = np.array([state.quaternion for state in states])
         turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
         same = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])
@@ -87,7 +84,6 @@ class OwnPath:
         self._positions = np.array([state.position for state in states])
         self._velocities = np.array([state.velocity @ quaternion_to_matrix(state.quaternion)
                                      for state in states])
-        self._longest = longest
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return attitudes (m, 4) at stamps (m,), s, and where they are known (m,)."""
@@ -97,7 +93,7 @@ class OwnPath:
         part = (times - stamps[after - 1]) / np.where(span > 0.0, span, 1.0)
         mixed = ((1.0 - part)[:, None] * self._quaternions[after - 1]
                  + part[:, None] * self._quaternions[after])
-        known = (part >= 0.0) & (part <= 1.0) & (span <= self._longest)
+        known = (part >= 0.0) & (part <= 1.0) & (span <= LONGEST)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), known
 
     def position(self, times: Array) -> Array:
