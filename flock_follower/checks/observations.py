@@ -158,8 +158,6 @@ class Observations:
     names: dict[str, str] = field(default_factory=dict)
     topics: dict[str, TopicSeen] = field(default_factory=dict)
     nodes: list[str] = field(default_factory=list)
-    clock: bool = False
-    """Whether /clock is published."""
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     own: OwnMotion | None = None
     child_frame: str = ''

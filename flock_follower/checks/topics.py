@@ -106,11 +106,12 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
     """Check that every node runs on simulated time if there is a /clock, and only then."""
     simulated = {node: bool(own['use_sim_time']) for node, own in seen.parameters.items()
                  if 'use_sim_time' in own}
-    wrong = ', '.join(node for node, value in simulated.items() if value != seen.clock)
+    clock = '/clock' in seen.topics
+    wrong = ', '.join(node for node, value in simulated.items() if value != clock)
     if simulated:
         yield first(
             'clock', 'use_sim_time where /clock is',
-            (wrong and seen.clock, ERROR,
+            (wrong and clock, ERROR,
              f'/clock is published, but use_sim_time is false in {wrong}',
              'start with -p use_sim_time:=true; or end the publisher of /clock'),
             (wrong, ERROR, f'use_sim_time is true in {wrong}, but nobody publishes /clock',

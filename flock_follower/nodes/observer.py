@@ -208,7 +208,6 @@ class Observer(Node):
             known.publishers = self._ends(self.get_publishers_info_by_topic(topic))
             if not known.publishers:
                 del seen.topics[topic]
-        seen.clock = bool(self.count_publishers('/clock'))
 
     def _ends(self, infos: list[Any]) -> list[TopicEnd]:
         return [TopicEnd(

@@ -31,7 +31,13 @@ import pytest
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
-from flock_follower.checks.observations import NodeStatus, Observations, OURS, TopicEnd
+from flock_follower.checks.observations import (
+    NodeStatus,
+    Observations,
+    OURS,
+    TopicEnd,
+    TopicSeen,
+)
 from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import TYPES
 from flock_follower.geometry import (
@@ -305,8 +311,8 @@ FAULTS: list[Fault] = [
               '/odom': 'type nav_msgs/Odometry has other fields in ROS 2 Jazzy'}))),
     Fault('use_sim_time forgotten', LIVE, ERROR, 'clock',
           '/clock is published, but use_sim_time is false in planner', 'use_sim_time:=true',
-          together(change(clock=True), *(parameter(node, 'use_sim_time', node != 'planner')
-                                         for node in OURS))),
+          together(lambda seen: seen.topics.update({'/clock': TopicSeen()}),
+                   *(parameter(node, 'use_sim_time', node != 'planner') for node in OURS))),
     Fault('twist in odom, told as child', BOTH, ERROR, 'odom velocity',
           'read in child, the positions say odom', 'odom_twist_frame:=auto',
           together(positions([0, 1, 2], [1.0] * 3, True),

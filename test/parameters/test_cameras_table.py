@@ -86,14 +86,6 @@ def test_a_wrong_parameter_is_refused_with_the_valid_ones(
         BOTH[node].build(values(**parameters)[node])
 
 
-def test_relative_pose_and_planner_must_have_the_same_cameras() -> None:
-    with pytest.raises(ValueError, match=re.escape(
-            'camera.left.rpy = [0.0, 0.0, 1.0] for relative_pose and [0.0, 0.0, 2.0] for '
-            'planner: must be the same')):
-        parse_parameters({'relative_pose': {'ros__parameters': two()},
-                          'planner': {'ros__parameters': two(rpy=[0.0, 0.0, 2.0])}}, TABLE)
-
-
 def test_the_example_is_taken_and_holds_all_that_a_camera_has() -> None:
     reported = read_parameters(resource('config/two_cameras.yaml'), TABLE)
     for node, table in BOTH.items():
