@@ -217,16 +217,6 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
     assert values is not None and values['planner']['v_max'] == 0.5
 
 
-def test_it_records_in_its_threads_until_it_is_asked_to_end(
-        vehicle: Vehicle, box: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(black_box, 'spin', lambda node: vehicle.fly(
-        10.0, lambda: 'recording' in box.values))
-    assert box.node.record() == 0
-    path, = (tmp_path / 'box').iterdir()
-    with open_bag(path) as bag:
-        assert bag.incomplete == '' and bag.message_count > 0
-
-
 def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
         vehicle: Vehicle, tmp_path: Path) -> None:
     process = vehicle.start('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
