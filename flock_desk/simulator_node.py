@@ -130,8 +130,6 @@ class Simulator(FlockNode):
         """When the bridge ended the scenario before its time, s, and with which words."""
         self._line = LiveLine()
         self._delay = SchedulingDelay(os.getppid()) if self._values['end_if_busy'] else None
-        self._lateness = self.diagnostics.latency('lateness')
-        self._rendering = self.diagnostics.latency('rendering')
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
         seed = self._values['seed']
         # It takes a second or two: the clock starts after it.
@@ -224,25 +222,16 @@ class Simulator(FlockNode):
                     next_service = now + SERVICE_PERIOD
                     for _ in range(1 if self._ahead is None else MESSAGES):
                         executor.spin_once(timeout_sec=0.0)
-                    self._show(now)
-                    if self._delay is not None and self._flight.began_ns is not None:
-                        self._delay.check(now)
-                    if self._external is not None and (gone := self._external.gone(now)):
-                        print(f'error: {gone}', file=sys.stderr)
-                        return 1
-        except TooBusyError as error:
+                    self._watch(now)
+            self._line.end()
+            if self._values['log'] and self.context.ok():
+                self._save_log()
+        except (OSError, TooBusyError) as error:
             print(f'error: {error}', file=sys.stderr)
-            return TOO_BUSY_EXIT_CODE
+            return TOO_BUSY_EXIT_CODE if isinstance(error, TooBusyError) else 1
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
-        self._line.end()
-        if self._values['log'] and self.context.ok():
-            try:
-                self._save_log()
-            except OSError as error:
-                print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
-                return 1
         return 0
 
     def _save_log(self) -> None:
@@ -293,7 +282,6 @@ class Simulator(FlockNode):
 
     def _step(self) -> None:
         due = self._step_due()
-        self._lateness.add(time.monotonic() - due)
         if isinstance(self._vehicle, EmbeddedVehicle):  # an external simulator has its own wind
             self._vehicle.autopilot.controller.wind = self._flight.scenario.wind(self._flight.time)
         self._end.step(due)
@@ -309,10 +297,8 @@ class Simulator(FlockNode):
             self._log.add('odom', self._epoch_ns + sampled_ns, *_logged(estimate))
         if (distance := self._flight.measured()) is not None:
             self._outputs.range(now_ns, distance)
-        began = time.monotonic()
-        frame = self._flight.look(round((began - self._start) * 1e9))
+        frame = self._flight.look(round((time.monotonic() - self._start) * 1e9))
         if frame is not None:
-            self._rendering.add(time.monotonic() - began)
             self._take_image(self._epoch_ns + frame.stamp_ns, frame)
 
     def _take_image(self, stamp_ns: int, frame: RenderedImage) -> None:
@@ -350,24 +336,25 @@ class Simulator(FlockNode):
             return None
         return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
 
-    def _show(self, now: float) -> None:
-        """Update the live line and the values of /diagnostics."""
+    def _watch(self, now: float) -> None:
+        """
+        Update the live line and the values of /diagnostics.
+
+        :raises TooBusyError: if the nodes wait too long for a processor.
+        :raises OSError: if an external vehicle is gone for good.
+        """
         flight = self._flight
-        self.diagnostics.values.update({
-            'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
-            'skipped_images': flight.skipped_images})
-        if self._external is not None:
-            self.diagnostics.values.update({
-                f'{name}_from': source for name, source in self._external.sources.items()})
-        if not self._line.due(now):
-            return
-        speed = sum(c * c for c in flight.follower.linear.tolist()) ** 0.5
-        when = ('waiting' if flight.began_ns is None
-                else f'{flight.time:5.1f} of {self._duration:g} s')
-        apart = flight.distance
-        where = 'no leader' if math.isnan(apart) else f'distance {apart:.2f} m'
-        self._line.show(f'{when}  {where}  {self._state or "no planner":<6}  '
-                        f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
+        if self._delay is not None and flight.began_ns is not None:
+            self._delay.check(now)
+        if self._external is not None and (gone := self._external.gone(now)):
+            raise OSError(gone)
+        self.diagnostics.values['time_s'] = f'{flight.time:.2f}'
+        self.diagnostics.values['skipped_images'] = flight.skipped_images
+        if self._line.due(now):
+            when = ('waiting' if flight.began_ns is None
+                    else f'{flight.time:5.1f} of {self._duration:g} s')
+            self._line.show(f'{when}  distance {flight.distance:.2f} m  '
+                            f'{self._state or "no planner":<6}')
 
 
 def _logged(state: Odometry) -> tuple[Array, Array, Array]:
