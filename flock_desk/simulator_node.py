@@ -36,13 +36,13 @@ import os
 import sys
 import time
 
+import cv2
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 from flock_desk.autopilot import Endpoint, loopback_address
-from flock_desk.camera.renderer import render_in_one_thread
 from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
@@ -139,8 +139,8 @@ class Simulator(FlockNode):
         self._vehicle: EmbeddedVehicle | ExternalVehicle
         self._end: Endpoint | ExternalVehicles
         leader: ExternalLeader | None = None
+        self.diagnostics.checks.append(self._problem)
         if self._external is None:
-            self.diagnostics.checks.append(self._lateness_problem)
             self._outputs.armed_below()  # armed in the air: the bridge cannot know from where
             self._start = time.monotonic()
             self._vehicle = EmbeddedVehicle(
@@ -149,7 +149,6 @@ class Simulator(FlockNode):
                                  self._vehicle.autopilot)
         else:
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
-            self.diagnostics.checks.append(self._external_problem)
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
@@ -170,16 +169,13 @@ class Simulator(FlockNode):
 
     def _links(self) -> ExternalVehicles | None:
         """Return the links to external vehicles, or None."""
-        leader = self._values['leader_truth_connection']
-        topic = self._values['leader_topic']
-        if self._values['vehicle'] == 'embedded':
-            if leader:
-                raise ValueError(f'leader_truth_connection = {leader!r}: only with vehicle = '
-                                 "'external'; the embedded vehicle follows the scenario's leader")
+        vehicle, leader = self._values['vehicle'], self._values['leader_truth_connection']
+        excluded = 'leader_truth_connection' if vehicle == 'embedded' else 'leader_topic'
+        if self._values[excluded]:
+            raise ValueError(f'{excluded} = {self._values[excluded]!r}: not with vehicle = '
+                             f'{vehicle!r}')
+        if vehicle == 'embedded':
             return None
-        if topic:
-            raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
-                             "'embedded'; that of an external one comes by MAVLink")
         return ExternalVehicles(
             ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
             ExternalAutopilot(leader, self._values['leader_target_system'],
@@ -323,18 +319,15 @@ class Simulator(FlockNode):
                 not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
-    def _external_problem(self, now: float) -> Problem | None:
-        assert self._external is not None
+    def _problem(self, now: float) -> Problem | None:
+        if self._external is None:
+            late = now - self._step_due()
+            return None if late < LATE else (
+                ERROR, f'{late:.1f} s late: this machine is too slow, or too busy')
         if stalled := self._external.stalled(now, self._flight.time_ns):
             return ERROR, stalled
         slow = self._external.slow(now)
         return (WARN, slow) if slow else None
-
-    def _lateness_problem(self, now: float) -> Problem | None:
-        late = now - self._step_due()
-        if late < LATE:
-            return None
-        return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
 
     def _watch(self, now: float) -> None:
         """
@@ -365,7 +358,7 @@ def _logged(state: Odometry) -> tuple[Array, Array, Array]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the scenario, 1 or 3 for what cannot be flown."""
-    render_in_one_thread()
+    cv2.setNumThreads(1)  # OpenCV's threads take twice the time, waiting
     return run(Simulator, args, Simulator.fly)
 
 

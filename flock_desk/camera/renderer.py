@@ -267,11 +267,6 @@ def _texture(cells: Array) -> Image:
     return np.dstack([fine, np.ones_like(fine)]).astype(np.float32)
 
 
-def render_in_one_thread() -> None:
-    """Keep OpenCV from sharing an image's work out: its threads take twice the time, waiting."""
-    cv2.setNumThreads(1)
-
-
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
 #: The marker on the leader's body (FLU): on the tail, facing backwards.

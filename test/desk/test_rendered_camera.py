@@ -63,39 +63,6 @@ def project(camera, points):
     return pixels.reshape(-1, 2)
 
 
-def look(image, points):
-    """Return the image (N,), linearly interpolated at points (N, 2)."""
-    x, y = points.astype(np.float32).T
-    return cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR)[0]
-
-
-def located_edges(image, camera, T_optical_marker):
-    """
-    Return where the marker's four edges are seen, (4, n, 2), and where they project to.
-
-    Along a profile from black to white the edge is where the light missing equals a step's.
-    """
-    h = SIDE / 2
-    corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
-    steps = np.linspace(-3.0, 3.0, 121)
-    seen, true = [], []
-    for start, end in zip(corners, np.roll(corners, -1, axis=0)):
-        along = np.linspace(0.12, 0.88, 40)[:, None]
-        outwards = (start + end) / np.linalg.norm(start + end)
-        edge = start + along * (end - start)
-        at = project(camera, T_optical_marker.apply(edge))
-        normal = project(camera, T_optical_marker.apply(edge + 1e-4 * outwards)) - at
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        for pixel, n in zip(at, normal):
-            profile = look(image, pixel + steps[:, None] * n)
-            black, white = profile[:12].mean(), profile[-12:].mean()
-            missing = (white - profile) / (white - black)
-            offset = np.sum(missing[1:] + missing[:-1]) * (steps[1] - steps[0]) / 2 - 3.0
-            seen.append(pixel + offset * n)
-            true.append(pixel)
-    return np.reshape(seen, (4, 40, 2)), np.reshape(true, (4, 40, 2))
-
-
 def model_of(camera):
     return CameraModel(np.array([[camera.focal_x, 0, camera.centre_x],
                                  [0, camera.focal_y, camera.centre_y], [0, 0, 1]]),
@@ -140,17 +107,6 @@ def test_rays_of_a_very_wide_lens_end_at_its_image_circle():
     assert angle.max() == pytest.approx(1.45, abs=1e-6)  # 83 degrees, in the corners
     image = Renderer(WIDE, Sensor(vignetting=0.15)).image(0, [T_WORLD_OPTICAL], [POSES['ahead']])
     assert image[:9, :9].mean() < 40 and image[70:130, 70:140].mean() > 90
-
-
-@pytest.mark.parametrize(('camera', 'fineness', 'off', 'pose'), [
-    (Camera(), 4, 0.02, 'ahead'), (Camera(), 2, 0.04, 'in the corner'),
-    (FISHEYE, 4, 0.02, 'turned')])
-def test_the_markers_edges_are_where_the_truth_projects(camera, pose, fineness, off):
-    renderer = Renderer(camera, Sensor(), leader(BLACK), fineness=fineness)
-    image = renderer.radiance([T_WORLD_OPTICAL], [POSES[pose]])
-    seen, true = located_edges(image, camera, T_WORLD_OPTICAL.inverse() @ POSES[pose]
-                               @ T_BODY_MARKER)
-    assert np.abs(np.linalg.norm(seen - true, axis=2)).mean() < off  # px
 
 
 def test_light_becomes_a_pixel_by_vignetting_gamma_and_noise_that_repeats_with_the_index():

@@ -42,10 +42,8 @@ from flock_desk.scenarios.scenario import (
     LeaderMotion,
     Leg,
     Outage,
-    RangeErrors,
     Response,
     Scenario,
-    Sensing,
     Start,
     VioErrors,
 )
@@ -186,14 +184,6 @@ def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called() ->
     assert flights.obeying[:, after].all() and in_state(flights, State.TRACK)[:, after].all()
 
 
-def test_in_sight_of_the_leader_ranges_change_nothing() -> None:
-    scenario = replace(HOVER, sensing=Sensing(recall=1.0))
-    without, with_them = (fly(each, range(2), True) for each in (
-        scenario, replace(scenario, ranges=RangeErrors(20.0))))
-    for name in ('follower', 'velocity', 'command'):
-        assert np.array_equal(getattr(without, name), getattr(with_them, name), equal_nan=True)
-
-
 def test_unseen_for_5_s_the_distance_stays_known_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     errors: list[float] = []
 
@@ -265,12 +255,6 @@ def test_a_wrong_scenario_is_a_message_not_a_traceback(
     assert main(['--scenario', str(bad), '--output', str(tmp_path)]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
         f'error: {bad}: flight.v_max = 99.0: must be a number in [0.05, 20] m/s')
-    twin = tmp_path / 'hover.yaml'
-    twin.write_text('summary: the same name\n')
-    assert main(['--scenario', 'hover', str(twin)]) == 1
-    assert 'another scenario has the name hover' in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(['--runs', '0'])
 
 
 def children(parent: int) -> list[str]:
@@ -309,14 +293,9 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
     for k in range(1, 360):
         world.advance(k)
         lookout.look(k)
-        for own in world.odometry(k * STEP):
-            if k > 60:
-                assert own is not None
-                ages.append(k * STEP - own.stamp)
+        ages += [k * STEP - own.stamp for own in world.odometry(k * STEP) if own and k > 60]
         images += [k * STEP - seen[0].estimate.stamp for _, seen in lookout.arrived(k * STEP)
                    if seen]
-    assert min(ages) == pytest.approx(0.06, abs=STEP)
-    assert max(ages) == pytest.approx(0.16, abs=STEP)
+    assert [min(ages), max(ages)] == pytest.approx([0.06, 0.16], abs=STEP)
     # An image waits for the odometry after it.
-    assert min(images) >= 0.06 - 1e-9
-    assert max(images) < 0.1 + 0.06 + 2 / 30
+    assert min(images) + 1e-9 >= 0.06 and max(images) < 0.16 + 2 / 30

@@ -43,9 +43,3 @@ def test_the_rotors_push_along_acceleration_drag_and_gravity(flight, name):
         thrust = track.accelerations[k] + DRAG * track.velocities[k] + [0.0, 0.0, GRAVITY]
         up = quaternion_to_matrix(track.quaternions[k])[:, 2]
         assert np.arccos(up @ thrust / np.linalg.norm(thrust)) < np.deg2rad(1.5)  # buffeting
-
-
-@pytest.mark.parametrize('time', [-0.001, 20.1, float('nan')])
-def test_a_time_outside_the_track_is_refused(flight, time):
-    with pytest.raises(ValueError, match=r'must be a number in \[0, 20\] s'):
-        flight.leader.pose(time)
