@@ -206,7 +206,10 @@ class Simulator(FlockNode):
         next_service = 0.0
         try:
             while self.context.ok() and not self._finished():
-                self._wait(next_service)
+                # An external vehicle is stepped once a pose has come, which ends the wait.
+                wake = min(self._step_due() if self._external is None else math.inf, next_service,
+                           self._start + self._outputs.next_image)
+                self._end.receive(wake - time.monotonic())
                 now = time.monotonic()
                 while (now if self._external is None
                        else self._external.known(now)) >= self._step_due():
@@ -268,13 +271,6 @@ class Simulator(FlockNode):
     def _step_due(self) -> float:
         """Return when the next step begins, s: always whole steps, lost time is flown through."""
         return self._start + (self._flight.time_ns + STEP_NS) * 1e-9
-
-    def _wait(self, next_service: float) -> None:
-        """Receive from the autopilot until the next step, image or service is due."""
-        # An external vehicle is stepped once a pose has come, which ends the wait.
-        wake = min(self._step_due() if self._external is None else math.inf, next_service,
-                   self._start + self._outputs.next_image)
-        self._end.receive(wake - time.monotonic())
 
     def _step(self) -> None:
         due = self._step_due()

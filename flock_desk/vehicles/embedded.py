@@ -203,7 +203,9 @@ class EmbeddedAutopilot:
             self._due[self._profile.mode_message] = now
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
-                messages += self._message(message_id, now)
+                name = _NAMES[message_id]
+                if fields := self._status(name, now) or self._motion(name, now):
+                    messages.append(mavlink.mavlink_map[message_id](*fields))
                 # From the time it was due: the mean rate is exact.
                 interval = self._intervals[message_id]
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
@@ -248,11 +250,6 @@ class EmbeddedAutopilot:
 
     def _boot_ms(self, now: float) -> int:
         return round((now - self._booted) * 1e3)
-
-    def _message(self, message_id: int, now: float) -> list[Any]:
-        """Return the message with an id; an empty list if it has no content."""
-        fields = self._status(_NAMES[message_id], now) or self._motion(_NAMES[message_id], now)
-        return [mavlink.mavlink_map[message_id](*fields)] if fields else []
 
     def _motion(self, name: str, now: float) -> tuple[Any, ...]:
         """Return the fields of a message about the motion; () if it is not known."""

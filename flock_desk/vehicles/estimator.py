@@ -66,7 +66,8 @@ class Estimator:
                  ready_at: float) -> None:
         self._vehicle, self._profile = vehicle, profile
         self.uses_vision = uses_vision
-        self._ready_at = ready_at
+        self.ready_at = ready_at
+        """Since when it runs, s, with or without aiding."""
         self._position_error: Array = np.zeros(3)
         self._velocity_error: Array = np.zeros(3)
         self.yaw_error = 0.0
@@ -96,14 +97,6 @@ class Estimator:
     def vision_age(self, now: float) -> float:
         """Return the time since the last valid vision, s; 0 if it does not use vision."""
         return now - self._vision_time if self.uses_vision else 0.0
-
-    def started(self, now: float) -> bool:
-        """Return whether it runs, be it without anything to rest on."""
-        return now >= self._ready_at
-
-    def to_true_frame(self, acceleration: Array) -> Array:
-        """Return a vector of the estimate's frame as it acts in the world."""
-        return quaternion_to_matrix(quaternion_from_yaw(-self.yaw_error)) @ acceleration
 
     def on_odometry(self, message: Any, now: float, age: float) -> None:
         """Take an ODOMETRY of an age, s, if it is one that the autopilot uses."""

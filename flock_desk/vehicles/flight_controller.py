@@ -31,7 +31,15 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_desk.vehicles.estimator import Estimator
 from flock_desk.vehicles.profiles import HOLD, LAND, Parameters, Profile, SETPOINTS
 from flock_desk.vehicles.quadrotor import Quadrotor
-from flock_follower.geometry import Array, GRAVITY, ned_to_enu, wrap_angle, yaw_ned_to_enu
+from flock_follower.geometry import (
+    Array,
+    GRAVITY,
+    ned_to_enu,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    wrap_angle,
+    yaw_ned_to_enu,
+)
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
 VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])
@@ -146,9 +154,9 @@ class FlightController(ABC):
     def _supervise(self, now: float) -> None:
         """Change the mode where a failsafe does."""
 
-    @abstractmethod
     def _fly_setpoints(self, now: float, dt: float) -> Array:
         """Return the acceleration (3,), m/s^2, of the mode that obeys setpoints."""
+        return self._setpoint.acceleration
 
     @abstractmethod
     def _detect_ground(self, wanted: Array, dt: float) -> None:
@@ -162,13 +170,13 @@ class FlightController(ABC):
     def position_known(self, now: float) -> bool:
         """Return whether there is an estimate, and vision, where it needs it, not long gone."""
         timeout = self.PROFILE.position_timeout + 1e-6 * self.parameters.get('EKF2_NOAID_TOUT', 0)
-        return self.estimator.started(now) and self.estimator.vision_age(now) <= timeout
+        return now >= self.estimator.ready_at and self.estimator.vision_age(now) <= timeout
 
     def conditions(self, now: float) -> dict[str, bool]:
         """Return which conditions of modes, arming and reports are met."""
         known, age = self.position_known(now), self.estimator.vision_age(now)
-        started = self.estimator.started(now)
-        reported, aided = (started and age <= t for t in (self.PROFILE.reports_for, _AIDED))
+        reported, aided = (now >= self.estimator.ready_at and age <= t
+                           for t in (self.PROFILE.reports_for, _AIDED))
         return {'permission': self.armed or not self._arming_denial,
                 'vision': age <= _VISION_HEALTHY,
                 'armable': self.armed or self.PROFILE.modes[self.mode].arms,
@@ -242,9 +250,10 @@ class FlightController(ABC):
         self._supervise(now)
         wanted = self._control(now, dt)
         self._detect_ground(wanted, dt)
-        self.vehicle.step(self.estimator.to_true_frame(wanted),
-                          wrap_angle(self._yaw - self.estimator.yaw_error), dt,
-                          powered=self.armed, wind=self.wind)
+        # From the frame of the estimate to the true one.
+        error = self.estimator.yaw_error
+        self.vehicle.step(quaternion_to_matrix(quaternion_from_yaw(-error)) @ wanted,
+                          wrap_angle(self._yaw - error), dt, powered=self.armed, wind=self.wind)
         self._flown = self.armed and (self._flown or not self.vehicle.landed)
         if not (self.armed and self.vehicle.landed and self._rests):
             self._landed_since = now

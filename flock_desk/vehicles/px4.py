@@ -148,9 +148,6 @@ class Px4(FlightController):
         descends = self.in_failsafe and 'sticks' in PX4.modes[self.mode].needs
         return LAND if descends and not self._sticks else super()._flies
 
-    def _fly_setpoints(self, now: float, dt: float) -> Array:
-        return self._setpoint.acceleration
-
     def _control(self, now: float, dt: float) -> Array:
         self._step_takeoff(now, dt)
         self._climb_limit = _RAMP_START + max(self._ramp, 0.0) * (_CLIMB_MAX - _RAMP_START)
