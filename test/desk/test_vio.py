@@ -35,7 +35,7 @@ RUNS = 60
 
 @pytest.fixture(scope='module')
 def track():
-    return fly(8.0).follower
+    return fly(8.0)[1]
 
 
 @pytest.fixture(scope='module')
