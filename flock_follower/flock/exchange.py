@@ -180,6 +180,8 @@ class Sharing:
             sender.sent_at(state.stamp, received)
             if sender.frame is not None:
                 sender.frame.move_anchor(state.position)
+        if sender.vague and state.stamp - max(sender.related.values(), default=0) > LONGEST:
+            sender.hops = math.inf  # not related by its best relation any more: by any
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         point = track_point(state, of_itself)
         sender.tracks[vehicle].add(point)
@@ -204,10 +206,12 @@ class Sharing:
         if point is not None:
             return point, 1
         for sender in sorted(self.senders.values(), key=lambda s: (s.hops, s.name != vehicle)):
-            if sender.frame is not None and sender.hops < of.hops and vehicle in sender.tracks:
-                point = sender.tracks[vehicle].at(stamp)
-                if point is not None:
-                    return sender.frame.point(point), sender.hops + 1
+            if sender.hops >= of.hops or sender.frame is None or sender.vague or (
+                    vehicle not in sender.tracks):
+                continue
+            point = sender.tracks[vehicle].at(stamp)
+            if point is not None:
+                return sender.frame.point(point), sender.hops + 1
         return None, math.inf
 
     def _relate_seen(self, name: str, ours: TrackPoint, hops: float) -> None:

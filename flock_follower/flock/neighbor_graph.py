@@ -62,8 +62,8 @@ def edges(position: Array, positions: Array, radii: Array, own_radius: float,
     return joined
 
 
-def graph_law(offsets: Array, differences: Array, joined: NDArray[np.bool_],
-              others: NDArray[np.bool_], params: FlockingParams, most: float) -> Array:
+def graph_law(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
+              params: FlockingParams, most: float) -> Array:
     """
     Return the acceleration (n,), m/s^2, of one agent of a flock.
 
@@ -73,7 +73,7 @@ def graph_law(offsets: Array, differences: Array, joined: NDArray[np.bool_],
 
     :param offsets: the neighbors' positions minus the own one (m, n), m.
     :param differences: their velocities minus the own one (m, n), m/s.
-    :param joined: (m,) whether it shares an edge with the agent.
+    :param share: (m,) 1 along an edge, 0 without one, in between while an edge changes.
     :param others: (m,) not part of the flock: separation with the L of the pair.
     :param most: largest pull of one neighbor, m/s^2.
     """
@@ -82,9 +82,9 @@ def graph_law(offsets: Array, differences: Array, joined: NDArray[np.bool_],
     scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
-    u: Array = np.sum(np.where(
-        joined[:, None], alignment(r2, params) * differences + pull * offsets,
-        -apart * fade(r2, params) * offsets), axis=0)
+    joined = share[:, None]
+    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
+                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
     return u
 
 

@@ -73,6 +73,14 @@ class Sender:
             self.ban = received + BAN, f'sends {OFTEN} times in {TOO_SHORT / 1e9:g} s'
             self.sent.clear()
 
+    @property
+    def vague(self) -> bool:
+        """Return whether its frame is unknown, or known too vaguely."""
+        if self.frame is None:
+            return True
+        place, yaw = self.frame.stds
+        return place > POSITION_STD_MAX or yaw > YAW_STD_MAX
+
     def unusable(self, now: int) -> str:
         """Return why its messages are not used at a time, ns, or ''."""
         if now < self.ban[0]:
@@ -82,10 +90,8 @@ class Sender:
                     f'its yaw is known to {self.yaw_std:.1f} rad: somebody has to move')
         if self.refused >= DOUBTED:
             return f'{self.refused} times in a row it did not fit'
-        place, yaw = self.frame.stds
-        return '' if place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX else (
-            f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
-            f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
+        return 'its frame is known to {:.2f} m and {:.2f} rad, limits {:g} m and {:g} rad'.format(
+            *self.frame.stds, POSITION_STD_MAX, YAW_STD_MAX) if self.vague else ''
 
     @property
     def slow(self) -> str:

@@ -122,8 +122,9 @@ class Memory(NamedTuple):
     """The neighbors of which only the distance is known at present."""
     motions: Mapping[str, Motion] = NONE
     """Motions of the flock."""
+    shares: Mapping[str, float] = NONE
+    """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
     edges: frozenset[str] = frozenset()
-    """See ``Neighborhood``; of the last step."""
     faced: str = ''
     """The neighbor that it faced then."""
     leader: Neighbor | None = None

@@ -30,7 +30,7 @@ position is unknown.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 import math
 from typing import NamedTuple
 
@@ -53,6 +53,8 @@ class Neighborhood(NamedTuple):
     """The neighbors at hand, all at one time, and their relations to the own vehicle."""
 
     flock: Sequence[Neighbor]
+    shares: Mapping[str, float]
+    """From 0 for none to 1 for an edge: each changes over the time of a handover."""
     edges: frozenset[str]
     """Names at the other ends of the own edges; others are only kept clear of."""
     faced: Neighbor | None
@@ -61,7 +63,7 @@ class Neighborhood(NamedTuple):
     """The neighbor whose altitude it follows; None: it holds its altitude."""
 
 
-NOBODY = Neighborhood((), frozenset(), None, None)
+NOBODY = Neighborhood((), {}, frozenset(), None, None)
 
 
 def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
@@ -69,18 +71,22 @@ def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
     return max(math.dist(n.position, me.position) - (params.radius + n.member.radius), 0.0)
 
 
-def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
-             params: PlannerParams) -> Neighborhood:
+def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: PlannerParams,
+             elapsed: float) -> Neighborhood:
     """
     Return the relations of the neighbors at hand to the own vehicle.
 
-    :param memory: with the relations of the step before.
+    :param memory: with the relations of the step before, ``elapsed`` seconds ago.
     :param flock: all neighbors at hand, at one time; at least one of them can be followed.
     """
     if len(flock) == 1:  # most often; one to avoid is never the only neighbor
         only = flock[0]
-        return Neighborhood(flock, frozenset([only.name]), only, only)
+        return Neighborhood(flock, {only.name: 1.0}, frozenset([only.name]), only, only)
     joined = edges(memory.edges, me, flock, params)
+    change, before = elapsed / max(params.handover_time, params.period), memory.shares
+    shares = {n.name: min(max(before.get(n.name, 0.0) + (
+        change if n.name in joined else -change), 0.0), 1.0) if before else float(n.name in joined)
+        for n in flock}
     follow = [n for n in flock if n.member.role != AVOID]
     leaders = [n for n in follow if n.member.role == LEADER]
     ends = [n for n in follow if n.name in joined]
@@ -89,7 +95,7 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor],
     faced = _nearest(me, memory.faced, next(filter(None, [*seen, leaders, ends]), []))
     # Several followers without a leader would follow their own motion if they followed each other.
     level = _nearest(me, memory.faced, leaders) or (faced if len(ends) < 2 else None)
-    return Neighborhood(flock, joined, faced, level)
+    return Neighborhood(flock, shares, joined, faced, level)
 
 
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
@@ -184,14 +190,13 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     if len(flock) == 1:
         law = acceleration(offsets, differences, params.law)
     else:
-        joined = np.array([n.name in neighbors.edges for n in flock])
+        share = np.array([neighbors.shares[n.name] for n in flock])
         others = np.array([n.member.role == AVOID for n in flock])
-        law = graph_law(offsets, differences, joined, others, params.law, params.a_max)
+        law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
     if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
         return law, None  # too near already: at once
-    begins = memory.params is not params and memory.params != params
-    if begins or memory.edges != neighbors.edges:
+    if memory.params is not params and memory.params != params:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
     if fading is None:
         return law, None

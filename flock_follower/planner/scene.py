@@ -94,13 +94,13 @@ class Scene(NamedTuple):
     """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
 
 
-def survey(memory: Memory, me: OwnState, state: State, blinded: bool,
-           params: PlannerParams) -> tuple[Memory, Scene]:
-    """Return the memory with all to keep clear of, and the scene of this step."""
+def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: PlannerParams,
+           elapsed: float) -> tuple[Memory, Scene]:
+    """Return the memory with all to keep clear of, and the scene ``elapsed`` s after the last."""
     neighbors, leader = NOBODY, None
     if state is State.TRACK:
         here = [at(n, me.stamp) for n in memory.neighbors.values()]
-        neighbors = gathered(memory, me, here, params)
+        neighbors = gathered(memory, me, here, params, elapsed)
         leader = sought(memory, neighbors, me, params)
     flock = _flock(memory, me.stamp, state, leader, params)
     missed = leader

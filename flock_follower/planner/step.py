@@ -92,7 +92,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     me, tracking = at(memory.own, now), mode.state is State.TRACK
     # Commands that are not flown yet count as velocity; part was flown since the measurement.
     coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
-    memory, scene = survey(memory, me, mode.state, mode.blinded, params)
+    memory, scene = survey(memory, me, mode.state, mode.blinded, params, elapsed)
     neighbors = scene.neighbors
     altitude, vertical = _altitude(memory, scene, ground, float(coming[2]), params, elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
@@ -109,7 +109,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     left = math.exp(-elapsed / params.response_time)
     memory = memory._replace(
         followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
-        edges=neighbors.edges,
+        shares=neighbors.shares, edges=neighbors.edges,
         faced=neighbors.faced.name if neighbors.faced else memory.faced,
         leader=last_known(memory, neighbors), looking=scene.leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,

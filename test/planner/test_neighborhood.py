@@ -29,7 +29,6 @@ from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import edges, gathered
 from flock_follower.planner.params import AVOID, FOLLOWER, LEADER, Member, PlannerParams
-from flock_follower.planner.step import step
 
 PARAMS = PlannerParams()
 
@@ -99,7 +98,7 @@ def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> Non
 def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}
-    neighbors = gathered(Memory(), own(), flock, PARAMS)
+    neighbors = gathered(Memory(), own(), flock, PARAMS, 0.1)
     assert neighbors.faced is flock[0] and neighbors.level is flock[0]
 
 
@@ -107,21 +106,20 @@ def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
 def test_whom_it_faces_changes_only_for_one_clearly_nearer(before: str, expected: str) -> None:
     a, b, near = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0), at('c', -1.5, 0.0, 0.0)
     for flock, found in (([a, b], expected), ([a, b, near], 'c')):
-        faced = gathered(Memory(faced=before), own(), flock, PARAMS).faced
+        faced = gathered(Memory(faced=before), own(), flock, PARAMS, 0.1).faced
         assert faced is not None and faced.name == found
 
 
-def test_a_change_of_edges_is_faded_in_over_the_time_of_a_handover() -> None:
-    """A follower at rest between its leader and one that was farther away before."""
-    params, memory, commands = PlannerParams(guard=False, v_max=5.0), Memory(), []
-    for tick in range(20):
-        now = 0.1 * tick
-        flock = [at('leader', 2.4, 0.0, 0.0), at('b', 0.0, 2.4, 0.0, received=True)]
-        moving = [n._replace(stamp=now, velocity=np.array([0.3, 0.2, 0.0])) for n in flock]
-        memory, decision = step(memory, now, True, own()._replace(stamp=now),
-                                moving[:1 if tick < 10 else 2], params)
-        commands.append(decision.acceleration)
-    steps = np.linalg.norm(np.diff(commands, axis=0), axis=1)
-    whole = np.linalg.norm(commands[-1] - commands[9])
-    assert whole > 0.1 and decision.edges == ('b', 'leader')
-    assert steps[9:14] == pytest.approx(whole / 5.0) and steps[14:] == pytest.approx(0.0)
+def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
+    def after(memory: Memory, *flock: Neighbor) -> Memory:
+        found = gathered(memory, own(), flock, PARAMS, 0.1)
+        return Memory(shares=found.shares, edges=found.edges)
+
+    a, b, c = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0), at('c', -2.0, 0.0, 0.0)
+    memory, shares = after(Memory(), a, b), []
+    assert memory == Memory(shares={'a': 1.0, 'b': 1.0}, edges=frozenset('ab'))
+    for _ in range(6):
+        memory = after(memory, a, b, c)
+        shares.append(memory.shares['c'])
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
+    assert after(memory, a) == Memory(shares={'a': 1.0}, edges=frozenset('a'))
