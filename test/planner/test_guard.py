@@ -39,8 +39,8 @@ A_MAX, V_MAX, T = 2.5, 0.5, 0.1
 
 Vector = tuple[float, float, float]
 ANYTHING = st.tuples(*[st.floats()] * 3)  # NaN, infinities, 1e308 and denormals among them
-NEAR = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
-SPEED = st.tuples(*[st.floats(-0.8, 0.8)] * 3)
+
+
 SEED = st.integers(0, 2 ** 32)
 
 

@@ -38,7 +38,8 @@ T = 0.1
 
 Vector = tuple[float, float, float]
 ANYTHING = st.tuples(*[st.floats()] * 3)  # NaN, infinities, 1e308 and denormals among them
-FINITE = st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3)
+
+
 FLYABLE = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 LIMIT = st.floats(0.01, 100.0)
 PERIOD = st.floats(0.01, 1.0)
