@@ -211,6 +211,8 @@ def outside(limits: GateLimits, height: float | None) -> str:
 
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.
 BANDWIDTH: Final[float] = 1.0
+#: s: until then the observer does not know the vertical velocity by the sensor alone.
+SETTLING: Final[float] = 3.0
 #: A height older than this, s, is not known any more.
 TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
@@ -245,7 +247,7 @@ class HeightEstimator:
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None
-        self._time = -math.inf
+        self._time = self._began = -math.inf
         self._sensor = ''
         self._zero = 0.0  # altitude of the sensor at altitude 0
         self._reference: float | None = None
@@ -275,7 +277,7 @@ class HeightEstimator:
         altitude -= self._zero
         if elapsed > TIMEOUT:
             # A sensor that returns is used again, with the same reference.
-            self._altitude, self._velocity_error = altitude, 0.0
+            self._altitude, self._velocity_error, self._began = altitude, 0.0, now
             self._differences.clear()
         else:
             self._follow(altitude, climb_rate, elapsed, now)
@@ -286,7 +288,8 @@ class HeightEstimator:
                 now: float) -> None:
         if (climb_rate is None) != (self._reported is None):
             # The rate stays; only its components change.
-            self._velocity_error = self.climb_rate - (climb_rate or 0.0)
+            unknown = climb_rate is not None and now - self._began < SETTLING
+            self._velocity_error = 0.0 if unknown else self.climb_rate - (climb_rate or 0.0)
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
         self._differences.append((now, difference))
