@@ -25,8 +25,9 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 import math
 from pathlib import Path
 import tempfile
@@ -35,7 +36,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_desk.runs.frame_errors import FrameErrors
+from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
@@ -83,6 +84,7 @@ STATES = tuple(state.value for state in State)
 #: What the autopilot is taken to be while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
+IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')
 TRUTHS: Final = ('truth/odom', 'truth/neighbors')
 #: Where a message with a header goes on after encapsulation and stamp.
@@ -91,7 +93,7 @@ _NOTHING = (math.nan,) * 3
 
 
 def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
-                several: Iterable[CameraValues] = ()) -> dict[str, tuple[str, str]]:
+                several: Sequence[CameraValues] = ()) -> dict[str, tuple[str, str]]:
     """
     Return the topics of a bag that a follower uses, and the truth.
 
@@ -101,49 +103,39 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     :param several: cameras with topics of their own, in place of the only one.
     :returns: our name of each topic, ``image_raw`` for all images, and the camera's name, ''
         of the only one.
-    :raises BagError: naming a topic that is missing, or of another type, and those that it may be.
+    :raises BagError: naming topics that are missing, or of another type, and those that may be.
     """
-    remaps, kinds = remaps or {}, (RAW_IMAGES, COMPRESSED_IMAGES)
+    remaps = remaps or {}
     names = names_there(namespace, remaps)
     images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
     published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
-    # If images are named, others that happen to be in the bag are not meant.
-    meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
-    # Our name, the camera's, and the topics that it may be, each with the type that it must have.
-    wanted: list[tuple[str, str, dict[str, str]]] = [
-        (ours, camera.name, {full: published.get(full, '') for full in (
-            full_name(name, namespace) for name in choice)})
+    # If images are named, others that happen to be in the bag are not used.
+    images = [full_name(remaps[kind], namespace) for kind in IMAGES if kind in remaps]
+    # Our name, the camera's, and the topics that it may be.
+    wanted: list[tuple[str, str, list[str]]] = [
+        (ours, camera.name, [full_name(name, namespace) for name in choice])
         for camera in several for ours, choice in (
             (RAW_IMAGES, [camera.images('raw'), camera.images('compressed')]),
             ('camera_info', [camera.camera_info]))]
-    if not wanted:
-        wanted.append((RAW_IMAGES, '', {names[kind]: TYPES[kind] for kind in kinds
-                                        if not meant or names[kind] in meant}))
-        wanted.append(('camera_info', '', {names['camera_info']: TYPES['camera_info']}))
-    wanted += [(ours, '', {names[ours]: TYPES[ours]}) for ours in ('odom', *TRUTHS, 'ranges')]
-
-    def offered(ours: str) -> str:
-        same = kinds if ours == RAW_IMAGES else (ours,)
-        offers = offer(ours, published, [n for name, n in names.items() if name not in same])
-        return f'; {offers}' if offers else ''
-
+    wanted = wanted or [(RAW_IMAGES, '', images or [names[kind] for kind in IMAGES]),
+                        ('camera_info', '', [names['camera_info']])]
+    wanted += [(ours, '', [names[ours]]) for ours in ('odom', *TRUTHS, 'ranges')]
     used: dict[str, tuple[str, str]] = {}
-    missing: dict[str, str] = {}
+    faults: dict[str, str] = {}
     for ours, camera_name, choices in wanted:
         full = next((full for full in choices if full in published), '')
-        if full and published[full] != choices[full]:
-            raise BagError(f'{bag.path}: {full} holds {published[full]}, not {choices[full]}'
-                           f'{offered(ours)}')
-        if full:
+        types = [TYPES[kind] for kind in (IMAGES if ours == RAW_IMAGES else (ours,))]
+        if full and published[full] in types:
             used[full] = ours, camera_name
-        elif camera_name:
-            raise BagError(f'{bag.path}: holds no message on {next(iter(choices))} of '
-                           f'camera {camera_name}, only on {", ".join(published)}')
+        elif full:
+            faults[ours] = f'{full} holds {published[full]}, not {types[0]}'
         elif ours in NEEDED:
-            missing[ours] = ' or '.join(meant if ours == RAW_IMAGES and meant else choices)
-    if missing:
-        raise BagError(f'{bag.path}: holds no message on {", ".join(missing.values())}, only on '
-                       f'{", ".join(published)}{"".join(map(offered, missing))}')
+            whose = f' of camera {camera_name}' if camera_name else ''
+            faults[ours] = f'no message on {" or ".join(choices)}{whose}'
+    if faults:
+        offers = filter(None, (offer(ours, published, used) for ours in faults))
+        raise BagError(f'{bag.path}: ' + '; '.join(
+            [*faults.values(), f'it holds {", ".join(published)}', *offers]))
     whole = all(names[truth] in used for truth in TRUTHS)
     return {full: use for full, use in used.items() if whole or use[0] not in TRUTHS}
 
@@ -231,11 +223,10 @@ class Evaluation(Listener):
     """
     The record of a run: a few numbers for each image, tick and setpoint.
 
-    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s since the first
-    message, ``frame_cpu`` perception's CPU time for it, s. ``tick_rows``: time, index of the state
-    in STATES, norm of the commanded acceleration (NaN: none), own speed. ``reasons`` has the time
-    and the reason of every tick in HOLD. ``setpoint_rows``: time, the acceleration sent (NaN:
-    none), 1 for a command.
+    ``cpu`` holds CPU times, s, by stage; ``frames`` counts the images. ``tick_rows``: time, s
+    since the first message, index of the state in STATES, norm of the commanded acceleration (NaN:
+    none), own speed. ``reasons`` has the time and the reason of every tick in HOLD.
+    ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
     """
 
     bag: str
@@ -247,21 +238,25 @@ class Evaluation(Listener):
     writer: BagWriter
     errors: FrameErrors = field(init=False)
     flight: RecordedFlight = field(init=False)
-    names: list[str] = field(default_factory=list)
     own: OwnMotion | None = None
     """Filled for the rules of ``check``."""
     findings: list[Finding] = field(default_factory=list)
     """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
-    frames: array[float] = field(default_factory=lambda: array('d'))
-    frame_cpu: array[float] = field(default_factory=lambda: array('f'))
+    frames: int = 0
     tick_rows: array[float] = field(default_factory=lambda: array('d'))
     setpoint_rows: array[float] = field(default_factory=lambda: array('d'))
     rejections: Counter[str] = field(default_factory=Counter)
     setpoint_kinds: Counter[str] = field(default_factory=Counter)
     brake_reasons: Counter[str] = field(default_factory=Counter)
     reasons: list[tuple[float, str]] = field(default_factory=list)
+
+    @cached_property
+    def tables(self) -> dict[str, Table]:
+        """Return the errors of each neighbour by its name, once all messages were taken."""
+        return {neighbor.name: self.errors.table(neighbor.name)
+                for neighbor in self.flight.perceiver.tracker.config.neighbors}
 
     @property
     def ticks(self) -> Array:
@@ -294,13 +289,13 @@ class Evaluation(Listener):
         """Take the outcome of an image."""
         seen, camera = outcome.sighting, outcome.camera
         self.errors.models[camera] = self.flight.perceiver.model(camera)
-        self.frames.append(self._seconds(outcome.stamp))
-        self.frame_cpu.append(outcome.perception)
-        if seen is not None:
+        self.frames += 1
+        if seen is None:
+            self.errors.frame(outcome.stamp, {}, {}, camera)
+        else:
             self._spent('decode', outcome.decoding)
             self._spent(seen.stage, outcome.perception)
-        self.errors.frame(outcome.stamp, seen.estimates if seen else {},
-                          seen.stages if seen else {}, camera)
+            self.errors.frame(outcome.stamp, seen.estimates, seen.stages, camera)
 
     def tick(self, tick: Tick) -> None:
         """Take the outcome of a tick of the planner."""
@@ -359,9 +354,8 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             evaluation = Evaluation(
                 path.name, bag.duration_ns / NANOSECONDS, bag.start_ns, bag.incomplete, writer)
             flight = RecordedFlight(values, evaluation, empty, time.process_time)
-            neighbors = flight.perceiver.tracker.config.neighbors
-            evaluation.flight, evaluation.names = flight, [n.name for n in neighbors]
-            evaluation.errors = FrameErrors(neighbors, {
+            evaluation.flight = flight
+            evaluation.errors = FrameErrors(flight.perceiver.tracker.config.neighbors, {
                 camera.name: camera_mounting(camera.position, camera.rpy)
                 for camera in mounted}, bag.start_ns)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.

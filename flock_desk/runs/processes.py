@@ -22,7 +22,7 @@ its workers need this package in the same version, and the same files where task
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
@@ -67,13 +67,10 @@ def claim_domain() -> int:
     """
     for domain_id in random.SystemRandom().sample(range(1, 101), 100):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
+        with contextlib.suppress(OSError):
             claim.bind(f'\0flock_follower domain {domain_id}')  # a name without a file
-        except OSError:
-            claim.close()
-            continue
-        _CLAIMS.append(claim)
-        return domain_id
+            _CLAIMS.append(claim)
+            return domain_id
     raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
 
 
@@ -102,14 +99,11 @@ def free_udp_port() -> int:
     The port is above the ephemeral ports: otherwise another process, such as DDS, could receive
     the same port before it is used.
     """
-    chance = random.SystemRandom()
     while True:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                port = chance.randrange(*PORTS)
-                probe.bind(('127.0.0.1', port))
-            except OSError:
-                continue
+        port = random.SystemRandom().randrange(*PORTS)
+        with contextlib.suppress(OSError), socket.socket(
+                socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(('127.0.0.1', port))
             return port
 
 
@@ -239,11 +233,10 @@ class Processes:
         :raises RuntimeError: if the child ends before.
         """
         def printed() -> bool:
-            if text in self.log(name):
-                return True
-            if self.children[name].poll() is not None and text not in self.log(name):
+            ended = self.children[name].poll() is not None
+            if ended and text not in self.log(name):
                 raise RuntimeError(f'{name} ended early:\n{self.log(name)}')
-            return False
+            return text in self.log(name)
 
         wait_until(printed, timeout, f'{name} to print {text!r}')
 
@@ -314,19 +307,27 @@ class Processes:
             signal.signal(number, handler)
 
 
-def pooled(jobs: int, function: Callable[[Given], Result],
-           tasks: Iterable[Given]) -> Iterator[Result]:
-    """Yield what a function makes of each task, in their order, computed by ``jobs`` processes."""
+def computed(function: Callable[[Given], Result], tasks: Sequence[Given], jobs: int = 1,
+             scheduler: str = '') -> Iterator[Result]:
+    """
+    Yield what a function makes of each task, in their order.
+
+    :param jobs: processes that compute; 1: this one.
+    :param scheduler: of a cluster that computes instead, such as ``tcp://192.168.1.5:8786``.
+    :raises RuntimeError: if Dask is not installed here.
+    :raises OSError: if no scheduler answers there, or it is lost.
+    """
+    if scheduler:
+        yield from _on_cluster(scheduler, function, tasks)
+        return
     if jobs == 1:
         yield from map(function, tasks)
         return
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
     # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        results = pool.map(function, tasks)
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    results = pool.map(function, tasks)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         yield from results
     except BaseException:
@@ -338,15 +339,8 @@ def pooled(jobs: int, function: Callable[[Given], Result],
         pool.shutdown(cancel_futures=True)
 
 
-def mapped(address: str, function: Callable[[Given], Result],
-           tasks: Sequence[Given]) -> Iterator[Result]:
-    """
-    Yield what a function makes of each task, in their order, computed by a cluster's workers.
-
-    :param address: of its scheduler, such as ``tcp://192.168.1.5:8786``.
-    :raises RuntimeError: if Dask is not installed here.
-    :raises OSError: if no scheduler answers there, or it is lost.
-    """
+def _on_cluster(address: str, function: Callable[[Given], Result],
+                tasks: Sequence[Given]) -> Iterator[Result]:
     try:
         from distributed import CancelledError, Client
     except ImportError as error:

@@ -154,8 +154,5 @@ def test_the_command_tells_of_flocks_beside_what_it_tells_of_all(
     for values in results.values():
         assert {'in_band', 'min_separation_m', 'lost_for_good', 'rms_acceleration_m_s2',
                 'edges', 'neighbors_in_sight'} <= set(values)
-    said = capsys.readouterr().out
-    assert 'nearest pair' in said
-    title, row = said[said.index('CPU time of a tick'):].splitlines()[:2]
-    assert title == 'CPU time of a tick of each follower, mean and p99, ms'
-    assert row.split()[0] == 'mine' and len(row.split()) == 3
+    out = capsys.readouterr().out
+    assert 'nearest pair' in out and 'mine: CPU time of a tick ' in out

@@ -95,7 +95,7 @@ def test_a_topic_that_is_missing_is_named_with_its_camera(
         **CAMERAS['camera'], 'left': {'rpy': [0.0, 0.0, 1.2]}})  # type: ignore[dict-item]
     assert main([str(bags[1]), '--output', str(tmp_path / 'out'), '--config', wrong]) == 2
     reported = capsys.readouterr().err
-    assert 'holds no message on /left/image_raw of camera left, only on ' in reported
+    assert 'no message on /left/image_raw or /left/image_raw/compressed of camera left' in reported
     assert '/port/mono/compressed' in reported
 
 

@@ -26,7 +26,7 @@ import pytest
 
 from flock_desk import evaluate
 from flock_desk.flights import main
-from flock_desk.runs.processes import mapped
+from flock_desk.runs.processes import computed
 
 SHORT = 'summary: short\nduration: 3\nleader: {motion: legs}\n'
 
@@ -41,7 +41,7 @@ def test_without_dask_it_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(builtins, '__import__', without)
     with pytest.raises(RuntimeError, match=r'pip install .flock_follower\[cluster\]'):
-        list(mapped('tcp://127.0.0.1:1', str, [1]))
+        list(computed(str, [1], scheduler='tcp://127.0.0.1:1'))
 
 
 @pytest.fixture(scope='module')
@@ -56,9 +56,9 @@ def cluster() -> Iterator[Any]:
 @pytest.mark.ros
 def test_results_come_in_the_order_of_their_tasks(cluster: Any) -> None:
     address = cluster.scheduler_address
-    assert list(mapped(address, abs, range(-40, 0))) == list(range(40, 0, -1))
+    assert list(computed(abs, range(-40, 0), scheduler=address)) == list(range(40, 0, -1))
     with pytest.raises(ZeroDivisionError):
-        list(mapped(address, (1).__truediv__, [1, 0]))
+        list(computed((1).__truediv__, [1, 0], scheduler=address))
 
 
 @pytest.mark.ros

@@ -126,11 +126,8 @@ def test_a_hold_is_told_with_its_length_and_reason() -> None:
     assert hold_figures([], [], 1.0) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
 
 
-def test_the_consistency_of_covariances_has_a_verdict() -> None:
-    assert [consistency(nees) for nees in (None, 1.4, 3.0, 6.1)] == [
-        '', 'covariances too large', 'consistent', 'covariances too small']
-
-
-def test_a_rate_counts_intervals() -> None:
+def test_a_rate_counts_intervals_and_a_nees_has_a_verdict() -> None:
     assert rate(np.arange(11) * 0.1) == pytest.approx(10.0)
     assert rate(np.array([1.0])) == 0.0
+    assert [consistency(nees) for nees in (None, 1.4, 3.0, 6.1)] == [
+        '', 'covariances too large', 'consistent', 'covariances too small']
