@@ -15,15 +15,11 @@
 """
 The figures of the paper, redrawn: ``python -m flock_desk.figures``.
 
-Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) with curves: those on simulations, and
-a table of what they show, for the law and the models it is compared with; and those on flights,
-from what ``fly`` has recorded of the same scenarios; and the controllers that ``flights``
+Without ``--agents`` the figures of Liu & Qiu (AAMAS 2020) on simulations, and a table of what
+they show, for the law and the models it is compared with; and the controllers that ``flights``
 compared, runs in the band against jerk. With ``--agents N`` one larger flock of the law on a
 neighbour graph. Each is as wide as a column, without a title, as PNG, SVG and PDF. Two runs write
-the same bytes.
-
-For a scenario that has not been flown yet a line says how to fly it; the exit code stays 0. If a
-flight cannot be read it is 1, after all else has been drawn.
+the same bytes. Flights are drawn by the reports of ``fly``.
 """
 
 from __future__ import annotations
@@ -46,9 +42,6 @@ from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
 from flock_desk.runs.console import aligned, guarded, progress
-from flock_desk.runs.record import last_flight, read_flown
-from flock_desk.scenarios.scenario_file import load
-from flock_follower.bags.bag import BagError, failures
 
 MODELS: dict[Model, str] = {
     'flocking': 'Flocking law',
@@ -60,8 +53,6 @@ MODELS: dict[Model, str] = {
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
-#: The scenarios of ``fly`` that the paper shows flights of.
-FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 DURATION = 20.0  # s, of the larger flock
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
@@ -72,8 +63,6 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='figures', description='Redraw the figures of the paper, or one larger flock.')
     parser.add_argument('--out', type=Path, default='build/figures', help='%(default)s')
-    parser.add_argument('--flights', type=Path, default='build/fly', metavar='FOLDER',
-                        help='folder of the flights of fly; %(default)s')
     parser.add_argument('--campaign', type=Path, default='build/flights/flights.json',
                         metavar='FILE', help='results of flights; %(default)s')
     parser.add_argument('--agents', type=int, metavar='N',
@@ -85,20 +74,13 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _draw(options: argparse.Namespace) -> int:
-    notes: list[str] = []
-    faults: list[str] = []
     options.out.mkdir(parents=True, exist_ok=True)
     if options.agents is not None:
         written = one_flock(options.out, options.agents, options.dim, options.seed)
     else:
-        written = redraw(options.out)
-        flown, notes, faults = redraw_flights(options.out, options.flights)
-        compared, note = redraw_controllers(options.out, options.campaign)
-        written, notes = [*written, *flown, *compared], [*notes, *note]
-    print('\n'.join(['', *notes, f'written to {options.out}: {", ".join(written)}']))
-    for fault in faults:
-        print(f'error: {fault}', file=sys.stderr)
-    return 1 if faults else 0
+        written = [*redraw(options.out), *redraw_controllers(options.out, options.campaign)]
+    print(f'written to {options.out}: {", ".join(written)}')
+    return 0
 
 
 def redraw(out: Path) -> list[str]:
@@ -134,39 +116,9 @@ def redraw(out: Path) -> list[str]:
     return [*(plots.save(figure, out / name) for name, figure in figures.items()), 'results.csv']
 
 
-def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list[str]]:
+def redraw_controllers(out: Path, path: Path) -> list[str]:
     """
-    Write the paper's flights, and return the names, a note on each, and the errors.
-
-    :param flights: the folder of the flights of ``fly``.
-    :raises OSError: if a figure cannot be written.
-    """
-    written, notes, faults = [], [], []
-    for name in FLIGHTS:
-        folder = last_flight(flights, name)
-        if folder is None:
-            notes.append(f'{name}: not drawn, there is no flight of it in {flights}: '
-                         f'make fly SCENARIO={name}')
-            continue
-        try:
-            with failures(folder / 'flight.npz', 'cannot be read'):
-                flight = read_flown(load(name), folder)
-        except BagError as error:
-            faults.append(f'{name}: not drawn: {error}')
-            continue
-        written += [plots.save(draw(flight), out / f'{name}_{draw.__name__}')
-                    for draw in (plots.positions, plots.distance)]
-        apart = flight.distance[np.isfinite(flight.distance)]
-        notes.append(f'{name}: {flight.duration:.3g} s in {folder}, {apart.min():.2f} to '
-                    f'{apart.max():.2f} m apart, '
-                    f'{100.0 * flight.time_in_band_share:.1f} % of the time in the band'
-                    f'{", flown by an autopilot elsewhere" if flight.external else ""}')
-    return written, notes, faults
-
-
-def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
-    """
-    Write the comparison of controllers, and return the names and the note without it.
+    Write the comparison of controllers, and return the names of its files.
 
     :param path: flights.json of ``flights``; only scenarios that all controllers flew count.
     """
@@ -174,7 +126,8 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
     flown = sorted((round(each['law']['max_speed_m_s'] / each['law']['max_speed_share'], 3), name)
                    for name, each in results.items() if CONTROLLERS.keys() <= each.keys())
     if not flown:
-        return [], [f'controllers: not drawn, {path} does not have them: make flights']
+        print(f'controllers: not drawn, {path} does not have them: make flights')
+        return []
     means = dict[float, dict[str, tuple[float, float]]]()
     for v_max, group in groupby(flown, lambda each: each[0]):
         names = [name for _, name in group]
@@ -182,7 +135,7 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
             float(np.mean([results[name][key]['horizontal_jerk_m_s3'] for name in names])),
             float(np.mean([results[name][key]['in_band'] for name in names])))
             for key, controller in CONTROLLERS.items()}
-    return [plots.save(plots.controllers(means), out / 'controllers')], []
+    return [plots.save(plots.controllers(means), out / 'controllers')]
 
 
 def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:

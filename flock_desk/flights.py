@@ -28,10 +28,7 @@ from functools import partial
 import os
 from pathlib import Path
 import sys
-import time
 from typing import NamedTuple
-
-import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
@@ -48,7 +45,6 @@ from flock_desk.runs.processes import computed
 from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import key_tables, load, names, ScenarioError
-from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
@@ -90,8 +86,6 @@ class Flown(NamedTuple):
     """What a task gives."""
 
     runs: Measures
-    cpu: Array
-    """CPU time of every tick of every planner, s."""
     exits: list[str]
     """Which runs left the band, when and why, one line each."""
 
@@ -142,10 +136,6 @@ def _campaign(options: argparse.Namespace) -> int:
         print(f'\n{table({name: results[name] for name in flocks}, FLOCK_COLUMNS)}\n{FLOCK_NOTES}')
     for name, of_scenario in flown.items():
         parts = of_scenario.get('guard', next(iter(of_scenario.values())))
-        if name in flocks:
-            cpu = 1e3 * np.concatenate([part.cpu for part in parts])
-            print(f'{name}: CPU time of a tick {np.mean(cpu):.2f} ms, p99 '
-                  f'{np.percentile(cpu, 99):.2f} ms')
         exits = [line for part in parts for line in part.exits]
         for line in exits[:MOST_EXITS]:
             print(f'{name}: left the band: {line}')
@@ -213,15 +203,14 @@ def table(results: Results,
 
 def _fly(task: Task) -> Flown:
     _, law, guard = CONTROLLERS[task.controller]
-    flights = fly(task.scenario, task.runs, guard, cpu_time=time.thread_time, law=law)
+    flights = fly(task.scenario, task.runs, guard, law=law)
     rows, many = measure(flights), task.scenario.company.followers
     exits = []
     for left in band_exits(flights):
         run, follower = divmod(left.row, many)
         which = f'follower {follower + 1} ' if many > 1 else ''
         exits.append(f'run {task.runs[run]}: {which}{left}')
-    return Flown(rows if task.scenario.flock is None else of_runs(rows, flights),
-                 flights.cpu.ravel(), exits)
+    return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), exits)
 
 
 if __name__ == '__main__':

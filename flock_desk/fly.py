@@ -45,8 +45,8 @@ from flock_desk.runs.console import guarded, within
 from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
 from flock_desk.runs.judge import FigureBound
-from flock_desk.runs.plots import column_chapters, scenario_chapters
-from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown, set_aside
+from flock_desk.runs.plots import scenario_chapters
+from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import (
     hold_within,
@@ -58,7 +58,6 @@ from flock_desk.runs.summary import (
 )
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
-from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
 FOLLOWERS = Range(1, 8, whole=True)
@@ -117,7 +116,6 @@ def _fly(options: argparse.Namespace) -> int:
     external = (links(options.autopilot, options.truth, options.forward_odometry,
                       options.leader_truth) if options.autopilot else None)
     with locked(options.output):
-        set_aside(options.output)
         for namespace in ('', *namespaces(options.followers)):
             clear(options.output / namespace)
         cores, exit_codes = fly(scenario, options.scenario, options.seed, duration,
@@ -147,9 +145,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
         nearest = FigureBound('nearest_m', least=nearest_allowed(scenario))
         judgements = report(
             out, f'{title}, a column of {followers}', scenario.summary, summary,
-            [nearest, *limits], column_chapters(
-                *column_tracks(scenario, flights), next(iter(flights.values())).params.law),
-            parts=summaries)
+            [nearest, *limits], (), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
     print()
     code = announce(summary, judgements, pages, out)
@@ -185,38 +181,26 @@ def nearest_allowed(scenario: Scenario) -> float:
     return round(SAFE * math.sqrt(scenario.flight.d0), 3)
 
 
-def column_tracks(scenario: Scenario, flights: Mapping[str, LiveFlight]
-                  ) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """
-    Return the motion of a column while all of it flew the scenario, in the first one's frame.
-
-    :returns: times (n,), s; positions (n, 3), m, by vehicle; distances (n,), m, by pair.
-    """
-    logs = {name: flight.log for name, flight in flights.items()}
-    began = max(float(log['began']) for log in logs.values())
-    times = np.arange(began, min(float(log['ended']) for log in logs.values()), STEP)
-    first = next(iter(logs.values()))
-    seen = float(first['start']) + (first['image_stamp'] - int(first['epoch_ns'])) * 1e-9
-    tracks = {'leader': along(times, seen, first['leader_position'])}
-    for i, (name, log) in enumerate(logs.items()):
-        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + along(
-            times, flights[name].speeds['follower'][0] + float(log['began']), log['position'])
-    return times - began, tracks, {
-        f'{a} to {b}': np.linalg.norm(tracks[a] - tracks[b], axis=1)
-        for a, b in combinations(tracks, 2)}
-
-
 def column_figures(scenario: Scenario, flights: Mapping[str, LiveFlight]) -> dict[str, Any]:
     """
-    Return the figures of a column as a whole.
+    Return the figures of a column as a whole, while all of it flew the scenario.
 
     ``nearest_m`` is the least true distance of any two vehicles, ``pairs`` that of each two.
     """
-    _, _, distances = column_tracks(scenario, flights)
-    pairs = {pair: float(np.nanmin(distance)) for pair, distance in distances.items()}
+    logs = {name: flight.log for name, flight in flights.items()}
+    times = np.arange(max(float(log['began']) for log in logs.values()),
+                      min(float(log['ended']) for log in logs.values()), STEP)
+    first = next(iter(logs.values()))
+    seen = float(first['start']) + (first['image_stamp'] - int(first['epoch_ns'])) * 1e-9
+    tracks = {'leader': along(times, seen, first['leader_position'])}  # in the first one's frame
+    for i, (name, log) in enumerate(logs.items()):
+        tracks[name] = np.array([-i * spacing(scenario), 0.0, 0.0]) + along(
+            times, flights[name].speeds['follower'][0] + float(log['began']), log['position'])
+    pairs = {f'{a} to {b}': float(np.nanmin(np.linalg.norm(tracks[a] - tracks[b], axis=1)))
+             for a, b in combinations(tracks, 2)}
     return jsonable({
         'column_of': scenario.name, 'followers': len(flights),
-        'nearest_m': min(pairs.values(), default=math.nan), 'pairs': pairs,
+        'nearest_m': min(pairs.values()), 'pairs': pairs,
         'speed_max_m_s': most(np.concatenate(
             [flight.speeds['follower'][1] for flight in flights.values()]))})
 

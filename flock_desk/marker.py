@@ -62,26 +62,18 @@ Box = tuple[float, float, float, float]
 _ENTRY = """\
 {first}marker_id: {marker_id}
 {next}side_length: {side_length:g}  # m; measure the print
-{next}position: [-0.20, {left:.4f}, {up:.4f}]  # m, the centre on the body: forward, left, up
+{next}position: [-0.20, 0.0, {up:.4f}]  # m, the centre on the body: forward, left, up
 {next}rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
 
 
 class Placed(NamedTuple):
-    """A marker on a print: its side, m, and its middle from the print's top left corner, mm."""
+    """A marker on a print: its side, m, that with the white border and its middle's place, mm."""
 
     marker_id: int
     side_length: float
-    x: float
+    outer: float
     y: float
-
-
-class Print(NamedTuple):
-    """One marker or a panel, to be cut out: its size, mm, with white borders and corner marks."""
-
-    dictionary: str
-    width: float
-    height: float
-    markers: Sequence[Placed]
+    """From the print's top edge down."""
 
 
 class Page(NamedTuple):
@@ -132,60 +124,53 @@ def _write(options: argparse.Namespace) -> int:
         SIDE_LENGTHS.check('--size', size)
     groups = [ids] if options.panel else [[marker_id] for marker_id in ids]
     prints = [layout(options.dictionary, group, sizes) for group in groups]
-    pages = [draw(each) for each in prints]
+    pages = [draw(options.dictionary, markers) for markers in prints]
     with whole_file(options.output) as file:
         file.write(pdf(pages, f'{options.dictionary} {ids}, {sizes} m'))
     page = pages[0]
     print(f'{options.output}: page {page.name}, {page.width:g} x {page.height:g} mm',
           file=sys.stderr)
-    print(neighbors_file(prints))
+    print(neighbors_file(options.dictionary, prints))
     return 0
 
 
-def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> Print:
-    """Return the print of markers of these sides, m, in the order of their ids."""
-    largest_first = sorted(zip(ids, sizes), key=lambda pair: -pair[1])
-    outer_sides = [outer_side(dictionary, size) for _, size in largest_first]
-    width, top, placed = outer_sides[0] + 2.0 * LINE, LINE, []
-    for (marker_id, size), outer in zip(largest_first, outer_sides):
-        placed.append(Placed(marker_id, size, 0.5 * width, top + 0.5 * outer))
+def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> list[Placed]:
+    """Return markers of these sides, m, in the order of their ids, the largest on top."""
+    top, placed = LINE, []
+    for marker_id, size in sorted(zip(ids, sizes), key=lambda pair: -pair[1]):
+        quiet = max(1.0 / marker_cells(dictionary), MIN_QUIET)
+        outer = 1e3 * size * (1.0 + 2.0 * quiet)
+        placed.append(Placed(marker_id, size, outer, top + 0.5 * outer))
         top += outer
-    return Print(dictionary, width, top + LINE, placed)
+    return placed
 
 
-def outer_side(dictionary: str, side_length: float) -> float:
-    """Return the side, mm, of a marker with its white border."""
-    quiet = max(1.0 / marker_cells(dictionary), MIN_QUIET)
-    return 1e3 * side_length * (1.0 + 2.0 * quiet)
-
-
-def draw(cut_out: Print) -> Page:
+def draw(dictionary: str, markers: Sequence[Placed]) -> Page:
     """
-    Return a print on the smallest page that holds it.
+    Return markers, to be cut out together, on the smallest page that holds them.
 
     :raises ValueError: for an unknown dictionary or id, and a print larger than all pages.
     """
-    least = max(cut_out.width, CAPTION[0]) + 2.0 * MARGIN
-    height_used = cut_out.height + CAPTION[1] + 2.0 * MARGIN
-    sides = ' and '.join(f'{1e3 * marker.side_length:g}' for marker in cut_out.markers)
+    cut = markers[0].outer + 2.0 * LINE, markers[-1].y + 0.5 * markers[-1].outer + LINE
+    least = max(cut[0], CAPTION[0]) + 2.0 * MARGIN, cut[1] + CAPTION[1] + 2.0 * MARGIN
+    sides = ' and '.join(f'{1e3 * marker.side_length:g}' for marker in markers)
     name = next((name for name, (width, height) in PAGES.items()
-                 if width >= least and height >= height_used), None)
+                 if width >= least[0] and height >= least[1]), None)
     if name is None:
-        raise ValueError(f'--size: {sides} mm with white border and caption take {least:.0f} x '
-                         f'{height_used:.0f} mm: must fit {[*PAGES][-1]}')
+        raise ValueError(f'--size: {sides} mm with white border and caption take {least[0]:.0f} x '
+                         f'{least[1]:.0f} mm: must fit {[*PAGES][-1]}')
     width, height = PAGES[name]
-    left, top = 0.5 * (width - cut_out.width), MARGIN + 0.5 * (height - height_used)
-    ids = ', '.join(str(marker.marker_id) for marker in cut_out.markers)
+    left, top = 0.5 * (width - cut[0]), MARGIN + 0.5 * (height - least[1])
     texts, boxes = caption(
-        0.5 * (width - CAPTION[0]), top + cut_out.height,
-        f'{cut_out.dictionary}   id {ids}   side {sides} mm',
-        'Print at 100 % (actual size); do not fit to page.',
+        0.5 * (width - CAPTION[0]), top + cut[1],
+        f'{dictionary}   id {", ".join(str(marker.marker_id) for marker in markers)}   '
+        f'side {sides} mm', 'Print at 100 % (actual size); do not fit to page.',
         f'Check: this ruler is 100 mm, the black square {sides} mm.',
         'Cut at the corner marks, keep it flat: the white border is part of it.')
-    boxes += corner_marks(left, top, cut_out.width, cut_out.height)
-    for marker in cut_out.markers:
+    boxes += corner_marks(left, top, *cut)
+    for marker in markers:
         side = 1e3 * marker.side_length
-        boxes += cells_of(cut_out.dictionary, marker.marker_id, left + marker.x - 0.5 * side,
+        boxes += cells_of(dictionary, marker.marker_id, 0.5 * (width - side),
                           top + marker.y - 0.5 * side, side)
     return Page(name, width, height, boxes, texts)
 
@@ -263,21 +248,19 @@ def _figure(page: Page) -> Figure:
     return figure
 
 
-def neighbors_file(prints: Sequence[Print]) -> str:
+def neighbors_file(dictionary: str, prints: Sequence[Sequence[Placed]]) -> str:
     """Return the neighbours file of leaders that each carry a print on the tail."""
-    lines = [f'dictionary: {prints[0].dictionary}', 'neighbors:']
-    for each in prints:
-        name = 'leader' if len(prints) == 1 else f'drone{each.markers[0].marker_id}'
+    lines = [f'dictionary: {dictionary}', 'neighbors:']
+    for markers in prints:
+        name = 'leader' if len(prints) == 1 else f'drone{markers[0].marker_id}'
         lines.append(f'  - name: {name}')
-        first, indent = '    ', 4
-        if len(each.markers) > 1:
+        first = indent = '    '
+        if len(markers) > 1:
             lines.append('    markers:')
-            first, indent = '      - ', 8
-        origin = min(each.markers, key=lambda marker: marker.side_length)
+            first, indent = '      - ', '        '
         lines += [_ENTRY.format(
-            first=first, next=' ' * indent, marker_id=marker.marker_id,
-            side_length=marker.side_length, left=1e-3 * (origin.x - marker.x) + 0.0,
-            up=1e-3 * (origin.y - marker.y) + 0.0) for marker in each.markers]
+            first=first, next=indent, marker_id=marker.marker_id, side_length=marker.side_length,
+            up=1e-3 * (markers[-1].y - marker.y)) for marker in markers]
     return '\n'.join(lines)
 
 

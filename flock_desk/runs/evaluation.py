@@ -184,38 +184,36 @@ class RecordedFlight:
             self.follower.engage(time, True)
             self.follower.permit(time, -math.inf)
             self.follower.vehicle(time, FLYING)
-        if name == 'camera_info':
-            calibration = data[_AFTER_STAMP:]
-            if calibration == self._calibrations.get(camera):
-                return  # all but the first, usually
-            self._calibrations[camera] = calibration
         try:
-            if message is None:
-                message = read_odometry(data) if name == 'odom' else deserialize(data, msgtype)
-            if name == 'camera_info':
-                self.follower.camera_info(time, message, camera)
-            elif name == 'odom':
-                state = self.source.take(message, time)
-            elif name == 'ranges':
-                measured = from_range(message)
-            else:
-                stamp = read_stamp(message.header.stamp)
+            if name == 'odom':
+                self._take_odometry(time, read_odometry(data) if message is None else message)
+            elif name != 'camera_info' or self._is_new(camera, data[_AFTER_STAMP:]):
+                message = deserialize(data, msgtype) if message is None else message
+                if name == 'camera_info':
+                    self.follower.camera_info(time, message, camera)
+                elif name == 'ranges':
+                    self.follower.range(time, from_range(message))
+                else:
+                    self.follower.image(time, message if pixels is None else pixels,
+                                        read_stamp(message.header.stamp), camera)
         except ValueError as error:
             self.follower.advance(time)
             self._listener.rejected(
                 INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
             if name == RAW_IMAGES:
                 self._listener.image(ImageOutcome(time, camera=camera))
-            return
-        if name == 'odom':
-            for event in self.source.new_events():
-                self._listener.rejected(*event)
-            if state is not None:
-                self.follower.odometry(time, state)
-        elif name == 'ranges':
-            self.follower.range(time, measured)
-        elif name == RAW_IMAGES:
-            self.follower.image(time, message if pixels is None else pixels, stamp, camera)
+
+    def _take_odometry(self, time: int, message: Any) -> None:
+        state = self.source.take(message, time)
+        for event in self.source.new_events():
+            self._listener.rejected(*event)
+        if state is not None:
+            self.follower.odometry(time, state)
+
+    def _is_new(self, camera: str, calibration: bytes) -> bool:
+        """Return whether a calibration differs from the last one of its camera; most do not."""
+        before, self._calibrations[camera] = self._calibrations.get(camera), calibration
+        return calibration != before
 
 
 @dataclass

@@ -14,7 +14,7 @@
 
 
 """
-The figures for a paper: simulated flocks, a panel for each model; flights of ``fly``.
+The figures for a paper: simulated flocks, a panel for each model; controllers compared.
 
 Each is one column wide and legible at that width; its lines are distinguishable in grey. The title
 belongs to the caption.
@@ -36,8 +36,6 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from flock_desk.flocks.agents import Simulation
-from flock_desk.runs.plots import with_gaps
-from flock_desk.runs.record import LiveFlight
 from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
 
@@ -64,7 +62,6 @@ Runs = Mapping[str, Simulation]
 Draw = Callable[[Axes, Simulation], None]
 #: The ratio of length to width of paths from which on both axes have a scale of their own.
 SLIM = 5.0
-_TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'butt', 'zorder': 1.8}
 _TIME = 'time [s]'
 #: A legend above the axis, where no data can be.
 _ABOVE: dict[str, Any] = {
@@ -89,11 +86,6 @@ def draw_bounds(axis: Axes, params: FlockingParams) -> None:
     """Draw the edges of the band, as distances, m."""
     for bound in np.sqrt([params.d0, params.d1]):
         axis.axhline(bound, color=INK, linestyle='--', linewidth=0.9, zorder=1.5)
-
-
-def bounds_handle(label: str) -> Handle:
-    """Return the edges of the band, for a legend."""
-    return Line2D([], [], color=INK, linestyle='--', linewidth=0.9, label=label)
 
 
 @styled()
@@ -160,7 +152,8 @@ def distances(runs: Runs, end: float, note: str = '') -> Figure:
     if several:
         handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
                              label='least to greatest'))
-    handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
+    handles.append(Line2D([], [], color=INK, linestyle='--', linewidth=0.9,
+                          label='$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
     return _panels(runs, draw, handles, _TIME, 'distance [m]', note, share=('all', False))
 
 
@@ -256,54 +249,6 @@ def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
 
 
 @styled()
-def positions(flight: LiveFlight) -> Figure:
-    """
-    Return x and y of leader and follower over time, m in odom.
-
-    As in the paper they are what the follower knew: its own odometry, and where it saw the leader.
-    The true ones, in a frame without drift, are beneath.
-    """
-    table = with_gaps({**flight.table, **flight.paths})
-    figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
-    axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
-    for i, axis in enumerate(axes):
-        for who, (colour, dash), known in (('leader', COLOURS[0], 'neighbor'),
-                                           ('follower', COLOURS[1], 'own')):
-            axis.plot(table['time'], table[who][:, i], color=colour, **_TRUTH)
-            axis.plot(table['time'], table[known][:, i], color=colour, linestyle=dash)
-        axis.set_ylabel(f'{"xy"[i]} [m]')
-    axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
-    figure.align_ylabels(axes)
-    handles = [*_agent_handles(('leader', 'follower')), _truth_handle('true positions')]
-    figure.legend(handles=handles, loc='outside upper center', ncols=3)
-    return figure
-
-
-@styled()
-def distance(flight: LiveFlight) -> Figure:
-    """Return the distance over time, m, as the follower knew it and as it was, in the band."""
-    table, law = with_gaps(flight.table), flight.params.law
-    figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
-    axis: Axes = figure.subplots()
-    for begin, end in flight.blind:
-        axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
-    axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
-    axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
-    draw_bounds(axis, law)
-    top = 1.05 * np.nanmax([*table['distance'], *table['true_distance'], 0.0])
-    axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
-             ylim=(0.0, max(1.12 * np.sqrt(law.d1), top)))
-    handles: list[Handle] = [
-        Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
-        _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
-    if flight.blind:
-        handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
-    figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
-                  columnspacing=1.2, handlelength=1.8)
-    return figure
-
-
-@styled()
 def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> Figure:
     """
     Return the share of runs that kept the band against the jerk, a panel for each ``v_max``, m/s.
@@ -323,8 +268,3 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
     figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
                   columnspacing=1.0, handlelength=1.0)
     return figure
-
-
-def _truth_handle(label: str) -> Handle:
-    return Line2D([], [], color=INK, linewidth=_TRUTH['linewidth'], alpha=_TRUTH['alpha'],
-                  label=label)

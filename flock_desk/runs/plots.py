@@ -32,7 +32,6 @@ from flock_desk.runs.frame_errors import Table
 from flock_desk.runs.record import Flight, LiveFlight, REPLAYED
 from flock_desk.runs.report import Chapter, Illustration
 from flock_desk.runs.summary import consistency, norms, sight_figures
-from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 
 matplotlib.use('Agg')
@@ -77,28 +76,6 @@ def scenario_chapters(flight: LiveFlight) -> list[Chapter]:
             for stamp, image in zip(log['picture_stamp'], log['picture'])])]
 
 
-def column_chapters(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
-                    law: FlockingParams) -> list[Chapter]:
-    """
-    Return the page of a column: a picture of the tracks, and the distances of all pairs.
-
-    :param times: (n,), s; ``tracks`` (n, 3), m, by vehicle; ``distances`` (n,), m, by pair.
-    """
-    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
-    above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
-    _draw_map(above, tracks, 'from above (● start, ■ end)')
-    apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=LEADER, alpha=0.08, lw=0)
-    for (name, distance), colour in zip(distances.items(), cycle(COLOURS)):
-        apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
-    apart.set(xlabel=TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])),
-              ylim=(0.0, None), title='distances; shaded: the band')
-    _add_key(apart)
-    pages = ', '.join(f'{name}/report.html' for name in tracks if name != 'leader')
-    return [Chapter(
-        'The column', f'In the frame of the first follower. Each has a page of its own: {pages}.',
-        [_illustration(figure, 'tracks from above and distances of all pairs')])]
-
-
 def chapters(flight: Flight, note: str = '') -> list[Chapter]:
     """Return the chapters of a flight behind a neighbour: the flight and, with truth, errors."""
     result = [Chapter(f'Flight: {flight.name}', note, [_flight_picture(flight)])]
@@ -112,7 +89,7 @@ def chapters(flight: Flight, note: str = '') -> list[Chapter]:
     return result
 
 
-def with_gaps(table: Table) -> Mapping[str, Array]:
+def _with_gaps(table: Table) -> Mapping[str, Array]:
     """Return a table with a row of NaN if images are missing, and so no line."""
     breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
     return {name: np.insert(column, breaks, np.nan, axis=0) for name, column in table.items()}
@@ -146,7 +123,7 @@ def _flight_picture(flight: Flight) -> Illustration:
 
 def _error_picture(flight: Flight) -> Illustration:
     """Return the errors and twice their deviations by axis."""
-    table = with_gaps(flight.table)
+    table = _with_gaps(flight.table)
     figures = sight_figures([flight.table], flight.params.max_velocity_std)
     figure = Figure(figsize=(13, 7), dpi=110, layout='constrained')
     axes = figure.subplots(3, 2, sharex=True)
@@ -176,7 +153,7 @@ def _error_picture(flight: Flight) -> Illustration:
 
 def _draw_distance(axis: Axes, flight: Flight) -> None:
     """Draw the estimated and the true distance in the band."""
-    table, law = with_gaps(flight.table), flight.params.law
+    table, law = _with_gaps(flight.table), flight.params.law
     low, high = np.sqrt(law.d0), np.sqrt(law.d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
     _draw_limit(axis, low, f'√d0\n{low:.2f} m')

@@ -13,12 +13,7 @@
 # limitations under the License.
 
 
-"""
-A flight through the real nodes, read from its files: a replayed one, and one of a scenario.
-
-`fly` leaves the last flight in its folder, earlier ones by scenario below it. A flight is complete
-once its summary is written; one that failed before does not count.
-"""
+"""A flight through the real nodes, read from its files: a replayed one, and one of a scenario."""
 
 from __future__ import annotations
 
@@ -26,10 +21,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field
 import fcntl
-import json
 import math
 from pathlib import Path
-import re
 import shutil
 from typing import Any
 
@@ -54,7 +47,6 @@ from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.planner.params import PlannerParams
 
 LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
-EARLIER = 'earlier'
 REPLAYED = 'vehicle that flew the commands'
 _RECORD = 'record'
 _FILES = (_RECORD, 'flight.npz', 'report.html', 'summary.json')
@@ -339,21 +331,6 @@ def along(times: Array, known: Array, positions: Array) -> Array:
                      for column in positions.T], axis=1)
 
 
-def scenario_flown(folder: Path) -> str:
-    """Return the name of the scenario of the flight in a folder, '' if none is complete."""
-    try:
-        name = json.loads((folder / 'summary.json').read_text(encoding='utf-8'))['scenario']
-    except (OSError, ValueError, TypeError, KeyError):
-        return ''
-    return name if isinstance(name, str) and re.fullmatch(r'[\w-]+', name) else ''
-
-
-def last_flight(folder: Path, scenario: str) -> Path | None:
-    """Return the folder below that of `fly` of the last complete flight of a scenario, if any."""
-    return next((place for place in (folder, folder / EARLIER / scenario)
-                 if scenario_flown(place) == scenario), None)
-
-
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """
@@ -377,19 +354,3 @@ def clear(folder: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-
-
-def set_aside(folder: Path) -> None:
-    """
-    Move the complete flight in a folder to the earlier ones, in place of that of its scenario.
-
-    :raises OSError: if it cannot be moved.
-    """
-    scenario = scenario_flown(folder)
-    if scenario:
-        place = folder / EARLIER / scenario
-        clear(place)
-        place.mkdir(parents=True, exist_ok=True)
-        for name in _FILES:  # the summary last: an incomplete flight does not count
-            if (folder / name).exists():
-                (folder / name).replace(place / name)

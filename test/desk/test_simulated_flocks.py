@@ -155,4 +155,4 @@ def test_the_command_tells_of_flocks_beside_what_it_tells_of_all(
         assert {'in_band', 'min_separation_m', 'lost_for_good', 'rms_acceleration_m_s2',
                 'edges', 'neighbors_in_sight'} <= set(values)
     out = capsys.readouterr().out
-    assert 'nearest pair' in out and 'mine: CPU time of a tick ' in out
+    assert 'nearest pair' in out

@@ -120,7 +120,7 @@ def test_the_pdf_is_to_scale_and_asks_viewers_not_to_scale(tmp_path: Path) -> No
     'DICT_4X4_50', 'DICT_6X6_250', 'DICT_7X7_1000', 'DICT_ARUCO_ORIGINAL'])
 def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str) -> None:
     marker_id = dictionary_size(dictionary) - 1
-    image = rasterize(draw(layout(dictionary, [marker_id], [0.05])), 5)
+    image = rasterize(draw(dictionary, layout(dictionary, [marker_id], [0.05])), 5)
     # 5 px/mm: cut inside the corner marks of 0.2 mm and lay it on something dark.
     quiet = 250.0 * max(1.0 / marker_cells(dictionary), 0.16)
     outer, border = int(250.0 + 2.0 * quiet), int(quiet) - 4
@@ -138,7 +138,7 @@ def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str) 
     ([0.3, 0.06], 'A2'), ([0.06, 0.14, 0.05], 'A3')])
 def test_the_page_is_the_smallest_on_which_printers_print_all(
         sides: list[float], page: str) -> None:
-    drawing = draw(layout('DICT_4X4_50', [*range(len(sides))], sides))
+    drawing = draw('DICT_4X4_50', layout('DICT_4X4_50', [*range(len(sides))], sides))
     assert (drawing.name, drawing.width, drawing.height) == (page, *PAGES[page])
     for x, y, w, h in drawing.boxes:
         assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
@@ -180,7 +180,8 @@ def test_the_panel_holds_the_markers_where_the_entry_says(
                  str(tmp_path / 'm.pdf')]) == 0
     (leader,) = neighbors.parse(yaml.safe_load(capsys.readouterr().out)).neighbors
     assert {m.marker_id: m.side_length for m in leader.markers} == dict(zip(ids, sizes))
-    found = detect(rasterize(draw(layout('DICT_4X4_50', ids, sizes)), 2, 4), 'DICT_4X4_50')
+    page = draw('DICT_4X4_50', layout('DICT_4X4_50', ids, sizes))
+    found = detect(rasterize(page, 2, 4), 'DICT_4X4_50')
     at = {number: corners.mean(axis=0) / 2e3 + 0.25e-3 for number, corners in zip(
         found.ids.tolist(), found.corners)}
     for one, other in combinations(leader.markers, 2):
