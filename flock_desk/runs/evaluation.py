@@ -23,8 +23,7 @@ mode from the first message on; its autopilot's own velocity and yaw are in no b
 
 from __future__ import annotations
 
-from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -241,10 +240,10 @@ class Evaluation(Listener):
     findings: list[Finding] = field(default_factory=list)
     """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
     wall_time: float = 0.0
-    cpu: dict[str, array[float]] = field(default_factory=dict)
+    cpu: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     frames: int = 0
-    tick_rows: array[float] = field(default_factory=lambda: array('d'))
-    setpoint_rows: array[float] = field(default_factory=lambda: array('d'))
+    tick_rows: list[tuple[float, ...]] = field(default_factory=list)
+    setpoint_rows: list[tuple[float, ...]] = field(default_factory=list)
     rejections: Counter[str] = field(default_factory=Counter)
     setpoint_kinds: Counter[str] = field(default_factory=Counter)
     brake_reasons: Counter[str] = field(default_factory=Counter)
@@ -259,7 +258,7 @@ class Evaluation(Listener):
     @property
     def ticks(self) -> Array:
         """Return the ticks (n, 4)."""
-        return np.frombuffer(self.tick_rows).reshape(-1, 4)
+        return np.reshape(np.array(self.tick_rows, dtype=float), (-1, 4))
 
     @property
     def states(self) -> list[tuple[float, str]]:
@@ -271,7 +270,7 @@ class Evaluation(Listener):
     @property
     def setpoints(self) -> Array:
         """Return the setpoints (n, 5)."""
-        return np.frombuffer(self.setpoint_rows).reshape(-1, 5)
+        return np.reshape(np.array(self.setpoint_rows, dtype=float), (-1, 5))
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
         """Write a message that a node would publish."""
@@ -291,27 +290,27 @@ class Evaluation(Listener):
         if seen is None:
             self.errors.frame(outcome.stamp, {}, {}, camera)
         else:
-            self._spent('decode', outcome.decoding)
-            self._spent(seen.stage, outcome.perception)
+            self.cpu['decode'].append(outcome.decoding)
+            self.cpu[seen.stage].append(outcome.perception)
             self.errors.frame(outcome.stamp, seen.estimates, seen.stages, camera)
 
     def tick(self, tick: Tick) -> None:
         """Take the outcome of a tick of the planner."""
-        self._spent('planner', tick.cpu)
+        self.cpu['planner'].append(tick.cpu)
         if tick.decision.state is State.HOLD:
             self.reasons.append((self._seconds(tick.time), tick.decision.reason))
-        self.tick_rows.extend((
+        self.tick_rows.append((
             self._seconds(tick.time), STATES.index(tick.decision.state.value),
             _norm(tick.decision.acceleration),
             _norm(None if tick.own is None else tick.own.velocity)))
 
     def cycle(self, cycle: ControlCycle) -> None:
         """Take the outcome of a cycle of the control."""
-        self._spent('gate', cycle.cpu)
+        self.cpu['gate'].append(cycle.cpu)
         decision = cycle.setpoint
         self.setpoint_kinds[decision.kind] += 1
         self.brake_reasons.update(filter(None, [decision.reason]))
-        self.setpoint_rows.extend((
+        self.setpoint_rows.append((
             self._seconds(cycle.time),
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
@@ -326,9 +325,6 @@ class Evaluation(Listener):
 
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self.start) / NANOSECONDS
-
-    def _spent(self, what: str, seconds: float) -> None:
-        self.cpu.setdefault(what, array('f')).append(seconds)
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,

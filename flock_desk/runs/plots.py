@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import io
-from itertools import cycle
 
 import cv2
 import matplotlib
@@ -42,7 +41,6 @@ matplotlib.rcParams.update({
 # Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
-COLOURS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
@@ -97,11 +95,11 @@ def _with_gaps(table: Table) -> Mapping[str, Array]:
 
 def _flight_picture(flight: Flight) -> Illustration:
     """Return distance, setpoints, speeds and states over time, and the paths from above."""
-    figure = Figure(figsize=(13, 9.5), dpi=110, layout='constrained')
+    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
     names = ['distance', 'setpoint', 'speed', 'state']
     axes: dict[str, Axes] = figure.subplot_mosaic(
-        [[name, 'above'] for name in names], width_ratios=[1.45, 1.0],
-        height_ratios=[1.2, 1.2, 1.0, 0.8])
+        [['distance', 'above'], ['setpoint', 'speed'], ['state', 'state']],
+        height_ratios=[1.2, 1.2, 0.7])
     _draw_above(axes['above'], flight)
     _draw_distance(axes['distance'], flight)
     _draw_setpoints(axes['setpoint'], flight)
@@ -114,7 +112,7 @@ def _flight_picture(flight: Flight) -> Illustration:
     axes['speed'].set(ylabel='speed [m/s]', ylim=(0.0, None))
     _draw_states(axes['state'], flight)
     for name in names:
-        axes[name].set_xlim(0.0, max(flight.duration, 1e-3))
+        axes[name].set(xlim=(0.0, max(flight.duration, 1e-3)), xlabel=TIME)
         _shade(axes[name], flight, 'leader not visible' if name == 'distance' else '')
     for name in names[:3]:
         _add_key(axes[name])
@@ -144,7 +142,7 @@ def _error_picture(flight: Flight) -> Illustration:
         rms = 100.0 * (figures['position_rms_m' if column == 0 else 'velocity_rms_m_s'] or 0.0)
         nees = figures[f'nees_{kind}']
         verdict = '' if nees is None else f'; NEES {nees:.1f}: {consistency(nees)}'
-        axes[0, column].set_title(f'relative {kind}: RMS {rms:.2f} {unit}; {100 * inside:.0f} % '
+        axes[0, column].set_title(f'relative {kind}: RMS {rms:.2f} {unit}\n{100 * inside:.0f} % '
                                   f'within two deviations{verdict}')
         axes[2, column].set_xlabel(TIME)
     axes[0, 0].set_xlim(0.0, max(flight.duration, 1e-3))
@@ -172,30 +170,26 @@ def _draw_distance(axis: Axes, flight: Flight) -> None:
 
 
 def _draw_above(axis: Axes, flight: Flight) -> None:
-    """Draw the paths from above, and lines between leader and follower at the same times."""
-    times = flight.table['time']
-    period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
-    _draw_map(axis, flight.paths, f'from above (● start, ■ end; a line every {period:.0f} s)')
-    for k in np.searchsorted(times, np.arange(0.0, times[-1], period)):
-        axis.plot(*np.transpose([path[k, :2] for path in flight.paths.values()]),
-                  color=LIMIT, linewidth=0.6, alpha=0.5)
-
-
-def _draw_map(axis: Axes, paths: Mapping[str, Array], title: str) -> None:
     """
-    Draw paths (n, 2) or (n, 3), m, from above, each with its label.
+    Draw the paths from above, and lines between leader and follower at the same times.
 
     Both axes have one scale, and a box as narrow as the data, within ``NARROWEST``.
     """
-    for (label, path), colour in zip(paths.items(), cycle(COLOURS)):
-        axis.plot(*path[:, :2].T, color=colour, linewidth=1.7, label=label)
+    times, paths = flight.table['time'], [path[:, :2] for path in flight.paths.values()]
+    period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
+    for label, path, colour in zip(flight.paths, paths, (LEADER, FOLLOWER)):
+        axis.plot(*path.T, color=colour, linewidth=1.7, label=label)
         known = path[np.isfinite(path).all(axis=1)]
         for end, marker in zip((known[:1], known[-1:]), 'os'):
-            axis.plot(*end[:, :2].T, marker, color=colour, markersize=6)
+            axis.plot(*end.T, marker, color=colour, markersize=6)
+    for k in np.searchsorted(times, np.arange(0.0, times[-1], period)):
+        pair = np.transpose([path[k] for path in paths])
+        axis.plot(*pair, color=LIMIT, linewidth=0.6, alpha=0.5)
     low, high = np.transpose([axis.get_xlim(), axis.get_ylim()])
     half = 0.5 * np.maximum(high - low, NARROWEST * np.max(high - low))
     (left, bottom), (right, top) = (0.5 * (low + high) + side * half for side in (-1.0, 1.0))
-    axis.set(title=title, xlabel='x [m]', ylabel='y [m]', xlim=(left, right), ylim=(bottom, top))
+    axis.set(title=f'from above (● start, ■ end; a line every {period:.0f} s)', xlabel='x [m]',
+             ylabel='y [m]', xlim=(left, right), ylim=(bottom, top))
     axis.set_aspect('equal', adjustable='box', anchor='N')
     axis.legend(loc='best', fontsize=9)
 
@@ -211,7 +205,7 @@ def _draw_setpoints(axis: Axes, flight: Flight) -> None:
         idle = ~flight.commanded
         axis.plot(times[idle], norms(setpoints)[idle], '.', color=_SHADE, markersize=5,
                   label='no command: brake or level')
-    axis.set(ylabel='acceleration [m/s²]', title='setpoint (odom axes)')
+    axis.set(ylabel='setpoint, odom axes [m/s²]')
 
 
 def _draw_states(axis: Axes, flight: Flight) -> None:
@@ -219,7 +213,7 @@ def _draw_states(axis: Axes, flight: Flight) -> None:
     if entered:
         times, levels = zip(*entered, (flight.duration, entered[-1][1]))
         axis.step(times, levels, where='post', color=VEHICLE, linewidth=1.5)
-    axis.set(ylabel="planner's state", ylim=(-0.3, len(_STATES) - 0.7), xlabel=TIME)
+    axis.set(ylabel="planner's state", ylim=(-0.3, len(_STATES) - 0.7))
     axis.set_yticks(range(len(_STATES)), _STATES)
 
 
