@@ -97,21 +97,6 @@ def test_the_bounds_are_those_of_band_and_limits():
     assert 'not measured' in judged(synthetic(), {})[1]['cpu_cores.total']
 
 
-@pytest.mark.parametrize('wrong', [np.nan, np.inf, -np.inf])
-def test_a_single_figure_that_is_not_finite_fails_its_bound(wrong):
-    flight = synthetic(external={})
-    flight.setpoints[7, 1] = flight.speeds['follower'][1][7] = wrong
-    flight.paths['follower'][200, 2] = wrong
-    figures, faults = judged(flight)
-    for key in ('setpoints.acceleration_max_m_s2', 'speed_max_m_s', 'altitude_off_m'):
-        assert figures[key] is None and 'not known' in faults[key]
-    flight = synthetic()
-    flight.distance[::10] = wrong
-    figures, faults = judged(flight)
-    assert figures['time_in_band_share'] == pytest.approx(0.9) and faults['time_in_band_share']
-    assert figures['true_distance_m.min'] == figures['true_distance_m.max']  # of the known ones
-
-
 @pytest.mark.parametrize(('seconds', 'outrun'), [(0.9, False), (1.3, True)])
 def test_a_follower_that_is_outrun_must_warn_instead_of_holding_the_band(seconds, outrun):
     since = TIMES - 1.0

@@ -25,6 +25,7 @@ from flock_desk.runs.summary import (
     consistency,
     hold_figures,
     jsonable,
+    most,
     rate,
     sight_figures,
     spread,
@@ -108,6 +109,7 @@ def test_what_is_not_known_is_none() -> None:
     nothing = sight_figures([table({}, [2.0, 0.0, 0.0])], 1.0)
     assert nothing['position_rms_m'] is None and nothing['distance_m']['min'] is None
     assert spread(np.array([1.0, 2.0, 6.0])) == {'min': 1.0, 'mean': 3.0, 'max': 6.0}
+    assert most(np.array([1.0, np.inf])) is None and most(np.array([np.nan, 1.0])) is None
     assert jsonable({'a': {'b': np.nan, 'c': float('inf'), 'd': 1.0}}) == {
         'a': {'b': None, 'c': None, 'd': 1.0}}
 
