@@ -67,7 +67,7 @@ def estimate(position: Array, velocity: Array, yaw: float = 0.0,
 
 
 def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, noise: float = 0.0,
-              truth: bool = True, ahead: Array = AHEAD) -> dict[str, Array]:
+              ahead: Array = AHEAD, leader_yaw: float = 0.0) -> dict[str, Array]:
     """Fly straight behind a leader for some frames, the odometry turned by ``drift``, rad."""
     errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
     errors.models[''] = CAMERA
@@ -78,9 +78,8 @@ def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, nois
         place = VELOCITY * k / 20
         # An error of the own velocity that lasts is in the leader's, too.
         errors.odometry(state(stamp, R @ place, drift, R @ (VELOCITY + BIAS)))
-        if truth:
-            errors.truth(state(stamp, place), own=True)
-            errors.truth(state(stamp, place + ahead, child='leader'))
+        errors.truth(state(stamp, place), own=True)
+        errors.truth(state(stamp, place + ahead, leader_yaw, child='leader'))
         errors.frame(START + stamp, {'leader': estimate(
             R @ (place + ahead + noise * POSITION_SIGMA * rng.standard_normal(3)),
             R @ (VELOCITY + BIAS + noise * VELOCITY_SIGMA * rng.standard_normal(3)),
@@ -110,28 +109,13 @@ def test_a_wrong_attitude_is_an_angle() -> None:
     np.testing.assert_allclose(collected(turned=0.5)['turned'], 0.5, atol=1e-7)
 
 
-def test_without_truth_there_is_a_distance_and_no_error() -> None:
-    table = collected(truth=False)
-    assert np.all(np.isfinite(table['distance']))
-    for name in ('true_distance', 'position', 'nees_position', 'turned', 'visible'):
-        assert np.all(np.isnan(table[name])), name
-
-
-@pytest.mark.parametrize(('ahead', 'visible'), [
-    ([2.0, 0.0, 0.0], 1.0), ([2.0, 1.5, 0.0], 0.0), ([-2.0, 0.0, 0.0], 0.0),
-    ([0.35, 0.0, 0.0], 0.0)])
-def test_only_a_marker_whole_in_the_image_is_in_view(ahead: list[float], visible: float) -> None:
-    np.testing.assert_array_equal(collected(3, ahead=np.array(ahead))['visible'], visible)
-
-
-def test_a_marker_seen_from_behind_is_not_in_view() -> None:
-    errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
-    errors.models[''] = CAMERA
-    errors.odometry(state(0, np.zeros(3)))
-    errors.truth(state(0, np.zeros(3)), own=True)
-    errors.truth(state(0, np.array([2.0, 0.0, 0.0]), yaw=np.pi, child='leader'))
-    errors.frame(START, {}, {})
-    assert errors.table('leader')['visible'].tolist() == [0.0]
+@pytest.mark.parametrize(('ahead', 'yaw', 'visible'), [
+    ([2.0, 0.0, 0.0], 0.0, 1.0), ([2.0, 1.5, 0.0], 0.0, 0.0), ([-2.0, 0.0, 0.0], 0.0, 0.0),
+    ([0.35, 0.0, 0.0], 0.0, 0.0), ([2.0, 0.0, 0.0], np.pi, 0.0)])
+def test_only_a_marker_whole_in_the_image_and_not_seen_from_behind_is_in_view(
+        ahead: list[float], yaw: float, visible: float) -> None:
+    table = collected(3, ahead=np.array(ahead), leader_yaw=yaw)
+    np.testing.assert_array_equal(table['visible'], visible)
 
 
 def test_truth_is_interpolated_between_stamps_but_not_across_a_gap() -> None:

@@ -65,15 +65,6 @@ def table(estimates: dict[int, dict[str, Estimate]], leader: list[float],
                     np.ones(len(STAMPS)) if visible is None else visible, 0)
 
 
-def test_drift_common_to_both_is_no_error() -> None:
-    figures = sight_figures([table(found(straight([2.0, 0.5, 0.0], 0.3)), [2.0, 0.5, 0.0], 0.3)],
-                            1.0)
-    assert figures['recall'] == 1.0
-    assert figures['position_rms_m'] == pytest.approx(0.0, abs=1e-9)
-    assert figures['velocity_rms_m_s'] == pytest.approx(0.0, abs=1e-9)
-    assert figures['distance_m']['mean'] == pytest.approx(np.hypot(2.0, 0.5))
-
-
 def test_an_offset_of_the_neighbour_is_the_error() -> None:
     estimates = found(straight([2.0, 0.0, 0.0]), np.array([0.0, 0.1, 0.0]))
     figures = sight_figures([table(estimates, [2.03, 0.04, 0.0])], 1.0)
