@@ -20,6 +20,7 @@ from collections import Counter
 import json
 from pathlib import Path
 import re
+import shutil
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,11 +31,8 @@ import pytest
 from flock_desk.evaluate import main
 from flock_desk.runs.evaluation import topics_used
 from flock_follower.bags.bag import BagError, BagMessage, deserialize, open_bag, serialize
-from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
-from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
-from flock_follower.check import main as check_main
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.checks.topic_names import IMAGE
 from flock_follower.files import resource
@@ -173,10 +171,7 @@ def test_bytes_that_are_no_message_are_counted_and_said(
     assert main([str(spoilt), '--output', str(tmp_path / 'out')]) == 0
     rejections = summary(tmp_path / 'out')['rejections']
     assert (rejections['invalid odom'], rejections['invalid image']) == (1, 1)
-    assert check_main([str(spoilt)]) == 0
-    lines = ' '.join(capsys.readouterr().out.split())
-    assert 'warning odom 1 of 240 say nothing: not an Odometry' in lines
-    assert 'incomplete: /odom: not an' in lines
+    assert 'odom: 1 of 240' in capsys.readouterr().err
 
 
 def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Path) -> None:
@@ -193,15 +188,11 @@ def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Pat
 def test_a_broken_bound_is_exit_code_1_and_named(
         bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bounds = tmp_path / 'bounds.yaml'
-    bounds.write_text('recall: {min: 0.99}\ndistance_rms_m: {max: 1.0e-7}\n'
-                      'planner.ticks: {min: 5, max: 10}\n')
-    assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 1
-    failed = [line for line in capsys.readouterr().err.splitlines() if 'FAILED' in line]
-    assert re.match(r'FAILED: distance_rms_m = 0\.00\d+: must be at most 1e-07', failed[0])
-    assert failed[1:] == ['FAILED: planner.ticks = 11: must be at most 10']
-    assert (tmp_path / 'report.html').read_text().count('>FAILED<') == 2
-    bounds.write_text('recall: {min: 0.99}\nrejections.invalid image: {max: 0}\n')
-    assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 0
+    for least, code in ((11, 0), (12, 1)):
+        bounds.write_text(f'planner.ticks: {{min: {least}}}\nrejections.invalid image: {{max: 0}}')
+        assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == code
+    assert capsys.readouterr().err == 'FAILED: planner.ticks = 11: must be at least 12\n'
+    assert (tmp_path / 'report.html').read_text().count('>FAILED<') == 1
 
 
 def test_a_truth_of_another_name_is_reported_and_topics_may_be_in_a_namespace(
@@ -261,32 +252,20 @@ def test_bad_files_are_exit_code_2_and_one_line(
 
 
 def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
-        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    box = FlightRecording(tmp_path / 'box', Limits(100.0, 10.0, 1.0), 0.0, 0.0)
-    box.note('parameters.yaml', 'planner: {ros__parameters: {v_max: 0.75}}\n'
-             'relative_pose: {ros__parameters: {neighbors_file: neighbors.yaml}}\n')
-    box.note('neighbors.yaml', resource('config/neighbors.yaml').read_text())
-    batch: list[TakenMessage] = []
-    with open_bag(bag) as source:
-        for m in source.messages():
-            batch.append(TakenMessage(RecordedTopic(m.topic, m.msgtype), m.stamp_ns, m.data))
-            if len(batch) == 100:
-                box.write(batch, 0.0)
-                batch = []
-    box.write(batch, 0.0)
-    path = box.path
-    assert path is not None
-    box.close()
-    assert main([str(path), '--output', str(tmp_path / 'whole')]) == 0
+        result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    box = excerpt(tmp_path / 'box')
+    (box / 'parameters.yaml').write_text(
+        'planner: {ros__parameters: {v_max: 0.75}}\n'
+        'relative_pose: {ros__parameters: {neighbors_file: neighbors.yaml}}\n')
+    shutil.copy(resource('config/neighbors.yaml'), box)
+    assert main([str(box), '--output', str(tmp_path / 'whole')]) == 0
     assert 'warning' not in capsys.readouterr().err
-    whole = summary(tmp_path / 'whole')
-    assert [whole[key] for key in ('frames', 'recall', 'distance_rms_m')] == [
-        summary(result)[key] for key in ('frames', 'recall', 'distance_rms_m')]
+    assert summary(tmp_path / 'whole')['distance_rms_m'] == summary(result)['distance_rms_m']
     assert 'with the parameters flown' in (tmp_path / 'whole' / 'report.html').read_text()
-    last = sorted(path.glob('*.mcap'))[-1]
+    (last,) = box.glob('*.mcap')
     last.write_bytes(last.read_bytes()[:-1000])
-    assert main([str(path), '--output', str(tmp_path / 'cut')]) == 0
-    assert f'warning: {path} is incomplete: {last.name} was cut short' in capsys.readouterr().err
+    assert main([str(box), '--output', str(tmp_path / 'cut')]) == 0
+    assert f'warning: {box} is incomplete: {last.name} was cut short' in capsys.readouterr().err
     assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
 
 
