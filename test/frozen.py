@@ -222,26 +222,19 @@ def main() -> int:
     different = 0
     for part in options.parts or PARTS:
         before = {} if options.write else read(part)
-        if not options.write and not before:
-            print(f'{part}: nothing frozen: run make freeze')
-            different += 1
-            continue
-        if part == 'flights' and not options.write:  # only runs that both have
-            frozen = sum(name.startswith(f'{SCENARIOS[0]} ') for name in before)
-            options.runs = min(options.runs, frozen)
+        if part == 'flights' and before:  # only runs that both have
+            options.runs = min(options.runs, max(
+                int(name.split()[-1]) for name in before if name) + 1)
             before = {name: row for name, row in before.items()
                       if not name or int(name.split()[-1]) < options.runs}
         after = PARTS[part](options)
-        if not after:
-            continue
-        if options.write:
+        if options.write and after:
             write(part, after)
-            continue
-        found = differences(before, after)
-        different += len(found)
-        for each in found:
-            print(f'{part}: {each}')
-        print(f'{part}: {len(after) - 1} rows compared, {len(found)} figures differ', flush=True)
+        elif after:
+            found = differences(before, after) if before else [f'{part}: run make freeze']
+            different += len(found)
+            print('\n'.join([*(f'{part}: {each}' for each in found), f'{part}: {len(after) - 1} '
+                             f'rows compared, {len(found)} figures differ']), flush=True)
     return 1 if different else 0
 
 

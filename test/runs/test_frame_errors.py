@@ -131,26 +131,3 @@ def test_truth_is_interpolated_between_stamps_but_not_across_a_gap() -> None:
     table = errors.table('leader')
     np.testing.assert_allclose(table['position'][:, 2], [0.5, np.nan, 0.5])
     np.testing.assert_allclose(table['true_distance'][[0, 2]], np.linalg.norm(AHEAD))
-
-
-def test_between_messages_of_a_slow_odometry_nothing_is_made_up() -> None:
-    # At 10 Hz a straight line between two attitudes is off by 6 mrad: 12 mm at 2 m.
-    errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
-
-    def own(stamp: int) -> OdometryState:
-        t = stamp / SECOND
-        place = np.array([np.sin(1.5 * t), 0.0, 1.0])
-        velocity = np.array([1.5 * np.cos(1.5 * t), 0.0, 0.0])
-        return state(stamp, place, 0.3 * np.sin(4.0 * t), velocity)._replace(
-            angular_velocity=np.array([0.0, 0.0, 1.2 * np.cos(4.0 * t)]))
-
-    for k in range(100):
-        stamp = k * SECOND // 30
-        if k % 3 == 0:
-            errors.odometry(own(stamp))
-        errors.truth(own(stamp), own=True)
-        errors.truth(state(stamp, AHEAD, child='leader'))
-        errors.frame(START + stamp, {'leader': estimate(AHEAD, VELOCITY)}, {'leader': 'track'})
-    table = errors.table('leader')
-    assert np.nanmax(np.abs(table['position'])) < 0.0015
-    assert np.isfinite(table['position'][:, 0]).sum() > 90
