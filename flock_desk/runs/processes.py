@@ -140,8 +140,7 @@ class SchedulingDelay:
     def __init__(self, parent: int | None = None, proc: Path = Path('/proc')) -> None:
         self._parent = os.getpid() if parent is None else parent
         self._proc = proc
-        self._threads: dict[Path, tuple[int, int]] = {}
-        self._history: deque[tuple[float, int, int]] = deque()
+        self._history: deque[tuple[float, dict[Path, list[int]]]] = deque()
 
     def check(self, now: float) -> None:
         """
@@ -151,24 +150,19 @@ class SchedulingDelay:
         """
         if self._history and now - self._history[-1][0] < 0.5:
             return
-        before, self._threads = self._threads, {}
-        ran = waited = 0
-        children: list[str] = []
-        for path in self._proc.glob(f'{self._parent}/task/*/children'):
-            with contextlib.suppress(OSError):  # a thread that has ended
-                children += path.read_text(encoding='ascii').split()
-        for child in children:
-            for path in self._proc.glob(f'{child}/task/*/schedstat'):
-                with contextlib.suppress(OSError, ValueError):  # a thread that has ended
-                    running, waiting, _ = map(int, path.read_text(encoding='ascii').split())
-                    last = before.get(path, (running, waiting))
-                    ran, waited = ran + running - last[0], waited + waiting - last[1]
-                    self._threads[path] = running, waiting
-        self._history.append((now, ran, waited))
-        if now - self._history[0][0] < BUSY_WINDOW:
+        counters: dict[Path, list[int]] = {}  # ns run and waited, of each thread
+        for tasks in self._proc.glob(f'{self._parent}/task/*/children'):
+            with contextlib.suppress(OSError, ValueError):  # a thread that has ended
+                for child in tasks.read_text(encoding='ascii').split():
+                    for path in self._proc.glob(f'{child}/task/*/schedstat'):
+                        counters[path] = [*map(int, path.read_text(encoding='ascii').split())]
+        self._history.append((now, counters))
+        began, before = self._history[0]
+        if now - began < BUSY_WINDOW:
             return
         self._history.popleft()
-        ran, waited = (sum(counts) for counts in list(zip(*self._history))[1:])
+        ran, waited = (sum(counters[path][k] - before[path][k]
+                           for path in counters.keys() & before.keys()) for k in (0, 1))
         if waited > BUSY_SHARE * (ran + waited):
             raise TooBusyError(
                 f'the processes waited for a processor for {waited / (ran + waited):.0%} of the '
