@@ -143,18 +143,19 @@ def evaluated(bag: Path, folder: Path, options: argparse.Namespace) -> BagOutcom
     findings = [finding for level in (ERROR, WARNING) for finding in evaluation.findings
                 if finding.level == level and finding.what != 'bag']
     lines = [finding.line for finding in findings]
-    warnings = [f'{bag} is incomplete: {evaluation.incomplete}'] if evaluation.incomplete else []
+    incomplete = evaluation.bag.incomplete
+    warnings = [f'{bag} is incomplete: {incomplete}'] if incomplete else []
     warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
                  for stranger in sorted(evaluation.errors.strangers)]
     if share := summary['faster_than_v_max_share']:
         warnings.append(
             f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
             f'{100 * share:.0f} % of the time above '
-            f'v_max = {evaluation.flight.planner_params.v_max:g} m/s: there the setpoints '
+            f'v_max = {evaluation.params.v_max:g} m/s: there the setpoints '
             'brake; set v_max (--config) to the recorded speed')
     flown_with = ', with the parameters flown' if flown else ''
     judgements = report(
-        folder, f'Evaluation of {evaluation.bag}',
+        folder, f'Evaluation of {bag.name}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
         'setpoints.', summary, bounds, evaluation_chapters(evaluation), [*lines, *warnings])

@@ -24,8 +24,7 @@ mode from the first message on; its autopilot's own velocity and yaw are in no b
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 import math
 from pathlib import Path
@@ -60,7 +59,6 @@ from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
     from_range,
-    Make,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
@@ -139,50 +137,63 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     return {full: use for full, use in used.items() if whole or use[0] not in TRUTHS}
 
 
-class RecordedFlight:
+class Evaluation(Listener):
     """
-    Feeds a follower from the messages of a bag, CDR bytes with the time of recording in ns.
+    A follower fed from the messages of a bag, and the record of its run.
+
+    ``cpu`` holds CPU times, s, by stage; ``frames`` counts the images. ``tick_rows``: time, s
+    since the first message, index of the state in STATES, norm of the commanded acceleration (NaN:
+    none), own speed. ``reasons`` has the time and the reason of every tick in HOLD.
+    ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
 
     :param values: the checked values of every parameter, by node, see ``TABLE``.
-    :param listener: receives the events of the flight.
-    :param make: returns an empty message of a type.
-    :param cpu_time: see ``Follower``.
     :raises ValueError: if values do not fit together, or the neighbours file is wrong.
     :raises OSError: if the neighbours file cannot be read.
     """
 
-    def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,
-                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+    def __init__(self, bag: Bag, values: dict[str, dict[str, Any]], writer: BagWriter) -> None:
         perception, bridge = values['relative_pose'], values['mavlink_bridge']
+        self.bag, self.writer = bag, writer
+        self.duration = bag.duration_ns / NANOSECONDS
+        self.params = planner_table.build(values['planner'])
         self.perceiver = Perceiver(
             relative_pose_table.build(perception), max_wait=perception['max_wait'])
-        self.planner_params = planner_table.build(values['planner'])
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
-            PlannerLoop(), self.planner_params, Gate(
+            PlannerLoop(), self.params, Gate(
                 filled(GateLimits(), bridge), bridge['velocity_source']),
-            listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
+            self, empty, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy={camera.name: camera.rpy for camera in cameras(values['planner'])},
-            cpu_time=cpu_time)
+            cpu_time=time.process_time)
         self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
-        self._listener = listener
+        self.own: OwnMotion | None = None
+        """Filled for the rules of ``check``."""
+        self.findings: list[Finding] = []
+        """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
+        self.neighbors = self.perceiver.tracker.config.neighbors
+        self.errors = FrameErrors(self.neighbors, {
+            camera.name: camera_mounting(camera.position, camera.rpy)
+            for camera in cameras(perception)}, bag.start_ns)
+        self.wall_time = 0.0
+        self.cpu: defaultdict[str, list[float]] = defaultdict(list)
+        self.frames = 0
+        self.tick_rows: list[tuple[float, ...]] = []
+        self.setpoint_rows: list[tuple[float, ...]] = []
+        self.rejections, self.setpoint_kinds, self.brake_reasons = (
+            Counter[str](), Counter[str](), Counter[str]())
+        self.reasons: list[tuple[float, str]] = []
         self._calibrations: dict[str, bytes] = {}
-        self._began = False
 
     def take(self, name: str, time: int, msgtype: str, data: bytes, camera: str = '',
              message: Any = None, pixels: GrayImage | None = None) -> None:
         """
         Take a message of our topic ``name``; bytes that are no message of the type are counted.
 
+        :param time: when it was recorded, ns.
         :param camera: the name of the camera, if there are several.
         :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
         """
-        if not self._began:
-            self._began = True
-            self.follower.engage(time, True)
-            self.follower.permit(time, -math.inf)
-            self.follower.vehicle(time, FLYING)
         try:
             if name == 'odom':
                 self._take_odometry(time, read_odometry(data) if message is None else message)
@@ -197,15 +208,14 @@ class RecordedFlight:
                                         read_stamp(message.header.stamp), camera)
         except ValueError as error:
             self.follower.advance(time)
-            self._listener.rejected(
-                INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
+            self.rejected(INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
             if name == RAW_IMAGES:
-                self._listener.image(ImageOutcome(time, camera=camera))
+                self.image(ImageOutcome(time, camera=camera))
 
     def _take_odometry(self, time: int, message: Any) -> None:
         state = self.source.take(message, time)
         for event in self.source.new_events():
-            self._listener.rejected(*event)
+            self.rejected(*event)
         if state is not None:
             self.follower.odometry(time, state)
 
@@ -214,46 +224,10 @@ class RecordedFlight:
         before, self._calibrations[camera] = self._calibrations.get(camera), calibration
         return calibration != before
 
-
-@dataclass
-class Evaluation(Listener):
-    """
-    The record of a run: a few numbers for each image, tick and setpoint.
-
-    ``cpu`` holds CPU times, s, by stage; ``frames`` counts the images. ``tick_rows``: time, s
-    since the first message, index of the state in STATES, norm of the commanded acceleration (NaN:
-    none), own speed. ``reasons`` has the time and the reason of every tick in HOLD.
-    ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
-    """
-
-    bag: str
-    duration: float
-    start: int
-    """The time of the first message, ns."""
-    incomplete: str
-    """Why the bag was never finished, '' if it was."""
-    writer: BagWriter
-    errors: FrameErrors = field(init=False)
-    flight: RecordedFlight = field(init=False)
-    own: OwnMotion | None = None
-    """Filled for the rules of ``check``."""
-    findings: list[Finding] = field(default_factory=list)
-    """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
-    wall_time: float = 0.0
-    cpu: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    frames: int = 0
-    tick_rows: list[tuple[float, ...]] = field(default_factory=list)
-    setpoint_rows: list[tuple[float, ...]] = field(default_factory=list)
-    rejections: Counter[str] = field(default_factory=Counter)
-    setpoint_kinds: Counter[str] = field(default_factory=Counter)
-    brake_reasons: Counter[str] = field(default_factory=Counter)
-    reasons: list[tuple[float, str]] = field(default_factory=list)
-
     @cached_property
     def tables(self) -> dict[str, Table]:
         """Return the errors of each neighbour by its name, once all messages were taken."""
-        return {neighbor.name: self.errors.table(neighbor.name)
-                for neighbor in self.flight.perceiver.tracker.config.neighbors}
+        return {each.name: self.errors.table(each.name) for each in self.neighbors}
 
     @property
     def ticks(self) -> Array:
@@ -279,13 +253,13 @@ class Evaluation(Listener):
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
         self.errors.odometry(state)
-        if self.own is not None and state.stamp < self.start + LONGEST * NANOSECONDS:
+        if self.own is not None and state.stamp < self.bag.start_ns + LONGEST * NANOSECONDS:
             self.own.states.append(state)
 
     def image(self, outcome: ImageOutcome) -> None:
         """Take the outcome of an image."""
         seen, camera = outcome.sighting, outcome.camera
-        self.errors.models[camera] = self.flight.perceiver.model(camera)
+        self.errors.models[camera] = self.perceiver.model(camera)
         self.frames += 1
         if seen is None:
             self.errors.frame(outcome.stamp, {}, {}, camera)
@@ -324,7 +298,7 @@ class Evaluation(Listener):
                 self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
-        return (nanoseconds - self.start) / NANOSECONDS
+        return (nanoseconds - self.bag.start_ns) / NANOSECONDS
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
@@ -342,16 +316,10 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     """
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        mounted = cameras(values['relative_pose'])
-        used = topics_used(bag, namespace, remaps, [camera for camera in mounted if camera.name])
+        used = topics_used(bag, namespace, remaps, [
+            camera for camera in cameras(values['relative_pose']) if camera.name])
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
-            evaluation = Evaluation(
-                path.name, bag.duration_ns / NANOSECONDS, bag.start_ns, bag.incomplete, writer)
-            flight = RecordedFlight(values, evaluation, empty, time.process_time)
-            evaluation.flight = flight
-            evaluation.errors = FrameErrors(flight.perceiver.tracker.config.neighbors, {
-                camera.name: camera_mounting(camera.position, camera.rpy)
-                for camera in mounted}, bag.start_ns)
+            evaluation = Evaluation(bag, values, writer)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *(
                     bag.topics[topic].msgtype for topic in used)):
@@ -359,7 +327,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             begin = time.perf_counter()
             system = None
             if checked:
-                evaluation.own = OwnMotion(flight.source)
+                evaluation.own = OwnMotion(evaluation.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
             _play(bag, used, evaluation, system)
             if system is not None:
@@ -371,16 +339,22 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
+    follower, message, pixels, began = evaluation.follower, None, None, False
     for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
-        message, pixels = (None, None) if system is None else (
-            system.take(topic, msgtype, stamp, data))
+        if system is not None:
+            message, pixels = system.take(topic, msgtype, stamp, data)
         name, camera = used.get(topic, ('', ''))
         if name in TRUTHS:
             evaluation.errors.truth(
                 from_odometry(read_odometry(data)), own=name == 'truth/odom')
         elif name:
-            evaluation.flight.take(name, stamp, msgtype, data, camera, message, pixels)
-    evaluation.flight.follower.finish()
+            if not began:
+                began = True
+                follower.engage(stamp, True)
+                follower.permit(stamp, -math.inf)
+                follower.vehicle(stamp, FLYING)
+            evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
+    follower.finish()
 
 
 def _norm(vector: Array | None) -> float:

@@ -53,7 +53,7 @@ def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
     """Return what the report of ``evaluate`` shows: of each neighbour, flight and errors."""
     ticks, setpoints = evaluation.ticks, evaluation.setpoints
     return [chapter for name, table in evaluation.tables.items() for chapter in chapters(Flight(
-        name=name, duration=evaluation.duration, params=evaluation.flight.planner_params,
+        name=name, duration=evaluation.duration, params=evaluation.params,
         table=table, states=evaluation.states, setpoint_times=setpoints[:, 0],
         setpoints=setpoints[:, 1:4], commanded=setpoints[:, 4] == 1.0,
         paths={f'{name}, estimated': table['neighbor'], 'follower, own odometry': table['own']},

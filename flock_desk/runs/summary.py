@@ -128,11 +128,11 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
                              for table in tables])
     cpu = {what: 1e3 * np.array(evaluation.cpu.get(what, ()), dtype=float)
            for what in ('decode', *STAGES, 'planner', 'gate')}
-    ticks, params = evaluation.ticks, evaluation.flight.planner_params
+    ticks, params = evaluation.ticks, evaluation.params
     acceleration, speed = _finite(ticks[:, 2]), _finite(ticks[:, 3])
     held = hold_figures(evaluation.states, evaluation.reasons, evaluation.duration)
     return jsonable({
-        'bag': evaluation.bag,
+        'bag': evaluation.bag.path.name,
         'duration_s': evaluation.duration,
         'check': {f'{level}s': [finding.line for finding in evaluation.findings
                                 if finding.level == level] for level in (ERROR, WARNING)},
