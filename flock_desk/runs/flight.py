@@ -145,15 +145,12 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
             if early:
                 print(f'\nthe bridge has ended the flight: {early}', flush=True)
-                come_down(processes)
             elif external:
                 call(processes, 'planner/engage', ('false',))
                 call(processes, 'mavlink_bridge/offboard', ('false',))
-                call(processes, 'mavlink_bridge/land', ())
-        except BaseException:
+        finally:
             if 'takeoff' in processes.children:
                 come_down(processes)
-            raise
         if external:
             simulator = processes.children['simulator']
             wait_until(lambda: simulator.poll() is not None, LANDING_TIMEOUT,

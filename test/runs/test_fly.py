@@ -211,6 +211,8 @@ class Pretended(Processes):
 
     def ask(self, service, *_, **__):
         self.asked.append(service)
+        if service.endswith('takeoff'):
+            self.children['takeoff'] = SimpleNamespace(pid=0, returncode=0, poll=lambda: 0)
         if self.refusal and service == 'mavlink_bridge/arm':
             raise RuntimeError(self.refusal)
         return 'yes'
