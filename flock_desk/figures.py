@@ -37,7 +37,7 @@ import numpy as np
 
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
-from flock_desk.flocks.agents import Leader, Model, simulate, Simulation
+from flock_desk.flocks.agents import Leader, Model, simulate, simulate_graph, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
@@ -94,8 +94,8 @@ def redraw(out: Path) -> list[str]:
             for model, name in MODELS.items():
                 bar.set_description_str(f'{scenario}: {name}')
                 runs[scenario][name] = simulate(
-                    start.positions, start.velocities, paper.PARAMS, duration=duration,
-                    model=model, leader=lead, sample_period=SAMPLE_PERIOD)
+                    *start, paper.PARAMS, duration=duration, model=model, leader=lead,
+                    sample_period=SAMPLE_PERIOD)
                 bar.update()
     alone, led = runs.values()
     continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
@@ -146,9 +146,7 @@ def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:
 
         def show(share: float) -> None:
             bar.update(round(1000 * share) - bar.n)
-        run = simulate(start.positions, start.velocities, paper.FLIGHT_PARAMS, duration=DURATION,
-                       neighbors='graph', integrator='semi_implicit', sample_period=0.05, dt=0.005,
-                       progress=show)
+        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION, progress=show)
     m, name = run.metrics, f'flock_{agents}_{dim}d_seed{seed}'
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')

@@ -203,13 +203,13 @@ def table(results: Results,
 
 def _fly(task: Task) -> Flown:
     _, law, guard = CONTROLLERS[task.controller]
-    flights = fly(task.scenario, task.runs, guard, law=law)
+    flights = fly(task.scenario, task.runs, guard, law)
     rows, many = measure(flights), task.scenario.company.followers
     exits = []
-    for left in band_exits(flights):
-        run, follower = divmod(left.row, many)
+    for row, why in band_exits(flights):
+        run, follower = divmod(row, many)
         which = f'follower {follower + 1} ' if many > 1 else ''
-        exits.append(f'run {task.runs[run]}: {which}{left}')
+        exits.append(f'run {task.runs[run]}: {which}{why}')
     return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), exits)
 
 

@@ -282,4 +282,4 @@ def test_topics_of_other_names_are_taken(
         **without_timings(summary(result)), 'bag': 'other'}
     assert (tmp_path / 'result.mcap').read_bytes() == (result / 'result.mcap').read_bytes()
     assert main([str(other), '--output', str(tmp_path), '--remap', 'odometry:=/x']) == 2
-    assert 'odometry is no name of ours' in capsys.readouterr().err
+    assert 'with a name of ours: one of' in capsys.readouterr().err
