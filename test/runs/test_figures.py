@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""The command that redraws the paper's figures: simulations, and flights that `fly` recorded."""
+"""The command that redraws the paper's figures: simulations, and controllers compared."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.text import Text
-import numpy as np
 import pytest
 
 from flock_desk import figures
@@ -36,10 +35,6 @@ from flock_desk.runs.paper_plots import styled, WIDTH
 pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
          'leaderless_lyapunov', 'leader_trajectories', 'leader_speeds', 'leader_distances')
-SECONDS, RATE, START = 6, 20, 10**18  # of the images
-DRIFT = np.array([0.1, -0.2, 0.0])  # of odom, m
-NO_IMAGE, NO_ESTIMATE = (2.0, 2.8), (4.0, 4.4)  # from and to, s
-SEEN_FARTHER = 0.05  # m
 
 
 @pytest.fixture(scope='module')
