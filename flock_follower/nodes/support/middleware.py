@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
+import contextlib
 import os
 from pathlib import Path
 import re
@@ -111,9 +112,11 @@ def receive_buffer_max() -> int:
 
 def shares_memory() -> bool:
     """Return whether Fast DDS has shared memory open in this process."""
-    folder = Path('/proc/self/fd')
-    links = (os.path.realpath(link) for link in folder.iterdir()) if folder.exists() else ()
-    return any(link.startswith('/dev/shm/fastrtps_') for link in links)
+    for link in Path('/proc/self/fd').glob('*'):
+        with contextlib.suppress(OSError):  # closed meanwhile by another thread
+            if os.readlink(link).startswith('/dev/shm/fastrtps_'):
+                return True
+    return False
 
 
 def segment_size(environment: Mapping[str, str]) -> int:
