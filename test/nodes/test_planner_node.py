@@ -210,26 +210,6 @@ def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig
     assert rig.set(v_max=0.5, a_max=2.5, guard=False) == ''
 
 
-def test_images_that_come_between_two_ticks_keep_the_planner_from_one_more(rig: Rig) -> None:
-    silence = rig.node._silence
-
-    def seen(late: int) -> None:
-        """Take the stamp of an image, which arrived some ns ago."""
-        rig.node._take_frame(
-            Header(stamp=nanoseconds_to_stamp(rig.now + STEP - late)), rig.now - late)
-    seen(late=150_000_000)
-    assert silence.timer_period_ns == 50_000_000  # since the image arrived
-    rig.node._poll_frames = lambda: seen(90_000_000)
-    ticks = rig.diagnostics.rate('tick')
-    before = ticks.count
-    rig.node._on_silence()
-    assert ticks.count == before and not silence.is_canceled()
-    assert silence.timer_period_ns == 110_000_000
-    rig.node._poll_frames = lambda: None
-    rig.node._on_silence()
-    assert ticks.count == before + 1 and silence.is_canceled()
-
-
 @pytest.mark.parametrize('step', [-5.0, 5.0])
 def test_a_system_clock_that_is_set_does_not_silence_it(
         ros: None, monkeypatch: pytest.MonkeyPatch, step: float) -> None:

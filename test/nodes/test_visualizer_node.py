@@ -133,7 +133,7 @@ def test_old_states_are_marked_and_forgotten_and_nothing_is_drawn_without_a_view
 @given(strategies.lists(strategies.floats(-1.0, 1.0), min_size=9, max_size=9))
 def test_an_ellipsoid_has_the_covariance_it_is_made_of(values: list[float]) -> None:
     root = np.reshape(values, (3, 3))
-    shape = ellipsoid('odom', 'x', np.zeros(3), root @ root.T)
+    shape = ellipsoid('x', np.zeros(3), root @ root.T)
     turn = shape.pose.orientation
     axes = quaternion_to_matrix([turn.x, turn.y, turn.z, turn.w])
     again = axes @ np.diag(np.square(to_array(shape.scale) / (2.0 * DEVIATIONS))) @ axes.T
