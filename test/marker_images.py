@@ -23,8 +23,9 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
@@ -32,12 +33,33 @@ from flock_follower.perception.markers import (
     MarkedNeighbor,
     Marker,
     marker_cells,
+    NeighborConfig,
 )
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
+from flock_follower.perception.tracker import Sighting, Tracker
 
 DICTIONARY = 'DICT_4X4_50'
 SIDE = 0.16  # m
+#: T_body_marker of a marker on the tail that faces backwards; x of the body is ahead.
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))
+CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
+
+
+class Hovering:
+    """A drone that hovers at a pose, and sees an image every ``period`` s."""
+
+    def __init__(self, camera: CameraModel, mounting: Transform, pose: Transform | None = None,
+                 config: NeighborConfig = CONFIG, period: float = 1.0 / 30.0) -> None:
+        self.camera, self.pose, self.period = camera, pose or Transform(), period
+        self.tracker, self.stamp = Tracker(config, mounting), -period
+
+    def see(self, image: GrayImage) -> Sighting:
+        self.stamp += self.period
+        self.tracker.feed_odometry(OdometrySample(
+            self.stamp, self.pose.translation, self.pose.quaternion, np.zeros(3), np.zeros(3)))
+        return self.tracker.process_image(self.stamp, image, self.camera)
 
 
 class Cover(NamedTuple):

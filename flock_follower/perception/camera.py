@@ -34,7 +34,6 @@ otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,10 +52,11 @@ _SIZE = Range(1, 65535, 'px', whole=True)
 _RADIUS_LIMIT = 10.0
 
 
-@dataclass(frozen=True, eq=False)
 class CameraModel:
     """
-    The intrinsic calibration of one camera.
+    The intrinsic calibration of one camera; not to be altered.
+
+    ``radius`` is the radius in normalised coordinates up to which the distortion is one-to-one.
 
     :param matrix: K, shape (3, 3), px.
     :param distortion: D; shorter is filled up with zeros if the model allows it (none at all,
@@ -67,48 +67,31 @@ class CameraModel:
     :raises ValueError: naming the fault of the calibration.
     """
 
-    matrix: Array
-    distortion: Array
-    model: str
-    width: int
-    height: int
-    #: Radius in normalised coordinates up to which the distortion is one-to-one.
-    radius: float = field(init=False)
-    #: K[:2, :2].T and K[:2, 2].
-    _transposed: Array = field(init=False, repr=False)
-    _middle: Array = field(init=False, repr=False)
-    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None if both are 0.
-    _aside: Array | None = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        """Validate, and find how far out the distortion can be inverted."""
-        model = self.model or 'plumb_bob'
-        if model not in DISTORTION_MODELS:
+    def __init__(self, matrix: ArrayLike, distortion: ArrayLike, model: str, width: int,
+                 height: int) -> None:
+        self.model = model or 'plumb_bob'
+        if self.model not in DISTORTION_MODELS:
             raise ValueError(f'distortion_model = {model!r}: must be one of '
                              f'{", ".join(DISTORTION_MODELS)}')
-        matrix = np.array(self.matrix, dtype=float)
-        object.__setattr__(self, 'model', model)
-        object.__setattr__(self, 'matrix', _checked_matrix(matrix))
-        object.__setattr__(self, '_transposed', self.matrix[:2, :2].T)
-        object.__setattr__(self, '_middle', self.matrix[:2, 2])
-        object.__setattr__(self, 'distortion', _checked_distortion(self.distortion, model))
-        p1, p2 = self._tangential
-        object.__setattr__(self, '_aside', np.array(
-            [[3.0 * p2, p1], [p2, 3.0 * p1], [2.0 * p1, 2.0 * p2]]) if p1 or p2 else None)
-        for name, size in (('width', self.width), ('height', self.height)):
-            _SIZE.check(name, size)
-        low, high = (share * max(self.width, self.height) for share in FOCAL_LENGTH_RANGE)
-        for focal in (self.matrix[0, 0], self.matrix[1, 1]):
-            Range(low, high, 'px').check(
-                f'K: focal length for {self.width}x{self.height}', float(focal))
-        for array in (self.matrix, self.distortion):
-            array.flags.writeable = False
+        self.matrix = _checked_matrix(np.array(matrix, dtype=float))
+        self.distortion = _checked_distortion(distortion, self.model)
+        _SIZE.check('width', width)
+        _SIZE.check('height', height)
+        self.width, self.height = width, height
+        low, high = (share * max(width, height) for share in FOCAL_LENGTH_RANGE)
+        for focal in self.matrix.diagonal()[:2].tolist():
+            Range(low, high, 'px').check(f'K: focal length for {width}x{height}', focal)
+        self._transposed, self._middle = self.matrix[:2, :2].T, self.matrix[:2, 2]
+        fisheye = self.model == 'equidistant'
+        p1, p2 = self._tangential = (0.0, 0.0) if fisheye else self.distortion[2:4].tolist()
+        # x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y').
+        self._aside: Array | None = np.array(
+            [[3.0 * p2, p1], [p2, 3.0 * p1], [2.0 * p1, 2.0 * p2]]) if p1 or p2 else None
         radii = np.linspace(0.0, _RADIUS_LIMIT, 2001)
         falling = np.flatnonzero(~(np.diff(radii * self._scale(radii**2)[0]) > 0.0))
-        limit = radii[falling[0]] if falling.size else _RADIUS_LIMIT
-        if limit == 0.0:
+        self.radius = float(radii[falling[0]]) if falling.size else _RADIUS_LIMIT
+        if self.radius == 0.0:
             raise ValueError(f'D = {self.distortion.tolist()}: folds the image at its centre')
-        object.__setattr__(self, 'radius', float(limit))
 
     @classmethod
     def from_calibration(cls, K: ArrayLike, D: ArrayLike, distortion_model: str,
@@ -249,13 +232,6 @@ class CameraModel:
         if outside.any():
             xy[outside] = np.nan
         return xy, depth
-
-    @property
-    def _tangential(self) -> tuple[float, float]:
-        """Return p1 and p2."""
-        if self.model == 'equidistant':
-            return 0.0, 0.0
-        return float(self.distortion[2]), float(self.distortion[3])
 
     def _radial(self, r2: Any) -> Any:
         """Return the radial factor g(r^2)."""

@@ -15,33 +15,215 @@
 """
 Fits a neighbour's pose to the edges of its markers, from a roughly known pose.
 
+Brightness profiles are taken across the known edges between black and white. The derivative of a
+profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
+between black and white, the peak hardly moves if blur dims a narrow cell.
+
 The fit minimises the squared distances between edges and model, across the edges: Gauss-Newton
 with Tukey's weights, so that covered or dirty edges do not count. Gamma and over-exposure make
 white areas swell ("bloom"): all edges shift from white to black. The fit estimates this shift with
 the pose, one for edges across the marker's x axis and one for those across y, because motion blurs
 them unequally.
-
-``ippe`` and ``refine`` give the pose of a square from its four corners. A square has two poses
-that explain its corners almost equally well, mirrored about the line of sight (Collins & Bartoli,
-"Infinitesimal plane-based pose estimation", IJCV 2014; IPPE).
 """
 
 from __future__ import annotations
 
 import math
 from operator import truediv
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
-from flock_follower.perception import edges
+from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edges import Found, Lines, normal_covariance, solve_normal
+from flock_follower.perception.edges import (
+    Lines,
+    moved,
+    normal_covariance,
+    project,
+    solve_normal,
+)
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.print_model import EdgeModel, median
+from flock_follower.perception.print_model import DERIVATIVES, EdgeModel, median
 
+#: px between samples of a profile: least, and most; but as a share of the cell more may be needed.
+SPACING = (0.3, 1.2)
+WIDEST = 0.1
+_HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
+_REACH = 2 * _HALF  # likewise of a profile
+_KERNEL_SIGMA = 2.0  # samples
+#: A point and a step, (1, 2), times this: the places along a profile.
+_STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
+_LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
+_MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
+#: Fainter edges, as a share of the median slope, are ignored. Those in a shadow have 0.2 of it;
+#: those of cells narrower than _NARROW, px, are faint because they run into one another.
+_FAINT, _FAINT_NARROW, _NARROW = 0.15, 0.3, 4.0
+_MIN_SHARE = 0.5  # of the edges must be found
+_WIDE = 0.5  # px between samples, for sharp images of large markers
+_FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
+_NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
+_LEAST_VARIANCE = 1e-9  # px^2: to divide by
+#: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
+_WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
+_ONES = np.ones(2)
+_DIFFERENCE = np.array([1.0, -1.0])
+
+
+def _correlation() -> Any:
+    """Return what takes a profile (17,) to its smoothed derivative at the middle 9 samples."""
+    k = np.arange(-_HALF, _HALF + 1.0)
+    kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
+    kernel /= kernel @ k  # one grey level per sample gives 1
+    matrix = np.zeros((2 * _REACH + 1, 2 * _HALF + 1), dtype=np.float32)
+    for i in range(2 * _HALF + 1):
+        matrix[i:i + 2 * _HALF + 1, i] = kernel
+    return matrix
+
+
+_CORRELATION = _correlation()
+
+
+class Found(NamedTuple):
+    """
+    Where edges are in the image.
+
+    ``offsets`` (n,), px, along the normals from where the lines are; ``found`` (n,), bool;
+    ``variance`` (n,), px^2, of the peaks' widths, kernel and blur together. ``known``: the
+    indices of those found across either axis.
+    """
+
+    offsets: Array
+    found: Any
+    variance: Array
+    known: tuple[Any, Any]
+
+
+def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+    """
+    Return where brightness rises most steeply along each line's normal.
+
+    None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
+    across edges of either axis.
+    """
+    model = lines.model
+    step = np.array(spacing, dtype=np.float32)[model.axis]
+    along = lines.normals * step[:, None]
+    profiles = _sample(image, lines.pixels, along, max(spacing))
+    if profiles is None:
+        return None
+    slope = profiles.dot(_CORRELATION)
+
+    peak = slope.argmax(axis=1)
+    within = _WITHIN[peak]
+    index = model.begins + within
+    values = slope.ravel()
+    before, top, after = values[index - 1], values[index], values[index + 1]
+    bend = np.minimum(before - 2.0 * top + after, -1e-3)
+    typical = median(top)
+    faint = _FAINT if min(lines.narrowest) > _NARROW else _FAINT_NARROW
+    found = (peak == within) & (top > faint * typical)
+    if (typical < _MIN_SLOPE * max(spacing)
+            or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
+        return None
+    offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
+    first, second = ((found & one).nonzero()[0] for one in model.across)
+    return Found(offsets, found, (-top / bend) * (step * step), (first, second))
+
+
+def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any:
+    """
+    Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
+
+    The image's edge repeats outside. None if hardly anything is inside. ``widest`` is the
+    longest step, px.
+    """
+    # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
+    height, width = image.shape
+    reach = _REACH * widest + 2.0
+    places = pixels.T.copy()
+    low_x, low_y = (_LEAST(places, axis=1) - reach).tolist()
+    high_x, high_y = (_MOST(places, axis=1) + reach).tolist()
+    left, top = max(int(low_x), 0), max(int(low_y), 0)
+    right, bottom = min(int(high_x) + 1, width), min(int(high_y) + 1, height)
+    if right - left < 2 or bottom - top < 2:
+        return None
+    stride = right - left
+    part = image[top:bottom, left:right].astype(np.float32).ravel()
+    count = len(pixels)
+    starts = np.empty((2, count, 2), dtype=np.float32)
+    starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
+    starts[:, :, 1] = along.T
+    at = starts.reshape(-1, 2).dot(_STEPS).reshape(2, count, -1)
+    x, y = at
+    if low_x < 0.0 or low_y < 0.0 or high_x > width or high_y > height:
+        np.clip(x, 0.0, np.float32(stride - 1.001), out=x)
+        np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
+    whole = np.floor(at)
+    at -= whole
+    column, index = whole.astype(np.intp)  # other integers would be turned into these
+    index *= stride
+    index += column
+    next_row = part[stride:]
+    above, below = part.take(index), next_row.take(index)
+    above += x * (part[1:].take(index) - above)
+    below += x * (next_row[1:].take(index) - below)
+    below -= above
+    below *= y
+    below += above
+    return below
+
+
+def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
+    """
+    Return where edges are without what neighbours push them by, and the blur of either axis, px.
+
+    Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
+    C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
+    about -d e / (1 + (d^2 / s^2 - 1) e), and -C / C'' is s^2 (1 - e) / (1 + (d^2 / s^2 - 1) e).
+    """
+    model, offsets = lines.model, found.offsets
+    known = found.known
+    variance = _typical(found.variance, known)
+    if any(cell**2 < _FAR * v for cell, v in zip(lines.narrowest, variance)):
+        room = model.room * np.array(lines.scale)[model.axis][:, None]
+        square = room * room
+        for again in (True, True, False):
+            blurred = np.maximum(variance, _LEAST_VARIANCE)[model.axis]
+            normalised = square / blurred[:, None]
+            e = np.exp(np.minimum(-0.5 * normalised, -_NEAR))
+            bend = 1.0 + ((normalised - 1.0) * e).dot(_ONES)
+            if again:
+                variance = _typical(found.variance * bend / (1.0 - e.dot(_ONES)), known)
+        offsets -= (room * e).dot(_DIFFERENCE) / bend
+    return found._replace(offsets=offsets), (math.sqrt(variance[0]), math.sqrt(variance[1]))
+
+
+def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
+    """Return the median variance of the known edges of either axis, px^2; 0 without one."""
+    first, second = known
+    return (median(variance[first]) if len(first) else 0.0,
+            median(variance[second]) if len(second) else 0.0)
+
+
+def _matched(lines: Lines, blur: list[float]) -> tuple[float, float]:
+    """Return the spacing at which the kernel is about as wide as the image is blurred, px."""
+    # Wider than the blur averages more noise, as long as the next edge stays out of it.
+    first, second = (
+        min(max(sigma / _KERNEL_SIGMA, min(_WIDE, 0.12 * cell), SPACING[0]),
+            max(SPACING[1], WIDEST * cell))
+        for sigma, cell in zip(blur, lines.narrowest))
+    return first, second
+
+
+def _searching(lines: Lines) -> tuple[float, float]:
+    """Return the spacing, px, at which edges half a cell away are still within reach."""
+    first, second = (max(cell / (2 * _HALF), SPACING[0]) for cell in lines.narrowest)
+    return first, second
+
+
+#: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
+MIN_INLIERS, MAX_RMS = 0.5, 0.4
 #: An edge is in place if the fit explains it to within this, px, or three times the RMS.
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
@@ -49,10 +231,10 @@ _FLOOR = 0.03  # px: least standard deviation of an edge's place
 #: What a step leaves out goes with its square, and against the marker's size: where the square is
 #: more than this times the narrowest cell, px, edges are looked for again;
 _AGAIN = 0.2
-_ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
+ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
-_LONGEST_TURN = 1.0  # rad: after a longer step the edges must be found again
+LONGEST_TURN = 1.0  # rad: after a longer step the edges must be found again
 _SETTLED = 2.0  # times as far as a step may go that nothing is looked for again after
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
@@ -92,101 +274,66 @@ class EdgeFit(NamedTuple):
 def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
         spacing: tuple[float, float] | None = None) -> EdgeFit | None:
     """
-    Return the pose near ``start``, ``T_camera_body``, or None if its edges are not found.
+    Return the pose near ``start``, ``T_camera_body``, or None if the image does not show it.
 
-    ``start`` may be off by half a cell of the marker in the image.
+    More than MIN_INLIERS of the edges must be in place, within MAX_RMS. ``start`` may be off by
+    half a cell of the marker in the image.
 
     :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
         by four times as much.
     """
-    lines = edges.project(camera, model, start)
-    if lines is None:
-        return None
-    pose = start
-    now = edges.searching(lines) if spacing is None else spacing
-    last: _Step | None = None
-    count = 0
-    while True:
-        count += 1
-        found = edges.find(image, lines, now)
-        if found is None:
+    pose, last = start, None
+    lines = project(camera, model, start)
+    if lines is not None and spacing is None:
+        spacing = _searching(lines)
+    for count in range(_PASSES):
+        found = None if lines is None or spacing is None else _find(image, lines, spacing)
+        if lines is None or spacing is None or found is None:
             return None
-        found, widths = edges.apart(lines, found)
+        found, widths = _apart(lines, found)
         step = _solve(lines, found, last)
-        if step is None:
-            return None
-        turn = max(map(abs, step.step[3:6].tolist()))
-        if not turn < _LONGEST_TURN:
+        turn = math.inf if step is None else max(map(abs, step.step[3:6].tolist()))
+        if step is None or not turn < LONGEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
-        blur = edges.blurs(widths, now)
-        suited = edges.matched(lines, blur)
-        farthest = float(np.abs(step.explained).max())
-        turned = turn > _TURNED
+        blur = [math.sqrt(max(width**2 - (_KERNEL_SIGMA * each)**2, 0.0))
+                for width, each in zip(widths, spacing)]
+        suited = _matched(lines, blur)
+        alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, spacing))
         clear = float(step.weights.sum()) > _CLEAR * len(model)
-        alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
-        cell = min(lines.narrowest)
-        near = farthest * farthest < _AGAIN * cell
-        settled = near and alike and clear and not turned
-        if settled or count == _PASSES:
-            if not settled and farthest * farthest > _SETTLED**2 * _AGAIN * cell:
+        farthest, turned = float(np.abs(step.explained).max()), turn > _TURNED
+        near = _AGAIN * min(lines.narrowest)
+        settled = farthest * farthest < near and alike and clear and not turned
+        if settled or count == _PASSES - 1:
+            if not settled and farthest * farthest > _SETTLED**2 * near:
                 return None
-            smear = max(map(truediv, blur, lines.narrowest))
-            return _fitted(pose, lines, found, step, suited, smear)
-        now = suited
+            return _fitted(pose, lines, found, step, suited,
+                           max(map(truediv, blur, lines.narrowest)))
+        spacing = suited
         # A fit to a part of the edges must not exclude the others.
         last = step if clear else None
-        if farthest > _ANEW or turned:
-            fresh = edges.project(camera, model, pose)
-            if fresh is None:
-                return None
-            lines = fresh
-
-
-def refit(camera: CameraModel, fitted: EdgeFit,
-          start: Transform) -> tuple[Transform, float] | None:
-    """
-    Return another pose near ``start`` that fits the edges found already, and its chi^2.
-
-    chi^2 is the weighted sum of their squared residuals. None if no pose fits.
-    """
-    pose = start
-    at = fitted.lines.pixels + fitted.residual[:, None] * fitted.lines.normals
-    for _ in range(2):
-        lines = edges.project(camera, fitted.lines.model, pose)
-        if lines is None:
-            return None
-        offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
-        design = lines.design[:, :6]
-        moment = (design * fitted.weights[:, None]).T
-        step = solve_normal(moment.dot(design), moment.dot(offsets))
-        if step is None or not float(np.abs(step[3:]).max()) < _LONGEST_TURN:
-            return None
-        pose = moved(pose, lines.center, step)
-        explained = design.dot(step)
-        if float(np.abs(explained).max()) < _ANEW:
-            break
-    residual = offsets - explained
-    return pose, float(fitted.weights.dot(residual * residual))
+        if farthest > ANEW or turned:
+            lines = project(camera, model, pose)
+    return None
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], smear: float) -> EdgeFit | None:
-    """Return the fit that ends with a step, None if that leaves a direction open."""
+    """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
-    covariance = normal_covariance(last.information)
-    if covariance is None:
-        return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
-    weights = last.weights / last.variance[lines.model.axis]
     square = float(last.weights.dot(last.squares)) / degrees
     in_place = np.count_nonzero(found.found & (last.squares < max(INLIER**2, 9.0 * square)))
+    inliers, rms = in_place / len(lines.model), math.sqrt(square)
+    covariance = normal_covariance(last.information)
+    if covariance is None or not (inliers > MIN_INLIERS and rms < MAX_RMS):
+        return None
+    weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(
-        pose, lines.center, covariance[:6, :6], math.sqrt(square),
-        float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
-        spacing, smear, lines, last.residual, weights)
+        pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
+        degrees, inliers, spacing, smear, lines, last.residual, weights)
 
 
 class _Step(NamedTuple):
@@ -242,61 +389,3 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
 def _robust(squares: Array) -> float:
     """Return the variance of which most of the squares (n,) are, by their median."""
     return 1.4826**2 * median(squares) if len(squares) else 1.0
-
-
-def moved(pose: Transform, center: Array, step: Array) -> Transform:
-    """Return a pose after a step (6,) or more of a point: its translation, and a turn about it."""
-    turn = rotation_vector_to_matrix(step[3:6])
-    return Transform(turn.dot(pose.rotation),
-                     center + step[:3] + turn.dot(pose.translation - center))
-
-
-def marker_corners(side_length: float) -> Array:
-    """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
-    return 0.5 * side_length * np.array(
-        [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-
-
-def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
-    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
-    normalised = camera.undistort(corners)
-    if not np.all(np.isfinite(normalised)):
-        return []
-    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
-    # faces the camera upright is half a turn away from it. So it is given the square as if it
-    # lay in the image, x right and y down, whichever of its corners is on top.
-    quarters = int(np.argmin(normalised.sum(axis=1)))
-    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
-    # Undistorted coordinates and an identity matrix serve every lens model alike.
-    _, rotations, translations, _ = cv2.solvePnPGeneric(
-        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
-        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
-    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
-    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
-            for r, t in zip(rotations, translations)
-            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
-
-
-def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
-           pose: Transform) -> tuple[Transform, Array] | None:
-    """
-    Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
-
-    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
-    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
-    """
-    for _ in range(20):
-        seen = pose.apply(points)
-        pixels, by_point = camera.linearize(seen)
-        residual = (corners - pixels).ravel()
-        middle = pose.apply(center[None])[0]
-        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
-        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
-        step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
-        if step is None or not np.all(np.isfinite(step)):
-            return None
-        if np.max(np.abs(step)) < 1e-7:
-            break
-        pose = moved(pose, middle, step)
-    return pose, jacobian

@@ -34,10 +34,10 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners, refine
+from flock_follower.perception.corners import marker_corners, refine
 from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.measurement import Measurement, PosePrior
-from flock_follower.perception.neighbor_motion import Estimate, POSITION, VELOCITY
+from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
 from flock_follower.perception.time_offset import MountedCamera
 
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
@@ -47,20 +47,18 @@ class View(NamedTuple):
     """
     The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
 
-    ``delay`` is how long after the image's stamp that was by the camera's clock, s.
+    ``rotation`` (3, 3) takes the body to odom.
     """
 
     own: OdometrySample
     rotation: Array
-    """Rotation of the body, to odom, (3, 3)."""
     T_smooth_camera: Transform
-    delay: float = 0.0
 
     @classmethod
-    def of(cls, own: OdometrySample, T_body_camera: Transform, delay: float) -> View:
+    def of(cls, own: OdometrySample, T_body_camera: Transform) -> View:
         """Return the view of a camera mounted at ``T_body_camera``."""
         body = own.smooth_pose
-        return cls(own, body.rotation, body @ T_body_camera, delay)
+        return cls(own, body.rotation, body @ T_body_camera)
 
     @property
     def turning(self) -> Array:
@@ -75,11 +73,10 @@ class View(NamedTuple):
 
     def moving(self, sight: Array) -> Array:
         """Return the change of the measured state, (15,), per s of offset, for a sight (3,), m."""
-        (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
-        a, b, c = self.own.velocity.tolist()
-        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
-        return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
-                         u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        change = np.zeros(15)
+        change[POSITION] = np.cross(self.turning, sight) + self.own.velocity
+        change[ATTITUDE] = self.turning
+        return change
 
     def passing(self, T_camera_body: Transform, reference: Array,
                 estimate: Estimate | None) -> tuple[Array, Array]:
@@ -117,6 +114,18 @@ def reported(estimate: Estimate, stamp: float, own: OdometrySample, attitude: fl
                              covariance=covariance)
 
 
+def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
+    """
+    Return how long after the first row a point (3,) in the optical frame was exposed, s.
+
+    :param readout_time: from the first row to the last, s.
+    """
+    row = float(camera.project(seen[None])[0, 1])
+    # Written so that NaN is the middle.
+    share = row / camera.height if 0.0 <= row <= camera.height else 0.5
+    return readout_time * share
+
+
 def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeighbor,
                  T_camera_body: Transform, reference: Array, velocity: Array,
                  rates: Array) -> Transform:
@@ -145,15 +154,6 @@ def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeigh
 def _faces(T_camera_marker: Transform) -> bool:
     normal = T_camera_marker.rotation[:, 2]
     return float(normal.dot(T_camera_marker.translation)) < 0.0
-
-
-class Sought(NamedTuple):
-    """Names: who may be ``near`` the expected place, and ``anywhere`` in the image."""
-
-    near: Sequence[str]
-    anywhere: Sequence[str]
-    number: int
-    """Number of neighbours to search for."""
 
 
 @dataclass
@@ -187,19 +187,34 @@ class Look:
     """
     An image of a camera: the neighbours expected, those to search for, and those measured.
 
-    ``views`` by the delay of the exposure after the stamp, s; ``expected`` and ``measured`` by
+    ``near`` are the neighbours that may be in the image where they are expected, ``anywhere``
+    those to search for if they are not found there. ``expected`` and ``measured`` are by
     neighbour; ``others`` are measurements of candidates, not of the primary track.
     """
 
     stamp: float
+    exposed: float
+    """When its middle row was exposed, by the camera's clock, s; ``view`` is of that time."""
     camera: MountedCamera
     model: CameraModel
-    sought: Sought
-    views: dict[float, View] = field(default_factory=dict)
+    view: View
+    near: Sequence[str]
+    anywhere: Sequence[str]
     expected: dict[str, PosePrior] = field(default_factory=dict)
     measured: dict[str, Measurement] = field(default_factory=dict)
     others: list[Measurement] = field(default_factory=list)
     sighting: Sighting = field(default_factory=Sighting)
+
+    @property
+    def missing(self) -> list[str]:
+        """Return the neighbours to search for that are not measured yet."""
+        return [name for name in self.anywhere if name not in self.measured]
+
+    def distance(self, measurement: Measurement) -> float:
+        """Return how far a body is from where its neighbour is expected, or from the camera, m."""
+        expected = self.expected[measurement.name].pose
+        place = np.zeros(3) if expected is None else expected.translation
+        return math.dist(measurement.T_camera_body.translation, place)
 
     def known(self, measurement: Measurement, side: float) -> bool:
         """Return whether a body was measured before at the same place, to within ``side``, m."""

@@ -53,7 +53,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-import difflib
 from functools import lru_cache
 import math
 from pathlib import Path
@@ -127,7 +126,7 @@ def correctable_cells(name: str) -> int:
     return int(_dictionary(name).maxCorrectionBits)
 
 
-def draw_marker(dictionary: str, marker_id: int, side_px: int, border_bits: int = 1) -> GrayImage:
+def draw_marker(dictionary: str, marker_id: int, side_px: int) -> GrayImage:
     """
     Return a marker as (side_px, side_px) uint8, without its white quiet zone.
 
@@ -136,13 +135,11 @@ def draw_marker(dictionary: str, marker_id: int, side_px: int, border_bits: int 
     book, size = _dictionary(dictionary), dictionary_size(dictionary)
     if not 0 <= marker_id < size:
         raise ValueError(f'marker_id = {marker_id}: {dictionary} has 0 to {size - 1}')
-    if border_bits < 1:
-        raise ValueError(f'border_bits = {border_bits}: must be at least 1')
-    cells = int(book.markerSize) + 2 * border_bits
+    cells = marker_cells(dictionary)
     if side_px < cells:
         raise ValueError(f'side_px = {side_px}: must be at least {cells}, one per cell')
     draw = _cv_aruco.generateImageMarker if _MODERN else _cv_aruco.drawMarker
-    image: GrayImage = draw(book, marker_id, side_px, borderBits=border_bits)
+    image: GrayImage = draw(book, marker_id, side_px)
     return image
 
 
@@ -284,78 +281,68 @@ def parse(document: Any) -> NeighborConfig:
 
     :raises ValueError: naming the key, its value and the valid range.
     """
-    _check_keys('', document, {'dictionary', 'neighbors'})
-    dictionary = document['dictionary']
-    size = dictionary_size(str(dictionary))
-    entries = document['neighbors']
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(f'neighbors = {entries!r}: must be a list of at least one neighbour')
-    neighbors = tuple(_parse_neighbor(f'neighbors[{i}]', entry, size)
-                      for i, entry in enumerate(entries))
-    names: set[str] = set()
-    ids: set[int] = set()
+    _check_keys('the document', document, {'dictionary', 'neighbors'})
+    dictionary = str(document['dictionary'])
+    ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
+    neighbors = tuple(_parse_neighbor(where, entry, ids)
+                      for where, entry in _entries('neighbors', document['neighbors']))
+    taken: set[object] = set()
     for i, neighbor in enumerate(neighbors):
-        if neighbor.name in names:
-            raise ValueError(
-                f'neighbors[{i}].name = {neighbor.name!r}: another neighbour has it')
-        names.add(neighbor.name)
-        for marker in neighbor.markers:
-            if marker.marker_id in ids:
-                raise ValueError(f'neighbors[{i}].marker_id = {marker.marker_id}: '
-                                 'another marker has it')
-            ids.add(marker.marker_id)
+        for key, value in (('name', neighbor.name),
+                           *(('marker_id', marker.marker_id) for marker in neighbor.markers)):
+            if value in taken:
+                raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique')
+            taken.add(value)
     return NeighborConfig(dictionary, neighbors)
 
 
-def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> MarkedNeighbor:
+def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
     _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
                 {'role', 'radius', 'tag_position'})
-    name = entry['name']
-    if not isinstance(name, str) or not name or name.split() != [name]:
+    name, role, radius = entry['name'], entry.get('role', 'leader'), entry.get('radius', 0.0)
+    if not isinstance(name, str) or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
-    role, radius = entry.get('role', 'leader'), entry.get('radius', 0.0)
     if role not in ROLES:
         raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
     RADII.check(f'{where}.radius', radius)
-    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0, 0.0, 0.0]),
-                      POSITIONS)
-    what = role, float(radius), (x, y, z)
-    if not several:
-        return MarkedNeighbor(name, (_parse_marker(where, entry, dictionary_size),), *what)
-    markers = entry['markers']
-    if not isinstance(markers, list) or not markers:
-        raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
-    for i, marker in enumerate(markers):
-        _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
-    return MarkedNeighbor(name, tuple(
-        _parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
-        for i, marker in enumerate(markers)), *what)
+    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0] * 3), POSITIONS)
+    if several:
+        places = _entries(f'{where}.markers', entry['markers'])
+        for place, marker in places:
+            _check_keys(place, marker, _MARKER_KEYS)
+    else:
+        places = [(where, entry)]
+    markers = tuple(_parse_marker(place, marker, ids) for place, marker in places)
+    return MarkedNeighbor(name, markers, role, float(radius), (x, y, z))
 
 
-def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
-    marker_id = entry['marker_id']
-    Range(0, dictionary_size - 1, whole=True).check(f'{where}.marker_id', marker_id)
-    side = entry['side_length']
-    SIDE_LENGTHS.check(f'{where}.side_length', side)
+def _parse_marker(where: str, entry: Any, ids: Range) -> Marker:
+    ids.check(f'{where}.marker_id', entry['marker_id'])
+    SIDE_LENGTHS.check(f'{where}.side_length', entry['side_length'])
     position = _triple(f'{where}.position', entry['position'], POSITIONS)
     roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], ANGLES)
-    return Marker(marker_id, float(side), Transform.from_quaternion(
+    return Marker(entry['marker_id'], float(entry['side_length']), Transform.from_quaternion(
         position, quaternion_from_rpy(roll, pitch, yaw)))
+
+
+def _entries(where: str, values: Any) -> list[tuple[str, Any]]:
+    """Return the entries of a list, each with its place in the file."""
+    if not isinstance(values, list) or not values:
+        raise ValueError(f'{where} = {values!r}: must be a list of at least one entry')
+    return [(f'{where}[{i}]', value) for i, value in enumerate(values)]
 
 
 def _check_keys(where: str, entry: Any, keys: set[str],
                 optional: Collection[str] = frozenset()) -> None:
-    place = where or 'the document'
     if not isinstance(entry, Mapping):
-        raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
-    for unknown in sorted(str(key) for key in set(entry) - keys - {*optional}):
-        known = sorted({*keys, *optional})
-        near = difflib.get_close_matches(unknown, known, n=1)
-        raise ValueError(f'{place} has an unknown key {unknown}: ' + (
-            f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
+        raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
     for key in sorted(keys - set(entry)):
-        raise ValueError(f'{place} lacks {key}')
+        raise ValueError(f'{where} lacks {key}')
+    unknown = sorted(map(str, set(entry) - keys - {*optional}))
+    if unknown:
+        known = ', '.join(sorted({*keys, *optional}))
+        raise ValueError(f'{where} has an unknown key {unknown[0]}: must be one of {known}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:

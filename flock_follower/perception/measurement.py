@@ -22,14 +22,13 @@ upright.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception.edge_fit import moved
+from flock_follower.perception.edges import moved
 
 #: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
 SIGMA_HISTORY = 0.1
@@ -61,26 +60,23 @@ class Hypothesis(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The likeliest pose; the others with their probabilities; its lead in chi^2."""
+    """The likeliest pose and its lead in chi^2; the other one, if any, and its probability."""
 
     chosen: Hypothesis
-    others: list[tuple[float, Hypothesis]]
     margin: float
+    other: Hypothesis | None = None
+    share: float = 0.0
 
 
 def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
     """Return the likeliest of one or two poses, given their residuals and the prediction."""
-    if len(poses) == 2 and angle(poses[0].pose, poses[1].pose) < SAME:
-        poses = [min(poses, key=lambda p: p.chi2)]
-    if len(poses) == 1:
-        return Choice(poses[0], [], 0.0)  # both in one: soon they may part
-    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
-    best = int(np.argmin(surprise))
-    weights = np.exp(-0.5 * (surprise - surprise[best]))
-    weights /= weights.sum()
-    others = [(float(w), p) for k, (w, p) in enumerate(zip(weights, poses)) if k != best]
-    margin = min(float(s - surprise[best]) for k, s in enumerate(surprise) if k != best)
-    return Choice(poses[best], others, margin)
+    if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME:
+        return Choice(min(poses, key=lambda p: p.chi2), 0.0)  # both in one: soon they may part
+    first, second = (p.chi2 + _surprise(p.pose, expected) for p in poses)
+    chosen, other = poses if first <= second else reversed(poses)
+    margin = abs(second - first)
+    odds = math.exp(-0.5 * margin)
+    return Choice(chosen, margin, other, odds / (1.0 + odds))
 
 
 def _surprise(pose: Transform, expected: PosePrior) -> float:
@@ -130,27 +126,16 @@ class Measurement(NamedTuple):
 
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:
-    """Return a measurement with mean and covariance of all poses, and the margin of the best."""
+    """Return a measurement with mean and covariance of both poses, and the margin of the best."""
     measurement = measurement._replace(margin=best.margin)
-    pose, reference = measurement.T_camera_body, measurement.reference
-    at = pose.apply(reference)
-    mean, square = np.zeros(6), np.zeros((6, 6))
-    for weight, other in best.others:
-        if weight > 1e-6:
-            d = np.concatenate([
-                other.pose.apply(reference) - at,
-                matrix_to_rotation_vector(other.pose.rotation @ pose.rotation.T)])
-            mean += weight * d
-            square += weight * np.outer(d, d)
-    if not mean.any():
+    if best.other is None or not best.share > 1e-6:
         return measurement
+    pose, other = measurement.T_camera_body, best.other.pose
+    at = pose.apply(measurement.reference)
+    apart = np.concatenate([
+        other.apply(measurement.reference) - at,
+        matrix_to_rotation_vector(other.rotation @ pose.rotation.T)])
     return measurement._replace(
-        T_camera_body=moved(pose, at, mean),
-        covariance=measurement.covariance + square - np.outer(mean, mean))
-
-
-def likeliest(several: Sequence[Measurement], expected: Transform | None) -> Measurement:
-    """Return the likeliest measurement of one neighbour: prints and reflections happen."""
-    # A print on the wall behind is farther away.
-    place = np.zeros(3) if expected is None else expected.translation
-    return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))
+        T_camera_body=moved(pose, at, best.share * apart),
+        covariance=measurement.covariance
+        + best.share * (1.0 - best.share) * np.outer(apart, apart))

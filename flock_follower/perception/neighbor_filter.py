@@ -166,17 +166,19 @@ class NeighborFilter:
         other._motion.factors = [max(factor, 1.0) for factor in self._motion.factors]
         return other
 
-    def shift(self, error: Array) -> None:
+    def shift(self, error: Array, later: float = 0.0) -> None:
         """
         Add an error state (15,) that was found elsewhere, and widen the covariance accordingly.
 
-        The motion that was learnt with it is forgotten.
+        The state is then that of ``later``, s, after its stamp. The motion that was learnt with
+        the error is forgotten.
         """
         self._motion = LearntMotion()
         if self.newest is not None:
             covariance = self.newest.covariance + np.outer(error, error)
             covariance[VELOCITY, VELOCITY] += error.dot(error) / SETTLING**2 * np.eye(3)
             self.newest = self.newest.corrected(error, covariance)
+            self.newest = self.newest._replace(stamp=self.newest.stamp + later)
             self._predicted = self._before = None
 
     def _transition(self, dt: float) -> tuple[Array, Array, Array]:

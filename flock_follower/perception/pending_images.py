@@ -15,14 +15,12 @@
 """
 Perception from messages to messages: calibrations, odometry, and the queue of images.
 
-An image is processed as soon as odometry has reached its stamp. It waits a little longer
-than recent images had to, and never longer than ``max_wait``.
+An image is processed as soon as odometry has reached its stamp, or after ``max_wait``.
 """
 
 from __future__ import annotations
 
 from bisect import insort
-from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -42,9 +40,6 @@ from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
-WAITS = 50  # images over which the wait for odometry is watched
-WAITED_LONGER = 1.5  # times the longest wait of late, and
-MARGIN = 0.03  # s more: odometry is late by now
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -88,13 +83,12 @@ class Processed(NamedTuple):
 
 
 class _Calibrated:
-    """The calibration of one camera, and how long its images had to wait."""
+    """The calibration of one camera; without one, its fault."""
 
     def __init__(self) -> None:
         self.model: CameraModel | None = None
         self.fault = 'none came yet'
         self.calibration: tuple[Any, ...] = ()
-        self.waits: deque[float] = deque(maxlen=WAITS)
 
 
 class Perceiver:
@@ -119,19 +113,11 @@ class Perceiver:
     @property
     def overdue(self) -> float | None:
         """Return when a waiting image will not wait any longer, s, or None."""
-        return min((image.received + self._wait(image.camera) for image in self._pending),
-                   default=None)
+        return min((image.received + self._max_wait for image in self._pending), default=None)
 
     def model(self, camera: str = '') -> CameraModel | None:
         """Return the calibration of a camera, where a usable one came."""
         return self._cameras[camera].model
-
-    def _wait(self, camera: str) -> float:
-        """Return how long an image waits for odometry now, s."""
-        waits = self._cameras[camera].waits
-        if len(waits) < WAITS:
-            return self._max_wait
-        return min(self._max_wait, WAITED_LONGER * max(waits) + MARGIN)
 
     def take_camera_info(self, message: Any, camera: str = '') -> bool:
         """
@@ -197,13 +183,11 @@ class Perceiver:
         :param clock: measures the time spent, s.
         :param shown: returns of a camera's name whether its images are decoded in any case.
         """
-        for image in self._pending:
-            if self._ready(image, now):
-                break
-        else:
+        ready = next((each for each in self._pending if self._ready(each, now)), None)
+        if ready is None:
             return None
-        self._pending = [each for each in self._pending if each is not image]
-        image = image._replace(model=self._cameras[image.camera].model)
+        self._pending = [each for each in self._pending if each is not ready]
+        image = ready._replace(model=self._cameras[ready.camera].model)
         sighting, pixels = Sighting(), None
         start = decoded = clock()
         try:
@@ -220,18 +204,11 @@ class Perceiver:
         return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
 
     def _ready(self, image: PendingImage, now: float) -> bool:
-        """Return whether to process an image now; if so, its camera's waits are updated."""
-        camera = self._cameras[image.camera]
-        awaited = camera.model is None or self.tracker.missing(
-            image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
-        waited = now - image.received
-        if not awaited:
-            camera.waits.append(waited)
-        elif waited >= self._wait(image.camera):
-            camera.waits.clear()  # it may be later from now on: wait longer
-        else:
-            return False
-        return True
+        """Return whether to process an image now: it waits for calibration and odometry."""
+        if now - image.received >= self._max_wait:
+            return True
+        return self._cameras[image.camera].model is not None and self.tracker.missing(
+            image.stamp, camera=image.camera) not in (Missing.TOO_NEW, Missing.EMPTY)
 
     def take_range(self, measured: RangeState) -> Rejection | None:
         """Take a range, or return why not; it is used by ``tracker.ranged``."""

@@ -29,8 +29,9 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import EdgeFit, fit, ippe, moved, refit
-from flock_follower.perception.edges import facing
+from flock_follower.perception.corners import ippe
+from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
+from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.measurement import (
@@ -59,9 +60,6 @@ SIGMA_FLOOR = 0.05
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
-#: A pose is accepted if more than this share of the edges agrees, to within this RMS, px.
-MIN_INLIERS = 0.5
-MAX_RMS = 0.4
 #: Of a marker that is not tracked yet, more than this share of the edges must agree.
 FOUND_INLIERS = 0.8
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
@@ -104,7 +102,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         start = _shifted(image, camera, sought, expected.pose)
         found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
         if found is not None:  # from afar it may have settled early
-            found = _good_fit(image, camera, found.lines.model, found.pose, found.spacing) or found
+            found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
     measured = None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
     if found is None or measured is None:
@@ -131,10 +129,10 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
         return _measurement(sought, found, None)
     chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
     if len(found.lines.model.codes) > 1:
-        return _measurement(sought, found, Choice(chosen, [], math.inf))
+        return _measurement(sought, found, Choice(chosen, math.inf))
     best = choose([chosen, *_mirrored(camera, found)], expected)
     if best.chosen.fit is None:
-        again = _good_fit(image, camera, found.lines.model, best.chosen.pose, spacing)
+        again = fit(image, camera, found.lines.model, best.chosen.pose, spacing)
         found = found if again is None else again
     return _measurement(sought, found, best)
 
@@ -152,7 +150,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     fits = [one for start in starts
-            if (one := _good_fit(image, camera, alone, start)) is not None
+            if (one := fit(image, camera, alone, start)) is not None
             and one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
         return _without_edges(image, camera, sought, index, starts, expected)
@@ -162,7 +160,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
         joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
         if joint is not None and len(joint.lines.model.codes) > 1:
-            found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), [], math.inf)
+            found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), math.inf)
     return _measurement(sought, found, best)
 
 
@@ -186,19 +184,19 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if not turned.any():
         return None
     seen = model.only(turned)
-    found = _good_fit(image, camera, seen, start, spacing)
+    found = fit(image, camera, seen, start, spacing)
     shown = None if found is None else _shown(image, found, True)
     if shown is not None and shown.all():
         return found
     if len(seen.codes) == 1:
         return None
     if shown is None:  # one that is covered spoils them all
-        alone = [_good_fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
+        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
                            spacing) for k in range(len(seen.codes))]
         shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return None
-    found = _good_fit(image, camera, seen.only(shown), start, spacing)
+    found = fit(image, camera, seen.only(shown), start, spacing)
     return found if found is not None and _shown(image, found, True).all() else None
 
 
@@ -230,13 +228,6 @@ def _of_smear(sought: Target, index: int, found: SmearFit) -> Measurement:
         found.covariance * WIDENING**2, found.rms, None)
 
 
-def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
-              spacing: tuple[float, float] | None = None) -> EdgeFit | None:
-    found = fit(image, camera, model, start, spacing)
-    good = found is not None and found.inliers > MIN_INLIERS and found.rms < MAX_RMS
-    return found if good else None
-
-
 def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
     """Return which of the fitted markers show their codes, (m,)."""
     lines, codes = found.lines, found.lines.model.codes
@@ -262,10 +253,37 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
         return []
     turn = axis / sine * math.atan2(sine, float(normal @ other))
     start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
-    refitted = refit(camera, found, start)
+    refitted = _refit(camera, found, start)
     if refitted is None or angle(refitted[0], found.pose) < SAME:
         return []
     return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
+
+
+def _refit(camera: CameraModel, fitted: EdgeFit,
+          start: Transform) -> tuple[Transform, float] | None:
+    """
+    Return another pose near ``start`` that fits the edges found already, and its chi^2.
+
+    chi^2 is the weighted sum of their squared residuals. None if no pose fits.
+    """
+    pose = start
+    at = fitted.lines.pixels + fitted.residual[:, None] * fitted.lines.normals
+    for _ in range(2):
+        lines = project(camera, fitted.lines.model, pose)
+        if lines is None:
+            return None
+        offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
+        design = lines.design[:, :6]
+        moment = (design * fitted.weights[:, None]).T
+        step = solve_normal(moment.dot(design), moment.dot(offsets))
+        if step is None or not float(np.abs(step[3:]).max()) < LONGEST_TURN:
+            return None
+        pose = moved(pose, lines.center, step)
+        explained = design.dot(step)
+        if float(np.abs(explained).max()) < ANEW:
+            break
+    residual = offsets - explained
+    return pose, float(fitted.weights.dot(residual * residual))
 
 
 def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measurement:

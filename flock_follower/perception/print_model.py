@@ -26,7 +26,7 @@ with its surrounding cells, in the window in which they agree best with the code
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -262,7 +262,6 @@ _INNER_SPACING = 0.6  # cells
 DERIVATIVES = 9
 
 
-@dataclass(frozen=True, eq=False)
 class EdgeModel:
     """
     The n edge points of all m markers of a neighbour, on its body (FLU), m.
@@ -275,43 +274,27 @@ class EdgeModel:
     (m, 3), its middle and its normal, and ``codes``.
     """
 
-    places: Array
-    tangents: Array
-    axis: Any
-    room: Array
-    marker: Any
-    cell_marker: Any
-    centers: Array
-    facings: Array
-    codes: tuple[CellCode, ...]
-    #: What the two shifts of bloom, px, do along the normals: (n, 2). Normals point from black to
-    #: white, white swells to black.
-    bloom: Array = field(init=False)
-    #: Which edges are across either axis: (2, n).
-    across: Any = field(init=False)
-    #: How many edges are across either axis: (2,).
-    counts: Array = field(init=False)
-    #: An edge of either axis; the narrowest room across either, m.
-    examples: tuple[int, int] = field(init=False)
-    narrowest: tuple[float, float] = field(init=False)
-    #: The mean of the points is this times them: (n,).
-    shares: Array = field(init=False)
-    #: Where the derivatives of each edge begin, of :data:`DERIVATIVES` each.
-    begins: Any = field(init=False)
-    _parts: dict[bytes, EdgeModel] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Derive what depends on the edges' directions."""
-        across = np.array([[0], [1]]) == self.axis
-        derived = {
-            'bloom': -np.eye(2)[self.axis], 'across': across,
-            'counts': across.sum(axis=1).astype(float),
-            'examples': (int(self.axis.argmin()), int(self.axis.argmax())),
-            'narrowest': tuple(float(self.room[one].min(initial=np.inf)) for one in across),
-            'shares': np.full(len(self), 1.0 / max(len(self), 1)),
-            'begins': DERIVATIVES * np.arange(len(self))}
-        for name, value in derived.items():
-            object.__setattr__(self, name, value)
+    def __init__(self, places: Array, tangents: Array, axis: Any, room: Array, marker: Any,
+                 cell_marker: Any, centers: Array, facings: Array,
+                 codes: tuple[CellCode, ...]) -> None:
+        self.places, self.tangents, self.axis, self.room = places, tangents, axis, room
+        self.marker, self.cell_marker = marker, cell_marker
+        self.centers, self.facings, self.codes = centers, facings, codes
+        # Which edges are across either axis, (2, n); how many, (2,); one of each axis.
+        self.across = np.array([[0], [1]]) == axis
+        self.counts = self.across.sum(axis=1).astype(float)
+        self.examples = int(axis.argmin()), int(axis.argmax())
+        # The narrowest room across either, m.
+        first, second = (float(room[one].min(initial=np.inf)) for one in self.across)
+        self.narrowest = first, second
+        # What the two shifts of bloom, px, do along the normals, (n, 2): normals point from black
+        # to white, white swells to black.
+        self.bloom = -np.eye(2)[axis]
+        # The mean of the points is this times them, (n,).
+        self.shares = np.full(len(self), 1.0 / max(len(self), 1))
+        # Where the derivatives of each edge begin, of DERIVATIVES each, (n,).
+        self.begins = DERIVATIVES * np.arange(len(self))
+        self._parts: dict[bytes, EdgeModel] = {}
 
     def __len__(self) -> int:
         """Return the number of edge points."""

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -54,12 +54,8 @@ AHEAD = 0.3
 OLDEST = 0.5
 MOST_WAITING = 100  # ranges: 2 s at 50 Hz, and a bound on memory
 UNKNOWN = 'range of an unknown neighbour'
-NOT_FINITE = 'range not finite'
-NEGATIVE = 'range negative'
-OUTSIDE = 'range outside min_range and max_range'
-REPEATED = 'range stamped as one before, or earlier'
-TOO_OLD = 'range too old'
-TOO_NEW = 'range ahead of the odometry'
+INVALID = 'range outside its limits'
+UNTIMELY = 'range stamp repeated, too old or ahead of the odometry'
 UNPLACED = 'range without odometry'
 Rejection = tuple[str, str]
 
@@ -119,7 +115,8 @@ class Ranging:
     @property
     def biases(self) -> dict[str, RangeBias]:
         """Return the biases of the ranges to each neighbour that has sent ranges."""
-        return {name: series.bias for name, series in self._series.items() if series.began}
+        return {name: series.bias for name, series in self._series.items()
+                if series.newest > -math.inf}
 
     @property
     def waiting(self) -> bool:
@@ -132,37 +129,22 @@ class Ranging:
 
         :param stamp: its stamp, s, by the clock of the odometry.
         """
-        series, distance = self._series.get(measured.name), measured.distance
-        detail = f'{measured.name}, {distance:.3g} m'
+        series, newest = self._series.get(measured.name), self._odometry.newest
         if series is None:
             return UNKNOWN, f'frame_id {measured.name!r}: must be one of {", ".join(self._series)}'
-        if not math.isfinite(distance):
-            return NOT_FINITE, detail
-        if distance < 0.0:
-            return NEGATIVE, detail
-        low, high = measured.limits
-        if low < high and not low <= distance <= high:
-            return OUTSIDE, f'{detail}: [{low:g}, {high:g}] m'
-        newest = self._odometry.newest
+        low, high = measured.limits if measured.limits[0] < measured.limits[1] else (0.0, math.inf)
+        if not (low <= measured.distance <= high and 0.0 <= measured.distance < math.inf):
+            return INVALID, f'{measured.name}, {measured.distance:.3g} m: [{low:g}, {high:g}] m'
         if newest is None:
             return UNPLACED, measured.name
-        if stamp > newest + AHEAD:
-            return TOO_NEW, f'{measured.name}: by {stamp - newest:.2f} s'
-        if stamp < newest - OLDEST:
-            return TOO_OLD, f'{measured.name}: {newest - stamp:.2f} s'
-        if series.newest is not None and stamp <= series.newest:
-            return REPEATED, measured.name
+        if not max(newest - OLDEST, series.newest) < stamp <= newest + AHEAD:
+            return UNTIMELY, f'{measured.name}: {stamp - newest:.2f} s after the odometry'
         series.newest = stamp
         insort(self._waiting, (stamp, measured), key=lambda waiting: waiting[0])
         return None
 
-    def due(self, clock: Callable[[str, float], float]) -> Iterator[Ranged | Rejection]:
-        """
-        Use every range that the odometry has reached; yield what becomes of it.
-
-        :param clock: returns, of a neighbour's name and a stamp of the odometry, s, what the
-            clock of that neighbour's filter shows.
-        """
+    def due(self) -> Iterator[Ranged | Rejection]:
+        """Use every range that the odometry has reached; yield the result."""
         while self._waiting:
             stamp, measured = self._waiting[0]
             own = self._odometry.at(stamp, extrapolate=False)
@@ -174,7 +156,7 @@ class Ranging:
                 continue
             body = own.smooth_pose
             variance = measured.variance or self.params.range_noise ** 2
-            placed = PlacedRange(clock(measured.name, stamp), measured.distance, variance,
+            placed = PlacedRange(stamp, measured.distance, variance,
                              body.apply(self._tag))
             estimate = self._series[measured.name].take(placed, own)
             if estimate is not None:
@@ -190,15 +172,13 @@ class RangeSeries:
 
     def restart(self) -> None:
         self.bias = RangeBias()
-        self.newest: float | None = None
-        self.began = False
+        self.newest = -math.inf  # stamp, s
         self._unused: deque[PlacedRange] = deque(maxlen=MOST_WAITING)
         self._apart: NeighborFilter | None = None
         self._since: float | None = None
 
     def take(self, measured: PlacedRange, own: OdometrySample) -> Estimate | None:
         """Take a range; return the state by the odometry's clock, where it is not in sight."""
-        self.began = True
         seen = self._seen.newest
         if seen is None:
             return None

@@ -33,7 +33,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,

@@ -36,9 +36,9 @@ import numpy as np
 
 from flock_follower.geometry import Array, skew, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import moved
 from flock_follower.perception.edges import (
     cross,
+    moved,
     normal_covariance,
     solve_normal,
     within_reason,

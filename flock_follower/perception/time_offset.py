@@ -40,9 +40,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometryBuffer
-from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.learnt_noise import LearntNoise
-from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_motion import FilterParams
 
 #: Initial standard deviation of an offset, s; largest offset that is applied, s.
@@ -72,8 +70,6 @@ class TimeOffset:
     """
     The offset of the camera's stamps, s: the ``applied`` one and the ``estimate``.
 
-    ``before`` is the offset that was applied until the newest change.
-
     :param offset: initial value, applied from the start.
     :param fixed: whether to keep the initial value.
     """
@@ -84,7 +80,7 @@ class TimeOffset:
 
     def restart(self) -> None:
         """Reset the estimate."""
-        self.applied = self.before = self.estimate = self._first
+        self.applied = self.estimate = self._first
         self.deviation = PRIOR
         """Standard deviation of the estimate, s."""
         self._misfits: Array = np.zeros(len(GRID))
@@ -95,13 +91,10 @@ class TimeOffset:
 
     @property
     def describe(self) -> str:
-        """Return the estimate and how it is used, as text."""
-        if self.fixed:
-            return f'{1e3 * self.applied:.1f} ms, as configured'
-        known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
-        if self._found:
-            return f'{known}, applied'
-        return f'{known}, not applied; {1e3 * self.applied:.1f} ms is applied'
+        """Return the applied offset and the estimate, as text."""
+        known = '' if self.fixed else (
+            f'; estimated {1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms')
+        return f'{1e3 * self.applied:.1f} ms applied{known}'
 
     def take(self, name: str, time: float, camera_point: Array, T_body_camera: Transform,
              odometry: OdometryBuffer) -> float:
@@ -160,9 +153,9 @@ class TimeOffset:
         off = abs(self.estimate - self.applied)
         if not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
             return 0.0
-        self._found = True
-        self.before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
-        return self.applied - self.before
+        before, self._found = self.applied, True
+        self.applied = min(max(self.estimate, -MOST), MOST)
+        return self.applied - before
 
 
 def _precision(times: Array) -> Array:
@@ -175,18 +168,6 @@ def _precision(times: Array) -> Array:
     free = inverse @ start
     precision: Array = inverse - free @ np.linalg.inv(start.T @ free) @ free.T
     return precision
-
-
-def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
-    """
-    Return how long after the first row a point (3,) in the optical frame was exposed, s.
-
-    :param readout_time: from the first row to the last, s.
-    """
-    row = float(camera.project(seen[None])[0, 1])
-    # Written so that NaN is the middle.
-    share = row / camera.height if 0.0 <= row <= camera.height else 0.5
-    return readout_time * share
 
 
 class MountedCamera:
@@ -214,28 +195,11 @@ class MountedCamera:
         """Reset all estimates and searches, for neighbours of these names."""
         self.noise.restart()
         self.time_offset.restart()
-        self.searched: float | None = None
-        """Stamp of the newest whole image searched, s."""
-        self.swept: float | None = None
-        """Stamp of the newest whole image searched although no neighbour was missing, s."""
-        self.wanting: float | None = None
-        """Stamp of the newest image in which a neighbour was missing, s."""
+        self.searched = self.swept = -math.inf
+        """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
         self.thorough = False
         """Whether the next search of a whole image is thorough."""
         self.unchecked = dict.fromkeys(names, 0)
         """Number of images for which a neighbour's mirrored attitude need not be checked."""
         self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
-        self.delays = dict.fromkeys(names, 0.5 * self.readout_time)
-        """How long after an image's stamp a neighbour is exposed, s."""
-        self.measured: dict[str, float] = {}
-        """When it last saw a neighbour, by the clock of that neighbour's filter, s."""
-        self.vain: dict[str, float] = {}
-        """Stamp of the newest image without a neighbour that another camera sees, s."""
-
-    def exposed(self, model: CameraModel, measurement: Measurement) -> float:
-        """Return how long after the image's stamp a neighbour was exposed, s, and remember it."""
-        if self.readout_time:
-            self.delays[measurement.name] = row_delay(
-                model, self.readout_time,
-                measurement.T_camera_body.apply(measurement.reference))
-        return self.delays[measurement.name]
+        """That of the brightness profiles of each neighbour's last measurement, px."""

@@ -23,17 +23,20 @@ roi      a neighbour not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, at a limited rate
 =======  ==========================================================================
 
-Once a second the whole image is searched even if no neighbour is missing: see ``hypotheses``.
+Once a second the whole image is searched even if none is missing: see ``hypotheses``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import (
+    Array,
     quaternion_from_rpy,
     quaternion_to_matrix,
     R_FLU_OPTICAL,
@@ -42,12 +45,12 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.camera_schedule import CameraSchedule
-from flock_follower.perception.hypotheses import Hypotheses
+from flock_follower.perception.camera_schedule import CameraSchedule, Sought
+from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.look import Look, reported, Sighting, straightened, View
+from flock_follower.perception.look import Look, reported, row_delay, Sighting, straightened, View
 from flock_follower.perception.markers import Detections, NeighborConfig
-from flock_follower.perception.measurement import likeliest, Measurement
+from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -57,7 +60,7 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
-from flock_follower.perception.time_offset import MountedCamera, TimeOffset
+from flock_follower.perception.time_offset import MountedCamera
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
 #: and otherwise in one of so many.
@@ -76,36 +79,47 @@ def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
     return Transform(link @ R_FLU_OPTICAL, np.asarray(position, dtype=float))
 
 
+class _Placed(NamedTuple):
+    """
+    A measurement in the smooth frame of ``OdometryBuffer``, with the view at its exposure.
+
+    The exposure was at ``exposed`` by the camera's clock, and at ``time`` by the filter's, s;
+    ``covariance`` (6, 6) is as ``NeighborFilter.update`` takes it.
+    """
+
+    view: View
+    exposed: float
+    time: float
+    T_smooth_body: Transform
+    covariance: Array
+
+
 class Tracker:
     """
     The neighbours of one drone, seen by one camera or several.
 
     The tracker needs every odometry message, and each image once :meth:`missing` returns None for
-    its stamp. Cameras have names; a single camera has the name ''.
+    its stamp. Cameras have names; a single camera has the name ''. All times of filters are by the
+    odometry's clock.
 
-    :param cameras: of one its place on the body (optical), of several each by its name.
-    :param time_offset: of one: finds out by how much the images' stamps are off.
-    :param readout_time: of one: from an image's first row to its last, s; the stamp is that of
-        the first.
+    :param cameras: by name; of a single one its place on the body (optical) is enough.
     """
 
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
-                 time_offset: TimeOffset | None = None, readout_time: float = 0.0,
                  ranging_params: RangingParams | None = None) -> None:
         self.config = config
-        self.filter_params = filter_params or FilterParams()
+        params = filter_params or FilterParams()
         if isinstance(cameras, Transform):
-            cameras = {'': MountedCamera(cameras, time_offset, readout_time,
-                                         self.filter_params.attitude_noise)}
+            cameras = {'': MountedCamera(cameras, attitude_noise=params.attitude_noise)}
         self.cameras = dict(cameras)
         self._odometry = OdometryBuffer()
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._side = {n.name: max(m.side_length for m in n.markers) for n in config.neighbors}
-        self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
+        self._hypotheses = {n.name: Hypotheses(params) for n in config.neighbors}
         self._filters = {name: each.primary for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
-        self._schedule = CameraSchedule(config.neighbors, list(self.cameras.values()))
+        self._schedule = CameraSchedule(config.neighbors, len(self.cameras))
         self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
 
@@ -121,7 +135,6 @@ class Tracker:
             camera.restart(self._targets)
         self._schedule.restart()
         self.ranging.restart()
-        self._planned: Look | Missing | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take the own state; return whether time jumped back and everything restarted."""
@@ -136,14 +149,13 @@ class Tracker:
 
     def ranged(self) -> Iterator[Ranged | Rejection]:
         """Yield the result of each range that odometry has reached."""
-        return self.ranging.due(self._schedule.by_odometry)
+        return self.ranging.due()
 
-    def missing(self, stamp: float, extrapolate: bool = False,
-                camera: str = '') -> Missing | None:
-        """Return why an image of this stamp, s, cannot be processed (yet), or None."""
+    def missing(self, stamp: float, camera: str = '') -> Missing | None:
+        """Return why an image of this stamp, s, cannot be processed yet, or None."""
         source = self.cameras[camera]
         last = stamp + source.time_offset.applied + source.readout_time
-        return self._odometry.missing(last, extrapolate)
+        return self._odometry.missing(last, extrapolate=False)
 
     def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
         """
@@ -151,12 +163,11 @@ class Tracker:
 
         With one camera always; with several cameras, only if a neighbour may be in the image.
         """
-        if len(self.cameras) == 1:
-            return True
-        look = self._planned = self._plan(stamp, model, camera)
-        return isinstance(look, Missing) or bool(look.sought.near) or (
-            bool(look.sought.anywhere) and self._schedule.search_due(look.camera, stamp)
-        ) or self._schedule.sweep_due(look.camera, stamp)
+        source = self.cameras[camera]
+        sought = self._sought(stamp, model, source)
+        return isinstance(sought, Missing) or bool(sought.near) or (
+            bool(sought.anywhere) and self._schedule.search_due(source, stamp)
+        ) or self._schedule.sweep_due(source, stamp)
 
     def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
                       camera: str = '') -> Sighting:
@@ -167,153 +178,126 @@ class Tracker:
         """
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
-        look, self._planned = self._planned, None
-        if not isinstance(look, Look) or (look.stamp, look.model, look.camera) != (
-                stamp, model, self.cameras[camera]):
-            look = self._plan(stamp, model, camera)
+        look = self._look(stamp, model, self.cameras[camera])
         if isinstance(look, Missing):
             return Sighting(rejections=[(look.value, '')])
         model.check_image(image.shape[1], image.shape[0])
-        self._track(image, look)
         look.sighting.stage = 'track'
-        if len(look.measured) < look.sought.number:
-            self._detect(image, look)
+        for name in look.near:
+            self._measure(look, name, track(
+                image, model, self._targets[name], look.expected[name],
+                look.camera.spacings[name], look.camera.unchecked[name] == 0))
+        for name, expected in self._candidates(look):
+            found = track(image, model, self._targets[name], expected, None, True)
+            if found is not None and not look.known(found, self._side[name]):
+                look.others.append(found)
+        self._detect(image, look)
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))
-        for name, measurement in look.measured.items():
-            look.camera.spacings[name] = measurement.spacing
-            self._update(look, measurement)
-        for measurement in look.others:
-            self._update(look, measurement, other=True)
+        for measurement in (*look.measured.values(), *look.others):
+            placed = self._placed(look, measurement)
+            if placed is not None:
+                name = measurement.name
+                self._report(look, measurement, placed, self._hypotheses[name].take(
+                    placed.time, placed.T_smooth_body, measurement.reference, placed.covariance,
+                    name in look.sighting.estimates))
         return look.sighting
 
-    def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
+    def _sought(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Sought | Missing:
+        """Return the neighbours to look for in an image, or why that is not known."""
+        if len(self.cameras) == 1:
+            return Sought([*self._filters], [*self._filters])
+        time = stamp + camera.time_offset.applied
+        own = self._odometry.at(time)
+        if isinstance(own, Missing):
+            return own
+        T_camera_odom = (own.smooth_pose @ camera.T_body_camera).inverse()
+        return self._schedule.sought(camera, time, model, T_camera_odom, self._filters)
+
+    def _look(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Look | Missing:
         """Return the expected content of an image, or why nothing is known."""
-        camera, sought = self.cameras[name], self._schedule.everybody
-        times = {name: self._schedule.time(name, camera, stamp + delay)
-                 for name, delay in camera.delays.items()}
-        if self._schedule.shared:
-            missing = self._odometry.missing(stamp + camera.time_offset.applied)
-            if missing is not None:
-                return missing
-            sought = self._schedule.sought(
-                camera, stamp, model, times,
-                lambda name: self._place(name, times[name], stamp, camera))
-        look = Look(stamp, camera, model, sought)
-        for name, delay in camera.delays.items():
-            if name in sought.near or name in sought.anywhere:
-                view = self._view(look, delay)
-                if isinstance(view, Missing):
-                    return view
-                look.expected[name] = view.prior(self._filters[name].predict(times[name]))
+        sought = self._sought(stamp, model, camera)
+        if isinstance(sought, Missing):
+            return sought
+        exposed = stamp + 0.5 * camera.readout_time
+        view = self._view(camera, exposed)
+        if isinstance(view, Missing):
+            return view
+        look = Look(stamp, exposed, camera, model, view, *sought)
+        for name in {*look.near, *look.anywhere}:
+            expected = self._filters[name].predict(self._time(name, camera, exposed))
+            look.expected[name] = view.prior(expected)
         return look
 
-    def _place(self, name: str, time: float, stamp: float,
-               camera: MountedCamera) -> Transform | None:
-        """Return about where a neighbour is in an image, ``T_camera_body``, if that is known."""
-        body = self._filters[name].place(time)
-        own = self._odometry.at(stamp + camera.time_offset.applied)
-        if body is None or isinstance(own, Missing):
-            return None
-        return (own.smooth_pose @ camera.T_body_camera).inverse() @ body
-
-    def _view(self, look: Look, delay: float) -> View | Missing:
-        """Return the view of an image's camera at a delay, s, after the image's stamp."""
-        if delay not in look.views:
-            own = self._odometry.at(look.stamp + look.camera.time_offset.applied + delay)
-            if isinstance(own, Missing):
-                return own
-            look.views[delay] = View.of(
-                self._odometry.steadied(own), look.camera.T_body_camera, delay)
-        return look.views[delay]
-
-    def _estimate(self, name: str, track_filter: NeighborFilter, look: Look,
-                  view: View) -> Estimate:
-        """Return the state of a track at the image's stamp, by the odometry's clock, in odom."""
-        stamp = look.stamp
-        estimate = track_filter.near(self._schedule.by_odometry(name, stamp))
-        assert estimate is not None, 'it was just taken in'
-        exposed = look.camera.time_offset.applied + view.delay
-        own = self._odometry.at(stamp) if exposed else view.own
+    def _view(self, camera: MountedCamera, exposed: float) -> View | Missing:
+        """Return the view of a camera at a time by its clock, s."""
+        own = self._odometry.at(exposed + camera.time_offset.applied)
         if isinstance(own, Missing):
-            own = view.own
-        return reported(estimate, stamp, own, *self._odometry.white_noise)
+            return own
+        return View.of(self._odometry.steadied(own), camera.T_body_camera)
 
-    def _track(self, image: GrayImage, look: Look) -> None:
-        """Measure the neighbours, and the other candidates, by their edges."""
-        camera = look.camera
-        for name in look.sought.near:
-            check = camera.unchecked[name] == 0
-            measurement = track(image, look.model, self._targets[name], look.expected[name],
-                                camera.spacings[name], check)
-            if measurement is None:
-                continue
-            if self._of_candidate(look, measurement):
-                look.others.append(measurement)
-                continue
-            look.measured[name] = measurement
-            if not check:
-                camera.unchecked[name] -= 1
-            elif measurement.margin is not None and measurement.margin > MARGIN:
-                camera.unchecked[name] = MIRRORED_EVERY - 1
+    def _time(self, name: str, camera: MountedCamera, exposed: float) -> float:
+        """Return the time of a neighbour's filter, s, of an exposure by the camera's clock, s."""
+        return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
+
+    def _measure(self, look: Look, name: str, found: Measurement | None) -> None:
+        """Take the measurement of a neighbour near its expected place, if it was found there."""
+        if found is None:
+            return
+        if self._of_candidate(look, found):
+            look.others.append(found)
+            return
+        look.measured[name] = found
+        unchecked = look.camera.unchecked
+        if unchecked[name]:
+            unchecked[name] -= 1
+        elif found.margin is not None and found.margin > MARGIN:
+            unchecked[name] = MIRRORED_EVERY - 1
+
+    def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
+        """Yield the name and the expected pose of each candidate in view."""
         for name, hypotheses in self._hypotheses.items():
             for candidate in hypotheses.candidates:
-                delay = camera.delays[name]
-                view = self._view(look, delay)
-                if isinstance(view, Missing):
-                    continue
-                expected = view.prior(candidate.track.predict(
-                    self._schedule.time(name, camera, look.stamp + delay)))
-                if self._schedule.in_view(name, look.model, expected.pose):
-                    measurement = track(image, look.model, self._targets[name], expected, None,
-                                        True)
-                    if measurement is not None and not look.known(measurement, self._side[name]):
-                        look.others.append(measurement)
+                expected = look.view.prior(candidate.track.predict(
+                    self._time(name, look.camera, look.exposed)))
+                if expected.pose is not None and self._schedule.in_view(
+                        name, look.model, expected.pose):
+                    yield name, expected
 
     def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
         """Return whether a measurement is of a candidate, not of the primary track."""
-        name, camera = measurement.name, look.camera
-        if not self._hypotheses[name].candidates:
-            return False
-        place = look.views[camera.delays[name]].T_smooth_camera @ measurement.T_camera_body
+        name, place = measurement.name, look.view.T_smooth_camera @ measurement.T_camera_body
         return self._hypotheses[name].candidate_at(
-            self._schedule.time(name, camera, look.stamp + camera.delays[name]),
-            place.translation) is not None
+            self._time(name, look.camera, look.exposed), place.translation) is not None
 
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbours that are not measured yet."""
-        (near, anywhere, _), camera = look.sought, look.camera
-
-        def missing() -> list[str]:
-            return [name for name in anywhere if name not in look.measured]
-
+        camera, dictionary = look.camera, self.config.dictionary
         for thorough in (False, True):
-            for name in [n for n in near if n not in look.measured and (
-                    not thorough or n in anywhere)]:
+            for name in [n for n in look.near if n not in look.measured and (
+                    not thorough or n in look.anywhere)]:
                 pose = look.expected[name].pose
                 if pose is not None:
-                    found = search.near(image, look.model, self.config.dictionary,
-                                        self._targets[name].neighbor, pose, thorough)
                     look.sighting.stage = 'roi'
-                    self._locate(found, 'roi', image, look)
-        if missing() and self._schedule.search_due(camera, look.stamp):
-            # The first time both ways: quickly, and if need be thoroughly; then they take turns.
-            ways = (False, True) if camera.searched is None else (camera.thorough,)
-            for thorough in ways:
-                if missing():
-                    found = search.everywhere(image, self.config.dictionary, [
-                        m for name in missing() for m in self._targets[name].neighbor.markers
-                    ] if thorough else None)
-                    self._locate(found, 'full', image, look)
-                    camera.thorough = not thorough
-            look.sighting.stage, camera.searched = 'full', look.stamp
-        camera.vain.update((name, look.stamp) for name in near if name not in look.measured)
+                    self._locate(search.near(image, look.model, dictionary,
+                                             self._targets[name].neighbor, pose, thorough),
+                                 'roi', image, look)
+        if not look.missing or not self._schedule.search_due(camera, look.stamp):
+            return
+        # The first time both ways: quickly, and if need be thoroughly; then they take turns.
+        for thorough in (False, True) if camera.searched == -math.inf else (camera.thorough,):
+            if look.missing:
+                markers = [m for n in look.missing for m in self._targets[n].neighbor.markers]
+                self._locate(search.everywhere(image, dictionary, markers if thorough else None),
+                             'full', image, look)
+                camera.thorough = not thorough
+        look.sighting.stage, camera.searched = 'full', look.stamp
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look) -> None:
         """Turn detections that are not measured yet into measurements."""
-        candidates: dict[str, list[Measurement]] = {}
+        located = []
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
             if marker_id not in self._by_marker:
                 look.sighting.other_ids.append(marker_id)
@@ -327,68 +311,80 @@ class Tracker:
             if measurement is None:
                 look.sighting.rejections.append(
                     ('no pose suits the marker', f'{name}, {marker_id}'))
-            elif not look.known(measurement, self._side[name]):
-                measurement = measurement._replace(stage=stage)
-                if self._of_candidate(look, measurement):
-                    look.others.append(measurement)
-                else:
-                    candidates.setdefault(name, []).append(measurement)
-        for name, several in candidates.items():
-            if name not in look.measured:
-                look.measured[name] = likeliest(several, look.expected[name].pose)
+            else:
+                located.append(measurement._replace(stage=stage))
+        for each in sorted(located, key=look.distance):
+            name = each.name
+            if look.known(each, self._side[name]):
+                continue
+            if name in look.measured or self._of_candidate(look, each):
+                look.others.append(each)
+            else:
+                look.measured[name] = each
                 look.camera.unchecked[name] = 0
-            for each in several:
-                if not look.known(each, self._side[name]):
-                    look.others.append(each)
 
-    def _update(self, look: Look, measurement: Measurement, other: bool = False) -> None:
-        """
-        Update a neighbour's track with a measurement, and add the estimate to the sighting.
-
-        :param other: whether it is of a candidate, not of the primary track.
-        """
-        name, camera, sighting = measurement.name, look.camera, look.sighting
-        delay = camera.exposed(look.model, measurement)
-        view = self._view(look, delay)
-        if isinstance(view, Missing):
-            return
-        time = self._schedule.time(name, camera, look.stamp + delay)
-        T_camera_body, reference = measurement.T_camera_body, measurement.reference
+    def _placed(self, look: Look, measurement: Measurement) -> _Placed | None:
+        """Return a measurement in the smooth frame; None without odometry of its exposure."""
+        camera, name = look.camera, measurement.name
+        pose, reference = measurement.T_camera_body, measurement.reference
+        view: View | Missing = look.view
+        exposed = look.stamp
         if camera.readout_time:
-            T_camera_body = straightened(
-                look.model, camera.readout_time, self._targets[name].neighbor, T_camera_body,
-                reference,
-                *view.passing(T_camera_body, reference, self._filters[name].predict(time)))
-        T_smooth_body = view.T_smooth_camera @ T_camera_body
+            exposed += row_delay(look.model, camera.readout_time, pose.apply(reference))
+            view = self._view(camera, exposed)
+        if isinstance(view, Missing):
+            return None
+        time = self._time(name, camera, exposed)
+        if camera.readout_time:
+            pose = straightened(
+                look.model, camera.readout_time, self._targets[name].neighbor, pose, reference,
+                *view.passing(pose, reference, self._filters[name].predict(time)))
+        T_smooth_body = view.T_smooth_camera @ pose
         turn, (place, attitude) = np.zeros((6, 6)), camera.noise.scales
         turn[:3, :3] = place * view.T_smooth_camera.rotation
         turn[3:, 3:] = attitude * view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
         covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
-        outcome, candidate = self._hypotheses[name].take(
-            time, T_smooth_body, reference, covariance, other and name in sighting.estimates)
+        return _Placed(view, exposed, time, T_smooth_body, covariance)
+
+    def _report(self, look: Look, measurement: Measurement, placed: _Placed, taken: Taken) -> None:
+        """Add the outcome of a measurement to the sighting, and learn from it."""
+        name, camera, sighting = measurement.name, look.camera, look.sighting
+        outcome, candidate = taken
+        other = look.measured.get(name) is not measurement
         refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)
         if not other and (refused or outcome is UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
-        if refused or (other and outcome is not UpdateOutcome.STARTED):
+        if refused:
             if candidate is not None and candidate.confirmed:
                 sighting.duplicates[candidate.name(name)] = self._estimate(
-                    name, candidate.track, look, view)
+                    candidate.track, look, placed)
             return
-        self._schedule.saw(name, camera, time)
+        self._schedule.saw(name, camera, placed.time)
+        camera.spacings[name] = measurement.spacing
         if not other:
-            self._learn(name, camera, view, look.stamp + delay, measurement)
+            self._learn(camera, measurement, placed)
         sighting.measurements[name] = measurement
-        sighting.estimates[name] = self._estimate(name, self._filters[name], look, view)
+        sighting.estimates[name] = self._estimate(self._filters[name], look, placed)
 
-    def _learn(self, name: str, camera: MountedCamera, view: View, time: float,
-               measurement: Measurement) -> None:
-        """Learn clock and noise from a neighbour's update with a measurement at a time, s."""
+    def _estimate(self, track_filter: NeighborFilter, look: Look, placed: _Placed) -> Estimate:
+        """Return the state of a track at the image's stamp, in odom."""
+        estimate, own = track_filter.near(look.stamp), placed.view.own
+        assert estimate is not None, 'it was just taken in'
+        if look.camera.time_offset.applied or placed.exposed != look.stamp:
+            stamped = self._odometry.at(look.stamp)
+            own = own if isinstance(stamped, Missing) else stamped
+        return reported(estimate, look.stamp, own, *self._odometry.white_noise)
+
+    def _learn(self, camera: MountedCamera, measurement: Measurement, placed: _Placed) -> None:
+        """Learn clock and noise from a neighbour's update with a measurement."""
+        name, view = measurement.name, placed.view
         change, estimate = self._filters[name].change, self._filters[name].newest
         if change is not None and estimate is not None:
             camera.noise.take(*change, estimate.position - view.own.travel)
         point = measurement.T_camera_body.apply(measurement.reference)
-        shift = camera.time_offset.take(name, time, point, camera.T_body_camera, self._odometry)
+        shift = camera.time_offset.take(
+            name, placed.exposed, point, camera.T_body_camera, self._odometry)
         if not shift:
             return
         camera.noise.restart()
@@ -396,5 +392,5 @@ class Tracker:
             if self._schedule.seen_last_by(other, camera):
                 for each in hypotheses.tracks:
                     if each.newest is not None:
-                        each.shift(shift * view.moving(each.newest.position - view.own.travel))
-        self._schedule.changed(camera)
+                        sight = each.newest.position - view.own.travel
+                        each.shift(shift * view.moving(sight), shift)

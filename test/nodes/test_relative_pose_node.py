@@ -304,9 +304,9 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
     r.range(1.0, 0.1, min_range=0.3, max_range=50.0)
     r.odom(1.1, velocity=np.full(3, np.nan))
     assert r.counters == {
-        'range without odometry': 1, 'range of an unknown neighbour': 1, 'range not finite': 1,
-        'range outside min_range and max_range': 1, 'invalid odom': 1,
-        'range stamped as one before, or earlier': 1}
+        'range without odometry': 1, 'range of an unknown neighbour': 1,
+        'range outside its limits': 2, 'invalid odom': 1,
+        'range stamp repeated, too old or ahead of the odometry': 1}
     assert not r.found
 
 
@@ -359,7 +359,7 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
     assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
     assert 'no image of camera front processed' not in reported
     assert r.values['camera front'] == '640x480 plumb_bob' and 'camera left' not in r.values
-    assert r.values['time_offset front'].startswith('0.0 +- ') and 'time_offset left' in r.values
+    assert {'time_offset front', 'time_offset left'} <= r.values.keys()
     r.give('left/camera_info', calibration())
     r.odom(0.2)
     r.image(0.2, view(leader=AHEAD @ Transform(translation=np.array([0.0, 1.5, 0.0])),

@@ -48,18 +48,13 @@ def covariance(attitude: float, distance: float) -> Array:
     return (2.0 * attitude)**2 * across + (2.0 * distance)**2 * np.outer(ALONG, ALONG)
 
 
-@pytest.mark.parametrize('attitude', [0.002, 0.005, 0.02])
-def test_the_own_attitudes_noise_is_learnt_across_the_line_of_sight(attitude: float) -> None:
-    learnt = fed(attitude, 0.0)
-    assert learnt.attitude == pytest.approx(attitude, rel=0.25)
-    assert learnt.distance < 0.0005
-
-
-@pytest.mark.parametrize('share', [0.004, 0.02])
-def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
-    learnt = fed(0.0, share)
-    assert learnt.distance == pytest.approx(share, rel=0.35)
-    assert learnt.attitude < 0.0007
+@pytest.mark.parametrize(('attitude', 'distance'), [
+    (0.002, 0.0), (0.02, 0.0), (0.0, 0.004), (0.0, 0.02)])
+def test_noise_is_learnt_of_the_attitude_across_the_line_of_sight_and_of_the_distance_along_it(
+        attitude: float, distance: float) -> None:
+    learnt = fed(attitude, distance)
+    assert learnt.attitude == pytest.approx(attitude, rel=0.25, abs=0.0007)
+    assert learnt.distance == pytest.approx(distance, rel=0.35, abs=0.0005)
 
 
 @pytest.mark.parametrize(('white', 'shares'), [

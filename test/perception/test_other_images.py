@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from marker_images import DICTIONARY, Hovering, SIDE, TAIL
 import numpy as np
 import pytest
 from warped_marker import Sensor, Shade, WarpedMarker
@@ -28,18 +29,12 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import parse
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
+from flock_follower.perception.tracker import camera_mounting, Sighting
 
 pytestmark = pytest.mark.slow
-SIDE = 0.16
 IMAGES, FIRST = 40, 5  # of a flight, and how many of them are as clear as can be
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
-
 Show = Callable[[int, Transform, WarpedMarker], GrayImage]
 
 
@@ -56,18 +51,13 @@ class Flight:
     """What a hovering follower sees of the leader, image by image, after a few clear ones."""
 
     def __init__(self, show: Show, seed: int) -> None:
-        tracker = Tracker(parse({'dictionary': 'DICT_4X4_50', 'neighbors': [{
-            'name': 'leader', 'marker_id': 0, 'side_length': SIDE, 'position': [-0.2, 0.0, 0.0],
-            'rpy': [np.pi / 2, 0.0, -np.pi / 2]}]}), camera_mounting([0.1, 0.0, 0.0], [0.0] * 3))
-        world = WarpedMarker('DICT_4X4_50', 0, SIDE, seed=seed)
+        world = WarpedMarker(DICTIONARY, 0, SIDE, seed=seed)
+        drone = Hovering(world.camera, camera_mounting([0.1, 0.0, 0.0], [0.0] * 3))
         self.sightings: list[Sighting] = []
         self.measured: list[tuple[Measurement, Transform]] = []
         for k in range(IMAGES):
-            pose, stamp = course(k, seed), (k + 1) / 30.0
-            image = (world.image([pose], k) if k < FIRST else show(k, pose, world))
-            tracker.feed_odometry(OdometrySample(
-                stamp, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)))
-            sighting = tracker.process_image(stamp, image, world.camera)
+            pose = course(k, seed)
+            sighting = drone.see(world.image([pose], k) if k < FIRST else show(k, pose, world))
             if k >= FIRST:
                 self.sightings.append(sighting)
                 self.measured += [(m, pose @ TAIL.inverse())

@@ -27,39 +27,26 @@ from flock_follower.perception.range_gate import (
     UNKNOWN_BIAS,
 )
 
-
-def judged(gate: RangeGate, *deviations: float) -> list[bool]:
-    return [gate.judge(d, 1.0).used for d in deviations]
-
-
-def test_one_too_long_is_refused_until_several_in_a_row_are() -> None:
-    gate = RangeGate(most=4)
-    assert judged(gate, 5.0, 5.0, 0.0, 5.0, 5.0, 5.0) == [False, False, True, False, False, False]
-    verdict = gate.judge(5.0, 1.0)
-    assert verdict.used
-    assert verdict.prior == pytest.approx(25.0 / RANGE_GATE)  # the prediction was wrong
-    assert verdict.spread == 1.0
-    assert judged(gate, 5.0, 0.0, 5.0) == [True, True, False]
+WILD = -1.01 * np.sqrt(RANGE_WILD * RANGE_GATE)
+AGAIN = 25.0 / RANGE_GATE  # factor for a deviation of 5
 
 
-def test_one_too_short_is_used_with_care_and_the_next_is_believed() -> None:
-    gate = RangeGate()
-    first, second = gate.judge(-5.0, 1.0), gate.judge(-5.0, 1.0)
-    assert first.used and second.used
-    assert first.prior == second.spread == 1.0
-    assert first.spread == second.prior == pytest.approx(25.0 / RANGE_GATE)
-
-
-def test_what_is_wildly_too_short_is_refused_at_first() -> None:
-    gate, wild = RangeGate(most=3), -1.01 * np.sqrt(RANGE_WILD * RANGE_GATE)
-    assert judged(gate, wild, wild, wild) == [False, False, True]
-
-
-@pytest.mark.parametrize('odd', [float('nan'), float('inf'), -float('inf')])
-def test_what_is_no_number_is_never_used_and_harms_nothing(odd: float) -> None:
-    gate = RangeGate(most=2)
-    assert judged(gate, odd, odd, odd, odd) == [False] * 4
-    assert judged(gate, 0.0, 1.0) == [True, True]
+@pytest.mark.parametrize(('most', 'deviations', 'factors'), [
+    # One too long is refused until several in a row are; then the prediction was wrong.
+    (4, [5.0, 5.0, 0.0, 5.0, 5.0, 5.0, 5.0], [None, None, (1, 1), None, None, None, (AGAIN, 1)]),
+    # One too short is used with care, and the next one is believed.
+    (6, [-5.0, -5.0], [(1, AGAIN), (AGAIN, 1)]),
+    (3, [WILD, WILD, WILD], [None, None, (1.01**2 * RANGE_WILD, 1)]),
+    (2, [np.nan, np.inf, -np.inf, 0.0, 1.0], [None, None, None, (1, 1), (1, 1)])])
+def test_distances_outside_the_gate_are_refused_or_have_less_weight(
+        most: int, deviations: list[float],
+        factors: list[tuple[float, float] | None]) -> None:
+    gate = RangeGate(most)
+    for deviation, expected in zip(deviations, factors):
+        verdict = gate.judge(deviation, 1.0)
+        assert verdict.used == (expected is not None)
+        if expected is not None:
+            assert (verdict.prior, verdict.spread) == pytest.approx(expected)
 
 
 def learnt(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05) -> RangeBias:

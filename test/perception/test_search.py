@@ -24,7 +24,7 @@ import pytest
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import MarkedNeighbor, Marker
 
@@ -40,24 +40,6 @@ def corners_of(camera: CameraModel, pose: Transform) -> Array:
 @pytest.fixture(scope='module')
 def image() -> GrayImage:
     return render(CAMERA, {3: HERE, 4: facing((-0.5, 0.3, 2.2), (0.1, 0.3, 0.05))})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('thorough', [False, True])
-@pytest.mark.parametrize('distance', [0.35, 0.7, 1.5, 2.0, 3.0, 4.0])
-def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,
-                                                               thorough: bool) -> None:
-    # From 280 px a side, which is searched at a fifth, to 24 px, at twice its size.
-    pose = facing((0.1 * distance, -0.08 * distance, distance), (0.1, 0.3, 0.2))
-    expected = facing((0.1 * distance + 0.04, -0.08 * distance, 1.1 * distance), (0.0, 0.2, 0.3))
-    found = search.near(render(CAMERA, {3: pose}, rays=3), CAMERA, DICTIONARY, LEADER, expected,
-                        thorough)
-    assert found.ids.tolist() == [3]
-    errors = found.corners[0] - corners_of(CAMERA, pose)
-    pixel = max(610.0 * SIDE / distance / search.SIDE, 1.0)  # of the image that was searched
-    assert np.abs(errors).max() < (1.5 * pixel if thorough else pixel)
-    # A half pixel lost in scaling would be half of those, less half a pixel.
-    assert np.abs(errors.mean(axis=0)).max() < 0.15 + (0.3 if thorough else 0.2) * pixel
 
 
 @pytest.mark.parametrize('thorough', [False, True])

@@ -17,9 +17,9 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
-from marker_images import DICTIONARY, make_camera, render, SIDE
+from marker_images import CONFIG, make_camera, render, SIDE, TAIL
 import numpy as np
 import pytest
 
@@ -32,35 +32,36 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
-from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.time_offset import MountedCamera, TimeOffset
+from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
 MODEL = make_camera()
 #: Each sees 55 degrees: 15 of them are in both images.
 FRONT = camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0])
 LEFT = camera_mounting([0.05, 0.08, 0.0], [0.0, 0.0, np.radians(40.0)])
 BACK = camera_mounting([-0.10, 0.0, 0.0], [0.0, 0.0, np.pi])
 EMPTY = render(MODEL, {})
-FLYING = np.array([0.3, -0.1, 0.05])  # m/s
+PLACE, FLYING = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.1, 0.05])  # m, m/s
 
 
 def body(stamp: float) -> Transform:
-    return Transform(np.eye(3), np.array([1.0, 2.0, 3.0]) + stamp * FLYING)
+    return Transform(np.eye(3), PLACE + stamp * FLYING)
+
+
+def ahead(distance: float, left: float, stamp: float = 0.0, up: float = 0.0) -> Transform:
+    """Return the pose of a neighbour ahead of the drone at a stamp, facing away."""
+    return Transform(np.eye(3), body(stamp).translation + np.array([distance, left, up]))
 
 
 class Drone:
     """A drone with cameras that flies evenly, and what its cameras see."""
 
-    def __init__(self, config: NeighborConfig = CONFIG, **mountings: Transform) -> None:
+    def __init__(self, **mountings: Transform) -> None:
         self.mountings = mountings
-        self.tracker = Tracker(config, {
+        self.tracker = Tracker(CONFIG, {
             name: MountedCamera(place) for name, place in mountings.items()})
         self.odometry = -1
 
@@ -72,42 +73,22 @@ class Drone:
             self.tracker.feed_odometry(OdometrySample(
                 now, body(now).translation, np.array([0.0, 0.0, 0.0, 1.0]), FLYING, np.zeros(3)))
 
-    def see(self, camera: str, stamp: float, image: GrayImage) -> Sighting:
+    def see(self, camera: str, stamp: float, leader: Transform | None = None) -> Sighting:
+        """Return what a camera sees of the leader, T_odom_body."""
         self.feed(stamp)
         if not self.tracker.wanted(stamp, MODEL, camera):
             return Sighting()
+        image = EMPTY if leader is None else self.image(camera, stamp, leader)
         return self.tracker.process_image(stamp, image, MODEL, camera)
 
-    def image(self, camera: str, stamp: float, **markers: Transform) -> GrayImage:
-        """Return what a camera sees of bodies, T_odom_body by 'm' and the marker's id."""
-        T_camera_odom = (body(stamp) @ self.mountings[camera]).inverse()
-        seen = {int(name[1:]): T_camera_odom @ pose @ TAIL for name, pose in markers.items()}
-        return render(MODEL, {k: pose for k, pose in seen.items() if shown(pose)}, rays=2,
+    def image(self, camera: str, stamp: float, leader: Transform) -> GrayImage:
+        T_camera_marker = (body(stamp) @ self.mountings[camera]).inverse() @ leader @ TAIL
+        outline = MODEL.project(T_camera_marker.apply(marker_corners(SIDE)))
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        shown = np.isfinite(outline).all() and (high > 10.0).all() and (
+            low < (MODEL.width - 10.0, MODEL.height - 10.0)).all()
+        return render(MODEL, {0: T_camera_marker} if shown else {}, rays=2,
                       seed=round(1000.0 * stamp))
-
-
-def shown(T_camera_marker: Transform) -> bool:
-    """Return whether a marker is in the image, be it in part."""
-    outline = MODEL.project(T_camera_marker.apply(marker_corners(SIDE)))
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    return bool(np.isfinite(outline).all() and (high > 10.0).all()
-                and (low < (MODEL.width - 10.0, MODEL.height - 10.0)).all())
-
-
-def ahead(distance: float, left: float = 0.0, up: float = 0.0) -> Transform:
-    """Return the pose of a neighbour about which the drone flies at stamp 0, facing away."""
-    return Transform(np.eye(3), body(0.0).translation + np.array([distance, left, up]))
-
-
-def flown(pose: Transform, stamp: float, velocity: Array) -> Transform:
-    return Transform(pose.rotation, pose.translation + stamp * velocity)
-
-
-class Report(NamedTuple):
-    stamp: float
-    camera: str
-    off: Array  # m, from where it is
-    velocity: Array
 
 
 @pytest.mark.parametrize('later', [0.0, 0.023], ids=['at once', 'in turns'])
@@ -115,177 +96,109 @@ def test_a_neighbour_passes_from_one_image_to_the_next_without_a_gap_or_a_step(
         later: float) -> None:
     # Above, and seen aslant: both attitudes of a marker that is seen straight on look the same.
     drone, start = Drone(front=FRONT, left=LEFT), Transform.from_quaternion(
-        ahead(2.3, -0.5, 0.4).translation, quaternion_from_yaw(-0.25))
-    velocity = FLYING + np.array([0.0, 0.9, 0.0])
-    reported: list[Report] = []
+        ahead(2.3, -0.5, up=0.4).translation, quaternion_from_yaw(-0.25))
+    velocity, cameras = FLYING + np.array([0.0, 0.9, 0.0]), list[str]()
+    off: list[Array] = []  # errors of place, m, and velocity, m/s, (6,), once settled
     for k in range(60):
-        found = set()
         for camera, stamp in (('front', 0.05 * k), ('left', 0.05 * k + later)):
-            leader = flown(start, stamp, velocity)
-            sighting = drone.see(camera, stamp, drone.image(camera, stamp, m0=leader))
+            leader = Transform(start.rotation, start.translation + stamp * velocity)
+            sighting = drone.see(camera, stamp, leader)
             assert sighting.rejections == []
             for estimate in sighting.estimates.values():
-                found.add(camera)
-                reported.append(Report(stamp, camera, estimate.position - leader.translation,
-                                 estimate.velocity))
-        assert found, f'nobody in sight at {0.05 * k:.2f} s'
-    cameras = [one.camera for one in reported]
+                cameras.append(camera)
+                if stamp > 0.7:
+                    off.append(np.concatenate([estimate.position - leader.translation,
+                                               estimate.velocity - velocity]))
+        assert sighting.estimates or cameras[-1] == 'front', f'not in sight at {0.05 * k:.2f} s'
     assert cameras[:5] == ['front'] * 5 and cameras[-5:] == ['left'] * 5
-    both = sum(a != b for a, b in pairwise(cameras))
-    assert both > 4, 'in the overlap both see it'
-    settled = [one for one in reported if one.stamp > 0.7]
-    assert max(np.abs(one.off).max() for one in settled) < 0.008
-    assert max(np.abs(one.velocity - velocity).max() for one in settled) < 0.06
-    for a, b in pairwise(settled):
-        assert np.abs(a.off - b.off).max() < 0.006
-        assert np.abs(a.velocity - b.velocity).max() < 0.05
+    assert sum(a != b for a, b in pairwise(cameras)) > 4, 'in the overlap both see it'
+    steps = np.abs(np.diff(off, axis=0)).max(axis=0)
+    assert np.abs(off).max(axis=0) == pytest.approx(0.0, abs=0.06)
+    assert np.abs(off).max(axis=0)[:3].max() < 0.008
+    assert steps[:3].max() < 0.006 and steps[3:].max() < 0.05
 
 
-def looked_for(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return a list that fills with the names of those who are looked for where expected."""
-    names: list[str] = []
-    track = tracker_module.track
+def watched(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int]:
+    """Return a list that fills with an entry for every call of a function of perception."""
+    calls: list[int] = []
+    function = getattr(module, name)
 
-    def watched(image: GrayImage, model: Any, sought: Any, *others: Any) -> Any:
-        names.append(sought.neighbor.name)
-        return track(image, model, sought, *others)
+    def counted(*arguments: Any) -> Any:
+        calls.append(len(calls))
+        return function(*arguments)
 
-    monkeypatch.setattr(tracker_module, 'track', watched)
-    return names
-
-
-def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list that fills with an entry for every whole image that is searched."""
-    done: list[int] = []
-    everywhere = tracker_module.search.everywhere
-
-    def watched(*arguments: Any) -> Any:
-        done.append(len(done))
-        return everywhere(*arguments)
-
-    monkeypatch.setattr(tracker_module.search, 'everywhere', watched)
-    return done
+    monkeypatch.setattr(module, name, counted)
+    return calls
 
 
-def test_one_who_is_tracked_is_not_looked_for_where_nobody_is_expected(
+def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
         monkeypatch: pytest.MonkeyPatch) -> None:
-    drone, leader = Drone(front=FRONT, back=BACK), ahead(2.0)
-    drone.see('front', 0.0, drone.image('front', 0.0, m0=leader))
-    names, whole = looked_for(monkeypatch), searched(monkeypatch)
-    for k in range(1, 21):
-        stamp = 0.05 * k
-        image = drone.image('front', stamp, m0=flown(leader, stamp, FLYING))
-        assert drone.see('front', stamp, image).estimates
-        drone.feed(stamp + 0.01)
-        assert not drone.tracker.wanted(stamp + 0.01, MODEL, 'back')
-        blind = drone.tracker.process_image(stamp + 0.01, EMPTY, MODEL, 'back')
-        assert (blind.estimates, blind.rejections, blind.stage) == ({}, [], 'track')
-    assert names == ['leader'] * 20  # in the images of the front camera
-    assert whole == []
+    drone = Drone(front=FRONT, back=BACK)
+    drone.see('front', 0.0, ahead(2.0, 0.0))
+    tracked = watched(monkeypatch, tracker_module, 'track')
+    whole = watched(monkeypatch, tracker_module.search, 'everywhere')
+    for k in range(1, 19):
+        assert drone.see('front', 0.05 * k, ahead(2.0, 0.0, 0.05 * k)).estimates
+        drone.feed(0.05 * k + 0.01)
+        assert not drone.tracker.wanted(0.05 * k + 0.01, MODEL, 'back')
+    assert (len(tracked), len(whole)) == (18, 0)  # in the images of the front camera
 
 
-def test_one_who_is_covered_in_one_image_is_looked_for_there_now_and_then(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    drone, leader = Drone(front=FRONT, left=LEFT), ahead(2.0, 0.75)
+def test_an_image_older_than_that_of_another_camera_is_not_used() -> None:
+    drone = Drone(front=FRONT, left=LEFT)
     for k in range(5):
-        stamp = 0.02 * k
-        image = drone.image('front', stamp, m0=flown(leader, stamp, FLYING))
-        assert drone.see('front', stamp, image).estimates or not k
-    names, whole = looked_for(monkeypatch), searched(monkeypatch)
-    for k in range(5, 25):
-        stamp = 0.02 * k
-        image = drone.image('front', stamp, m0=flown(leader, stamp, FLYING))
-        assert drone.see('front', stamp, image).estimates
-        drone.see('left', stamp + 0.01, EMPTY)
-    tries = len(names) - 20
-    assert 0.4 / SEARCH_PERIOD - 1 <= tries <= 0.4 / SEARCH_PERIOD + 1
-    assert whole == []
+        drone.see('front', 0.05 * k, ahead(2.0, 0.75, 0.05 * k))
+    assert not drone.tracker.wanted(0.17, MODEL, 'left')
 
 
-def test_whole_images_are_searched_at_a_limited_rate_one_camera_after_the_other(
-        monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_cameras_search_no_more_whole_images(monkeypatch: pytest.MonkeyPatch) -> None:
     drone = Drone(front=FRONT, left=LEFT, back=BACK)
-    whole = searched(monkeypatch)
-    took: list[tuple[float, str]] = []
+    whole = watched(monkeypatch, tracker_module.search, 'everywhere')
     for k in range(60):
         for name in drone.mountings:
-            before = len(whole)
-            drone.see(name, k / 30.0, EMPTY)
-            took += [(k / 30.0, name)] * (len(whole) > before)
-    assert len(whole) == len(took) + 3  # each one's first time in both ways
-    stamps, names = [stamp for stamp, _ in took], [name for _, name in took]
-    assert names == (['front', 'left', 'back'] * len(took))[:len(took)]
-    assert min(np.diff(stamps)) > SEARCH_PERIOD - 1e-3
-    assert len(took) >= 2.0 / (SEARCH_PERIOD + 1 / 30.0)
+            drone.see(name, k / 30.0)
+    # Each one's first time in both ways.
+    assert len(whole) == pytest.approx(2.0 / SEARCH_PERIOD + 3, abs=3)
 
 
-def test_who_leaves_all_images_is_searched_for_in_all_and_found() -> None:
-    drone, leader = Drone(front=FRONT, back=BACK), ahead(2.0)
+def test_a_neighbour_that_leaves_all_images_is_searched_for_in_all_and_found() -> None:
+    drone, found = Drone(front=FRONT, back=BACK), list[float]()
     for k in range(10):
+        drone.see('front', 0.05 * k, ahead(2.0, 0.0, 0.05 * k))
+    for k in range(60, 70):  # now it is behind, and its tail is turned to there
         stamp = 0.05 * k
-        image = drone.image('front', stamp, m0=flown(leader, stamp, FLYING))
-        drone.see('front', stamp, image)
-    found = None
-    for k in range(60, 100):  # now it is behind, and its tail is turned to there
-        stamp = 0.05 * k
-        behind = Transform(np.diag([-1.0, -1.0, 1.0]),
-                           body(stamp).translation + np.array([-2.0, 0.1, 0.0]))
-        drone.see('front', stamp, EMPTY)
-        sighting = drone.see('back', stamp, drone.image('back', stamp, m0=behind))
-        if sighting.estimates and found is None:
-            found = stamp
-    assert found is not None and found <= 3.0 + 4 * SEARCH_PERIOD + 0.05
+        drone.see('front', stamp)
+        behind = Transform(np.diag([-1.0, -1.0, 1.0]), ahead(-2.0, 0.1, stamp).translation)
+        found += [stamp] * bool(drone.see('back', stamp, behind).estimates)
+    assert found and found[0] <= 3.0 + 4 * SEARCH_PERIOD + 0.05
 
 
-def test_a_frozen_or_late_image_of_another_camera_is_left_alone() -> None:
-    drone, leader = Drone(front=FRONT, left=LEFT), ahead(2.0, 0.75)
-    for k in range(5):
-        stamp = 0.05 * k
-        seen = flown(leader, stamp, FLYING)
-        drone.see('front', stamp, drone.image('front', stamp, m0=seen))
-    stamp = 0.17  # older than what the front camera has seen
-    assert not drone.tracker.wanted(stamp, MODEL, 'left')
-
-
-def test_each_camera_finds_out_its_own_offset_of_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
-    offsets = {'front': 0.0, 'left': 0.02}
-    tracker = turning(monkeypatch, offsets)
-    applied = {name: camera.time_offset.applied for name, camera in tracker.cameras.items()}
-    assert applied['left'] == pytest.approx(0.02, abs=0.003)
-    assert abs(applied['front']) < 0.003
-
-
-def turning(monkeypatch: pytest.MonkeyPatch, offsets: dict[str, float]) -> Tracker:
-    """Return a tracker that has seen a neighbour at rest while it turned to and fro."""
-    rng = np.random.default_rng(3)
-    leader = ahead(2.0, 0.75)
-    mountings = {'front': FRONT, 'left': LEFT}
-    tracker = Tracker(CONFIG, {name: MountedCamera(place, TimeOffset())
-                               for name, place in mountings.items()})
+def test_each_camera_finds_its_own_offset_of_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    offsets, rng, leader = {'front': 0.0, 'left': 0.02}, np.random.default_rng(3), ahead(2.0, 0.75)
+    drone, exposed = Drone(front=FRONT, left=LEFT), ['', 0.0]
 
     def attitude(now: float) -> Array:
         return quaternion_from_yaw(0.15 * np.sin(1.7 * now) + 0.05 * np.sin(11.0 * now))
 
-    def measured(name: str, now: float) -> Measurement:
-        own = Transform(quaternion_to_matrix(attitude(now)), body(0.0).translation)
-        pose = (own @ mountings[name]).inverse() @ leader
+    def measured(*_: Any) -> Measurement:
+        name, now = exposed
+        own = Transform(quaternion_to_matrix(attitude(now)), PLACE)
+        pose = (own @ drone.mountings[name]).inverse() @ leader
         noisy = Transform(pose.rotation, pose.translation + rng.normal(0.0, 0.001, 3))
         return Measurement('leader', noisy, TAIL.translation, np.diag([1e-6] * 3 + [1e-4] * 3),
                            0.1, None)
 
-    now: dict[str, Any] = {}
-    monkeypatch.setattr(tracker_module, 'track', lambda *_: measured(**now))
-    monkeypatch.setattr(tracker_module, 'locate', lambda *_: measured(**now))
-    first = render(MODEL, {0: (Transform(np.eye(3), body(0.0).translation) @ FRONT).inverse()
-                           @ leader @ TAIL})
+    monkeypatch.setattr(tracker_module, 'track', measured)
+    monkeypatch.setattr(tracker_module, 'locate', measured)
+    first = drone.image('front', 0.0, leader)
     for k in range(2000):
         stamp = k / 200.0
-        tracker.feed_odometry(OdometrySample(
-            stamp, body(0.0).translation, attitude(stamp), np.zeros(3),
+        drone.tracker.feed_odometry(OdometrySample(
+            stamp, PLACE, attitude(stamp), np.zeros(3),
             np.array([0.0, 0.0, 0.255 * np.cos(1.7 * stamp) + 0.55 * np.cos(11.0 * stamp)])))
         name = 'front' if k % 8 == 0 else 'left' if k % 8 == 4 else ''
         if name and stamp > 0.1:
-            exposed = stamp - 0.05
-            now.update(name=name, now=exposed)
-            tracker.process_image(exposed - offsets[name], first, MODEL, name)
-    return tracker
+            exposed[:] = name, stamp - 0.05
+            drone.tracker.process_image(stamp - 0.05 - offsets[name], first, MODEL, name)
+    applied = [drone.tracker.cameras[name].time_offset.applied for name in offsets]
+    assert applied == pytest.approx([0.0, 0.02], abs=0.003)
