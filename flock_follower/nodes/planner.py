@@ -272,11 +272,14 @@ class Planner(FlockNode):
         """Return the values of the newest tick for /diagnostics."""
         decision, memory = self._decision, self._loop.memory
         now = self._loop.seconds(self._even_clock.now())
-        states = {'odom': memory.own, **memory.neighbors}
+        states, values = {'odom': memory.own, **memory.neighbors}, self._settings.values
         return {
             'state': decision.state.value, 'reason': decision.reason,
             'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
             'missed_ticks': self._loop.missed, 'limits': decision.limits,
+            # The band about a neighbour, to its hull.
+            'nearest_m': f'{math.sqrt(values["d0"]) + values["radius"]:.3f}',
+            'farthest_m': f'{math.sqrt(values["d1"]) + values["radius"]:.3f}',
             'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),
             **{f'{name}_age_s': f'{now - state.stamp:.3f}'
                for name, state in states.items() if state is not None},

@@ -49,14 +49,12 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
-from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 
 SPECS: list[Spec] = []
 PERIOD = 0.1  # s between two drawings
-ASK_PERIOD = 3.0  # s between two requests for the band, which can be changed in flight
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
 LARGEST = 65536  # bytes of a message on /diagnostics
 
@@ -97,7 +95,6 @@ class Visualizer(FlockNode):
         self._command: Command | None = None
         self._report: dict[str, str] = {}
         """The planner's newest values on /diagnostics."""
-        self._planner = RemoteParameters(self, 'planner')
         self._polls = [
             self.poll(Odometry, 'odom', self._take_odom, best_effort()),
             self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False),
@@ -110,7 +107,6 @@ class Visualizer(FlockNode):
         self._markers = self.create_publisher(MarkerArray, 'visualizer/markers', QoSProfile(
             depth=1))
         self.create_timer(PERIOD, self._tick, clock=STEADY)
-        self.create_timer(ASK_PERIOD, self._ask, clock=STEADY)
 
     def _take_odom(self, message: Odometry, _: int) -> None:
         self._own = from_odometry(message)
@@ -128,9 +124,6 @@ class Visualizer(FlockNode):
         for status in message.status:
             if status.name == planner:
                 self._report = {pair.key: pair.value for pair in status.values}
-
-    def _ask(self) -> None:
-        self._planner.ask(['d0', 'd1', 'radius'])
 
     def _tick(self) -> None:
         """Take the messages that wait and draw them, if a viewer subscribes."""
@@ -173,13 +166,12 @@ class Visualizer(FlockNode):
         if self._own is not None:
             drawn.append(shape(f'{name} edge', Marker.LINE_STRIP, EDGE, LINE_SIZE,
                                points=[self._own.position, at]))
-        if (band := self._planner.values) is not None:
-            drawn += [shape(f'{name} {edge}', Marker.LINE_STRIP, color,
-                            (0.05 if reason in self._guarded() else 0.015, 0.0, 0.0),
-                            points=at + (math.sqrt(band[edge]) + band['radius']) * RING)
-                      for edge, color, reason in (('d0', INNER, SEPARATION),
-                                                  ('d1', OUTER, COHESION))]
-        return drawn
+        return drawn + [
+            shape(f'{name} {edge}', Marker.LINE_STRIP, color,
+                  (0.05 if reason in self._guarded() else 0.015, 0.0, 0.0),
+                  points=at + float(self._report[edge]) * RING)
+            for edge, color, reason in (('nearest_m', INNER, SEPARATION),
+                                        ('farthest_m', OUTER, COHESION))]
 
     def _follower(self, own: OdometryState, now: int) -> list[Marker]:
         """Return the follower with its state and its command."""

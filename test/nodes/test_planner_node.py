@@ -182,6 +182,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     assert rig.node._loop.ground == 0.4
     assert 0.0 < rig.node._loop.memory.motions['leader'].acceleration[0] <= 0.3  # smoothed
     assert rig.values['leader_is'] == 'leader, seen' and rig.values['edges'] == 'leader'
+    assert (rig.values['nearest_m'], rig.values['farthest_m']) == ('1.000', '2.828')
     rig.run(0.9, (0.8, 0.0, 2.0))  # half a second of it is taken for a jump
     assert rig.values['warnings'].startswith('leader 0.80 m away')
     assert rig.values['warnings'] in rig.problems()
