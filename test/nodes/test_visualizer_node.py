@@ -108,7 +108,8 @@ def test_it_draws_each_vehicle_where_it_is_and_the_band_of_the_one_in_the_graph(
 
 
 @pytest.mark.parametrize(('limits', 'thick', 'thin'), [
-    ('a_max, separation', 'leader nearest_m', 'leader farthest_m'), ('cohesion', 'leader farthest_m', 'leader nearest_m')])
+    ('a_max, separation', 'leader nearest_m', 'leader farthest_m'),
+    ('cohesion', 'leader farthest_m', 'leader nearest_m')])
 def test_the_bound_that_the_guard_holds_is_thick(
         rig: Rig, limits: str, thick: str, thin: str) -> None:
     assert rig.draw()['command'].color.r == pytest.approx(COMMAND[0])
