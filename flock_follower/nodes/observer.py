@@ -54,7 +54,11 @@ from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
-from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
+from flock_follower.nodes.support.middleware import (
+    open_to_network,
+    segment_size,
+    shares_memory,
+)
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.cdr import read_odometry
@@ -223,10 +227,9 @@ def _machine(idle: float | None) -> Machine:
 def _open_nodes() -> list[str]:
     """Return our nodes on this computer that the network reaches; as check, where none is read."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    found = {node: reach(environment) for node, environment in processes()
-             if environment.get('ROS_DOMAIN_ID', '0') == domain}
-    return sorted(node for node, far in (found or {'check': reach(os.environ)}).items()
-                  if far == NETWORK)
+    found = {node: environment for node, environment in processes()
+             if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}
+    return sorted(node for node, environment in found.items() if open_to_network(environment))
 
 
 def observe(seconds: float, namespace: str, remaps: dict[str, str], camera: str

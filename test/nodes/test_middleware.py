@@ -27,11 +27,8 @@ from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
     avoid_shared_memory_for_images,
     DEFAULT_SEGMENT,
-    HERE,
     IMAGES_BUFFER,
-    NETWORK,
-    PEERS,
-    reach,
+    open_to_network,
     segment_size,
 )
 
@@ -111,18 +108,18 @@ def test_the_bridge_and_the_planner_run_without(module, monkeypatch):
     assert profiles == [UDP]
 
 
-@pytest.mark.parametrize(('given', 'far'), [
-    ({}, NETWORK), ({RANGE: 'SUBNET'}, NETWORK), ({RANGE: 'SYSTEM_DEFAULT'}, NETWORK),
-    ({'ROS_STATIC_PEERS': '10.0.0.2'}, NETWORK),
-    ({RANGE: 'SUBNET', PROFILE: '/of/the/user.xml'}, NETWORK),
-    ({PROFILE: OWN, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}, NETWORK),
-    ({'ROS_LOCALHOST_ONLY': '0'}, NETWORK),
-    ({RANGE: 'LOCALHOST'}, HERE), ({RANGE: 'localhost'}, HERE), ({RANGE: 'OFF'}, HERE),
-    ({'ROS_LOCALHOST_ONLY': '1'}, HERE), ({PROFILE: OWN}, HERE),
-    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, HERE),
-    ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, PEERS)])
-def test_how_far_ros_reaches(given, far):
-    assert reach(given) == far
+@pytest.mark.parametrize(('given', 'found'), [
+    ({}, True), ({RANGE: 'SUBNET'}, True), ({RANGE: 'SYSTEM_DEFAULT'}, True),
+    ({'ROS_STATIC_False': '10.0.0.2'}, True),
+    ({RANGE: 'SUBNET', PROFILE: '/of/the/user.xml'}, True),
+    ({PROFILE: OWN, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}, True),
+    ({'ROS_LOCALHOST_ONLY': '0'}, True),
+    ({RANGE: 'LOCALHOST'}, False), ({RANGE: 'localhost'}, False), ({RANGE: 'OFF'}, False),
+    ({'ROS_LOCALHOST_ONLY': '1'}, False), ({PROFILE: OWN}, False),
+    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_False': '10.0.0.2'}, False),
+    ({RANGE: 'LOCALHOST', 'ROS_STATIC_False': '10.0.0.2'}, False)])
+def test_how_far_ros_reaches(given, found):
+    assert open_to_network(given) == found
 
 
 def test_the_size_of_the_shared_memory_is_that_of_the_profile(tmp_path):
