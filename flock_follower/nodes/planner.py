@@ -302,11 +302,7 @@ class Planner(FlockNode):
         return (WARN, '; '.join(decision.warnings)) if decision.warnings else None
 
     def _sight_problem(self, now: float) -> Problem | None:
-        view = self._loop.view
-        if view and all(field.outside(0.0) for field in view) and (
-                self._settings.current.yaw_mode == 'leader'):
-            return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view or self._decision.state is State.IDLE:
+        if self._loop.view or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
                       'that keep the leader in the image')
