@@ -22,13 +22,12 @@ import re
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 from driven import Driven, overrides, START
 from geometry_msgs.msg import TransformStamped
 from marker_images import make_camera, render
 import numpy as np
 import pytest
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, Image, Range, RegionOfInterest
 
 from flock_follower.geometry import (
     quaternion_from_rpy,
@@ -196,17 +195,6 @@ def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
         0, 10_000_000, 5_000_000_000]
     assert {h.frame_id for h in r.frames} == {'vio_odom'} and len(r.found) == 2
     assert r.counters['no odometry yet'] == 1 and 'no /odom for' in r.problems(ahead=4.0)
-
-
-def test_compressed_images_are_taken_by_parameter(
-        rig: Callable[..., Rig], image: GrayImage) -> None:
-    r = rig(image_transport='compressed')
-    r.odom(0.0)
-    message = CompressedImage(format='jpeg', data=array(
-        'B', cv2.imencode('.jpg', image)[1].tobytes()))
-    message.header.stamp = nanoseconds_to_stamp(START)
-    r.give('image_raw/compressed', message)
-    np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
 
 
 def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time(

@@ -148,7 +148,7 @@ class BridgeReport:
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
         for text in self._bridge.texts.new():
-            log = (self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info)
+            log = self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
     def _send_arming(self, now: float) -> None:
