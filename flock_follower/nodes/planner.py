@@ -252,11 +252,14 @@ class Planner(FlockNode):
         """Return the values of the newest tick for /diagnostics."""
         decision, memory = self._decision, self._loop.memory
         now = self._loop.seconds(self._even_clock.now())
-        states = {'odom': memory.own, **memory.neighbors}
+        states, values = {'odom': memory.own, **memory.neighbors}, self._settings.values
         return {
             'state': decision.state.value, 'reason': decision.reason,
             'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
             'missed_ticks': self._loop.missed, 'limits': decision.limits,
+            # The band about a neighbour, to its hull.
+            'nearest_m': f'{math.sqrt(values["d0"]) + values["radius"]:.3f}',
+            'farthest_m': f'{math.sqrt(values["d1"]) + values["radius"]:.3f}',
             'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),
             **{f'{name}_age_s': f'{now - state.stamp:.3f}'
                for name, state in states.items() if state is not None},
@@ -279,11 +282,7 @@ class Planner(FlockNode):
         return (WARN, '; '.join(decision.warnings)) if decision.warnings else None
 
     def _sight_problem(self, now: float) -> Problem | None:
-        view = self._loop.view
-        if view and all(field.outside(0.0) for field in view) and (
-                self._settings.current.yaw_mode == 'leader'):
-            return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view or self._decision.state is State.IDLE:
+        if self._loop.view or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
                       'that keep the leader in the image')
