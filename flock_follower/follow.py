@@ -13,15 +13,14 @@
 # limitations under the License.
 
 """
-One command to follow: check, arm, take off, offboard, engage; a key confirms each step.
+One command to follow: check, then arm, take off, offboard, engage; a key confirms each step.
 
-Run ``ros2 run flock_follower follow`` beside the nodes. A line shows state, distance, reason and
-battery. If a step is refused, the reason is printed and the step stays due. The key l lands.
-Ctrl-C, SIGTERM and a closed terminal brake and hand over: the planner is disengaged, and the
-autopilot holds.
+Run ``ros2 run flock_follower follow`` beside the nodes. It ends with the findings of ``check`` if
+these prevent a flight. A line shows state, distance, reason and battery. If a step is refused, the
+reason is printed and the step stays due. The key l lands. Ctrl-C, SIGTERM and a closed terminal
+brake and hand over: the planner is disengaged, and the autopilot holds.
 
-Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or, with ``--yes``, a step is
-refused.
+Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or ``check`` finds a fault.
 """
 
 from __future__ import annotations
@@ -34,34 +33,31 @@ import sys
 from flock_follower.check import SECONDS, table
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ready
-from flock_follower.checks.observations import Observations
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(
-        prog='follow', description='Check, arm, take off, request offboard, engage: each step by '
-        'its key. l lands; Ctrl-C, SIGTERM and a closed terminal brake and hand over.')
+        prog='follow', description='Check; then arm, take off, request offboard, engage: each '
+        'step by its key. l lands; Ctrl-C, SIGTERM and a closed terminal brake and hand over.')
     parser.add_argument('--namespace', default='', help='of the nodes')
-    parser.add_argument('--yes', action='store_true', help='no keys, for a simulator: refused '
-                        'unless the bridge has a loopback connection. A router on this machine '
-                        'looks the same: never with a real vehicle')
     options = parser.parse_args(args)
     if not re.fullmatch(r'[\w/]*', options.namespace):
         parser.error(f'--namespace {options.namespace}: must be letters, digits, _ and /')
     try:
+        from flock_follower.nodes.observer import observe
         from flock_follower.nodes.pilot import fly
     except ModuleNotFoundError as error:
         print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
               'package in package.xml', file=sys.stderr)
         return 2
-    return fly(options.namespace, not options.yes, verdict, SECONDS)
-
-
-def verdict(seen: Observations) -> tuple[bool, str]:
-    """Return whether ``check`` permits the flight, and its findings as text."""
+    try:
+        seen = observe(SECONDS, options.namespace, {}, None, '')
+    except KeyboardInterrupt:
+        return 130
     findings = judge_all(seen)
-    return ready(findings), table(seen, findings, colours=sys.stdout.isatty())
+    print(table(seen, findings, colours=sys.stdout.isatty()))
+    return fly(options.namespace) if ready(findings) else 1
 
 
 if __name__ == '__main__':

@@ -63,10 +63,7 @@ class Driven:
     @property
     def values(self) -> dict[str, Any]:
         """Return the values of /diagnostics."""
-        found = dict(self.diagnostics.values)
-        for part in self.diagnostics.parts.values():
-            found |= part
-        return found
+        return dict(self.diagnostics.shown(time.monotonic()))
 
     def give(self, topic: str, message: Any, number: int | None = None,
              received: int | None = 0) -> None:

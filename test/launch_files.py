@@ -21,13 +21,15 @@ use. An argument that was given, or declared before, keeps its value in a file t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import namedtuple
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 import runpy
 import sys
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
+from unittest import mock
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 
@@ -36,60 +38,30 @@ class Context(dict[str, str]):
     """The values of the launch arguments."""
 
 
-class LaunchConfiguration(NamedTuple):
-    name: str
-
+class LaunchConfiguration(namedtuple('LaunchConfiguration', 'name')):
     def perform(self, context: Context) -> str:
         return context[self.name]
 
 
-class FindPackageShare(NamedTuple):
-    package: str
-
+class FindPackageShare(namedtuple('FindPackageShare', 'package')):
     def perform(self, context: Context) -> str:
         assert self.package == 'flock_follower'
         return str(LAUNCH.parent)
 
 
-class PathJoinSubstitution(NamedTuple):
-    parts: list[Any]
-
+class PathJoinSubstitution(namedtuple('PathJoinSubstitution', 'parts')):
     def perform(self, context: Context) -> str:
         return '/'.join(text(part, context) for part in self.parts)
 
 
-class DeclareLaunchArgument(NamedTuple):
-    name: str
-    default_value: Any
-    description: str
-
-
-class PythonLaunchDescriptionSource(NamedTuple):
-    path: str
-
-
-class IncludeLaunchDescription(NamedTuple):
-    source: PythonLaunchDescriptionSource
-    launch_arguments: Any = ()
-
-
-class OpaqueFunction(NamedTuple):
-    function: Any
-
-
-class Node(NamedTuple):
-    """A node as launch_ros takes it; ``parameters`` are files, and values that beat them."""
-
-    package: str
-    executable: str
-    exec_name: str
-    output: str
-    namespace: str
-    parameters: list[Any]
-    remappings: Sequence[tuple[str, str]] = ()
-    respawn: bool = False
-    respawn_delay: float = 0.0
-    prefix: str = ''
+DeclareLaunchArgument = namedtuple('DeclareLaunchArgument', 'name default_value description')
+PythonLaunchDescriptionSource = namedtuple('PythonLaunchDescriptionSource', 'path')
+IncludeLaunchDescription = namedtuple('IncludeLaunchDescription', 'source launch_arguments',
+                                      defaults=((),))
+OpaqueFunction = namedtuple('OpaqueFunction', 'function')
+#: A node as launch_ros takes it; ``parameters`` are files, and values that beat them.
+Node = namedtuple('Node', 'package executable exec_name output namespace parameters remappings '
+                          'respawn respawn_delay prefix', defaults=((), False, 0.0, ''))
 
 
 def ignored(*_: Any, **__: Any) -> None:
@@ -121,17 +93,11 @@ def stand_ins() -> Iterator[None]:
         'launch_ros': {},
         'launch_ros.actions': {'Node': Node},
         'launch_ros.substitutions': {'FindPackageShare': FindPackageShare}}
-    before = {name: sys.modules.get(name) for name in holding}
+    modules = {name: ModuleType(name) for name in holding}
     for name, members in holding.items():
-        sys.modules[name] = ModuleType(name)
-        vars(sys.modules[name]).update(members)
-    try:
+        vars(modules[name]).update(members)
+    with mock.patch.dict(sys.modules, modules):
         yield
-    finally:
-        for name, module in before.items():
-            sys.modules.pop(name)
-            if module is not None:
-                sys.modules[name] = module
 
 
 def launched(file: str, **arguments: str) -> tuple[dict[str, Node], Context]:

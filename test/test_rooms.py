@@ -54,9 +54,9 @@ ROOMS = {
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
     'support': ('checks mavlink messages odometry parameters planner',
-                'ROS numpy pymavlink yaml'),
+                'ROS numpy pymavlink'),
     'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support',
-              'ROS numpy'),
+              'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),
     'external': ('mavlink', 'numpy pymavlink'),

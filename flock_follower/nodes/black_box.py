@@ -26,7 +26,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 import os
+from pathlib import Path
 import sys
 import threading
 import time
@@ -34,13 +36,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile
+import yaml
 
 from flock_follower.bags.bag import deserialize, serialize
 from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.checks.observations import OURS
-from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
+from flock_follower.checks.topic_names import COMPRESSED, full_name, IMAGE, INFO, TYPES
+from flock_follower.files import resource
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
@@ -48,14 +52,11 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory_for_images,
-    IMAGES_BUFFER,
     receive_buffer_max,
-    shares_memory,
 )
-from flock_follower.nodes.support.parameters import FlownParameters
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import (
     FlockNode,
-    LONGEST_WAIT,
     never_block_output,
     run,
     spin,
@@ -63,7 +64,8 @@ from flock_follower.nodes.support.runtime import (
 )
 from flock_follower.parameters.black_box_table import build, folder, SPECS
 from flock_follower.parameters.cameras_table import cameras
-from flock_follower.perception.images import decode, encode_jpeg
+from flock_follower.parameters.files import FLOWN
+from flock_follower.perception.images import decode_image, encode_jpeg
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
 WRITE_PERIOD = 0.3  # s between writes: where one takes long, still less than a second
@@ -109,43 +111,37 @@ class BlackBox(FlockNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('black_box', **kwargs)
         values = self.declare(SPECS, build).values
-        self._values = values
         self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
         self._limits = Limits(values['disk_used'], values['disk_free'])
-        self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._recording: FlightRecording | None = None
         # One thread takes, one writes, and the executor's notes: none needs a lock.
         self._notes: dict[str, str] = {}
-        self._noted: dict[str, str] = {}
         self._taken: deque[TakenMessage] = deque()
         self._bytes_taken = self._bytes_written = 0
-        self._last: dict[RecordedTopic, int] = {}
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
         self._inputs: list[_Subscribed] = []
         for name, msgtype in RECORDED.items():
             self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)
+        transport = values['image_transport']
         for camera in cameras(values):
             self._subscribe(camera.camera_info, INFO, QOS)
             if values['record_images'] != 'none':
-                raw = values['image_transport'] == 'raw'
-                self._subscribe(camera.images(values['image_transport']),
-                                IMAGE if raw else COMPRESSED, IMAGE_QOS,
-                                camera.images('compressed'), self._compressed if raw else bytes)
+                raw = transport == 'raw'
+                self._subscribe(camera.images(transport), IMAGE if raw else COMPRESSED, IMAGE_QOS,
+                                camera.images('compressed'), _compressed if raw else bytes)
         # rosbags takes tenths of a second for each type the first time: now, not in flight.
         for msgtype in {each.topic.msgtype for each in self._inputs}:
             definition(msgtype)
             type_hash(msgtype)
         for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
             deserialize(serialize(empty(msgtype), msgtype), msgtype)
-        self._flown = FlownParameters(self, OURS, self._notes.__setitem__)
-        self.create_timer(ASK_PERIOD, self._flown.ask, clock=STEADY)
+        names = [full_name(name, self.get_namespace()) for name in OURS]
+        self._nodes = {name: RemoteParameters(self, name, self._note) for name in names}
+        self._unasked = set(names)  # or of changed parameters
+        self.create_timer(ASK_PERIOD, self._ask, clock=STEADY)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
-        if shares_memory():
-            self.get_logger().warning(
-                'receives through shared memory: if it is started in flight, publishers may block '
-                f'for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} prevents that')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""
@@ -172,16 +168,27 @@ class BlackBox(FlockNode):
             qos is LATCHED_QOS, self.resolve_topic_name(name))
         self._inputs.append(_Subscribed(topic, handle, kind, change))
 
-    def _compressed(self, data: bytes) -> bytes:
-        """Return a serialised image as a serialised compressed one."""
-        image = deserialize(data, IMAGE)
-        compressed = empty(COMPRESSED)
-        compressed.header, compressed.format = image.header, 'jpeg'
-        gray = decode(image.encoding, image.height, image.width, image.step,
-                      bool(image.is_bigendian), image.data)
-        jpeg = encode_jpeg(gray, JPEG_QUALITY)
-        compressed.data = np.frombuffer(jpeg, dtype=np.uint8)
-        return serialize(compressed, COMPRESSED)
+    def _ask(self) -> None:
+        """Ask the nodes whose parameters are not known, if they run."""
+        for name in list(self._unasked):
+            if self._nodes[name].ask():
+                self._unasked.discard(name)
+
+    def _note(self, _: dict[str, Any]) -> None:
+        """Note the parameters flown as a file for ``evaluate``, and the neighbours beside them."""
+        flown = {}
+        for name, node in self._nodes.items():
+            if node.values is None:
+                continue
+            own = {key: value for key, value in node.values.items() if value is not None}
+            if own.get('neighbors_file') or name.endswith('/relative_pose'):
+                path = Path(own.get('neighbors_file') or resource('config/neighbors.yaml'))
+                with suppress(OSError, UnicodeDecodeError):  # its node reports that, if it must
+                    self._notes['neighbors.yaml'] = path.read_text(encoding='utf-8')
+                    own['neighbors_file'] = 'neighbors.yaml'
+            flown[name.rsplit('/', 1)[-1]] = {'ros__parameters': own}
+        text = yaml.safe_dump(flown, default_flow_style=False, allow_unicode=True)
+        self._notes[FLOWN] = f'# The parameters flown, as the nodes had them last.\n{text}'
 
     def _take_on(self) -> None:
         """
@@ -198,8 +205,8 @@ class BlackBox(FlockNode):
 
     def _take(self) -> None:
         """Take the messages that have arrived."""
-        if self._simulated and not self.get_clock().now().nanoseconds:
-            return  # without the time they wait
+        if not self.get_clock().now().nanoseconds:
+            return  # without simulated time they wait
         for topic, handle, kind, change in self._inputs:
             while (received := handle.take_message(kind, True)) is not None:
                 data, info = received
@@ -209,26 +216,13 @@ class BlackBox(FlockNode):
                     self.diagnostics.reject(f'invalid {topic.source}', str(error))
                     continue
                 if topic.name == PARAMETER_EVENTS:
-                    self._flown.changed(deserialize(data, topic.msgtype).node)
+                    name = deserialize(data, topic.msgtype).node
+                    self._unasked |= {name} & self._nodes.keys()
                 if self._bytes_taken - self._bytes_written + len(data) > WAITING_MAX:
                     self.diagnostics.reject('disk too slow')
                     continue
                 self._bytes_taken += len(data)
-                self._taken.append(TakenMessage(
-                    topic, self._arrival(topic, info['received_timestamp']), data))
-
-    def _arrival(self, topic: RecordedTopic, received: int) -> int:
-        """Return the time at which a message arrived, ns of this node's clock."""
-        stamp = received
-        if self._simulated or not received:
-            waited = time.time_ns() - received if received else 0
-            now: int = self.get_clock().now().nanoseconds
-            stamp = now - min(max(waited, 0), LONGEST_WAIT)
-        last = self._last.get(topic, 0)
-        if stamp < last < stamp + LONGEST_WAIT:  # else the clock was set
-            stamp = last  # simulated time comes in steps
-        self._last[topic] = stamp
-        return stamp
+                self._taken.append(TakenMessage(topic, self.arrival(info), data))
 
     def _write_on(self) -> None:
         """Write until the end, and finish the recording."""
@@ -253,10 +247,8 @@ class BlackBox(FlockNode):
                 raise OSError(0, self._fault)
             if self._recording is None:
                 self._recording = FlightRecording(self._folder, self._limits, now, time.time())
-            for name, text in list(self._notes.items()):
-                if self._noted.get(name) != text:
-                    self._recording.note(name, text)
-                    self._noted[name] = text
+            while self._notes:
+                self._recording.note(*self._notes.popitem())
             self._recording.write(taken, now)
             self._fault = ''
             self.diagnostics.rate('written').tick(now)
@@ -270,6 +262,15 @@ class BlackBox(FlockNode):
 
     def _problem(self, now: float) -> Problem | None:
         return (ERROR, f'not recording to {self._folder}: {self._fault}') if self._fault else None
+
+
+def _compressed(data: bytes) -> bytes:
+    """Return a serialised image as a serialised compressed one; ValueError if it is corrupt."""
+    image = deserialize(data, IMAGE)
+    compressed = empty(COMPRESSED)
+    compressed.header, compressed.format = image.header, 'jpeg'
+    compressed.data = np.frombuffer(encode_jpeg(decode_image(image), JPEG_QUALITY), np.uint8)
+    return serialize(compressed, COMPRESSED)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -25,13 +25,12 @@ have taken over.
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
 import sys
 import time
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.mavlink.commands import (
@@ -45,12 +44,10 @@ from flock_follower.nodes.support.runtime import run
 from flock_follower.parameters.mavlink_bridge_table import SPECS
 
 POLL_PERIOD = 0.1  # s between looks for the service
-NOTICE = 2.0  # s without an answer after which the command says that it waits
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
 LONGEST = STREAM_TIMEOUT + CONFIRM_TIMEOUT + REASON_WAIT
 _HEIGHT = next(spec.range.high for spec in SPECS if spec.name == 'takeoff_height')
-_TYPES = {'std_srvs/srv/SetBool': '{} true|false', 'std_srvs/srv/Trigger': '{}'}
 
 
 def patience(service: str) -> float:
@@ -68,78 +65,36 @@ class Caller(Node):
 
     def __init__(self, service: str, value: bool | None, timeout: float) -> None:
         super().__init__('caller', start_parameter_services=False)
-        self._service = service
-        self._timeout = timeout
-        kind = Trigger if value is None else SetBool
-        self._type = f'std_srvs/srv/{kind.__name__}'
+        self._service, self._timeout = self.resolve_service_name(service), timeout
+        self._kind = Trigger if value is None else SetBool
         self._request = Trigger.Request() if value is None else SetBool.Request(data=value)
-        self._client = self.create_client(kind, service)
-        self._name = self.resolve_service_name(service)
+        self._client = self.create_client(self._kind, service)
 
     def spin(self) -> int:
         """Call, print the answer, and return the exit code."""
         try:
-            problem = self._wait_for_service() or self._call()
-        except ExternalShutdownException:
-            problem = 'interrupted'
-        if not problem:
-            return 0
-        if not rclpy.ok():
+            success, answer = self._call()
+        except (ExternalShutdownException, KeyboardInterrupt):
             return 130
-        print(f'error: {self._service}: {problem}', file=sys.stderr)
-        return 1
+        print(f'{"" if success else "error: "}{self._service}: {answer}',
+              file=sys.stdout if success else sys.stderr)
+        return 0 if success else 1
 
-    def _wait_for_service(self) -> str:
-        """Wait until the service exists; return the problem, or ''."""
+    def _call(self) -> tuple[bool, str]:
+        """Wait for the service, call it once, and return its answer, or what failed."""
         deadline = time.monotonic() + self._timeout
-        while rclpy.ok():
-            types = self._types()
-            if types and self._type not in types:
-                return f'is a {", ".join(types)}: {self._how_to_call(types[0])}'
-            if types and self._client.service_is_ready():
-                return ''
+        while not self._client.service_is_ready():
             if time.monotonic() >= deadline:
-                return f'no such service within {self._timeout:g} s: {self._name}'
+                return False, (f'no such service of type {self._kind.__name__} within '
+                               f'{self._timeout:g} s')
             rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
-        return 'interrupted'
-
-    def _types(self) -> list[str]:
-        """Return the types of the service by its servers: the graph counts a client's, too."""
-        types: list[str] = []
-        for name, namespace in self.get_node_names_and_namespaces():
-            with suppress(NodeNameNonExistentError):  # it ended meanwhile
-                served = self.get_service_names_and_types_by_node(name, namespace)
-                types += dict(served).get(self._name, [])
-        return types
-
-    def _how_to_call(self, kind: str) -> str:
-        if kind in _TYPES:
-            return f'call {_TYPES[kind].format(self._service)}'
-        return (f'this command calls only SetBool and Trigger; '
-                f'ros2 service call {self._name} {kind}')
-
-    def _call(self) -> str:
-        """Call once; print the answer if it is yes, else return the problem."""
         future = self._client.call_async(self._request)
-        longest = patience(self._name)
-        began = time.monotonic()
-        noticed = False
-        while rclpy.ok() and not future.done() and time.monotonic() < began + longest:
-            rclpy.spin_until_future_complete(self, future, timeout_sec=POLL_PERIOD)
-            if not future.done() and not self._client.service_is_ready():
-                return 'the service went away without an answer: the result is unknown'
-            if not noticed and not future.done() and time.monotonic() > began + NOTICE:
-                noticed = True
-                print(f'{self._service}: waiting for the answer, at most {longest:.0f} s',
-                      file=sys.stderr, flush=True)
-        if not rclpy.ok():
-            return 'interrupted'
-        if not future.done():
-            return f'no answer within {longest:.0f} s: the result is unknown'
-        if not future.result().success:
-            return str(future.result().message)
-        print(f'{self._service}: {future.result().message}')
-        return ''
+        deadline = time.monotonic() + patience(self._service)
+        while not future.done():
+            if time.monotonic() >= deadline or not self._client.service_is_ready():
+                return False, 'no answer: the result is unknown'
+            rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
+        return future.result().success, future.result().message
 
 
 def main(args: list[str] | None = None) -> int:

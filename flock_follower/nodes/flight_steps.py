@@ -15,51 +15,34 @@
 """
 The steps of a flight by the command ``follow``: which request is due, and which key confirms it.
 
-The steps are check, arm, takeoff, offboard, engage; land at the end. The step that is due is the
-first one whose result the nodes do not report: a step that is reached already is left out, and
-after a takeover offboard is due again. No function reads a clock; times are s, monotonic.
+The steps are arm, takeoff, offboard, engage; land at the end. The step that is due is the first
+one whose result the nodes do not report: a step that is reached already is left out, and after a
+takeover offboard is due again. No function reads a clock; times are s, monotonic.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 import math
-import re
-from types import MappingProxyType
 from typing import Final
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
-#: A node that has reported nothing for this long is missing, s; each reports once per second.
-SILENCE: Final[float] = 3.0
-#: Time to receive a report of every node, s, at the start and after an answer.
+#: Time to receive a report of every node at the start, s; each reports once per second.
 DISCOVERY: Final[float] = 8.0
-#: Only reports received so long, s, after an answer show what the request has changed.
-SETTLING: Final[float] = 0.2
-#: The state of a node whose last report is older, s, is shown as old: a report comes each second.
+#: Only reports received so long after an answer show for certain what it has changed, s.
+SETTLING: Final[float] = 1.5
+#: The state of a node whose last report is older, s, is shown as old.
 OLD: Final[float] = 1.5
 #: An older distance is not shown, s.
 SHOWN: Final[float] = 1.0
 INTERRUPTED: Final[int] = 130
-#: The service of each request, and its value; None: it takes none. 'check' is no service.
-SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = MappingProxyType({
+#: The service of each request, and its value; None: it takes none.
+SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = {
     'arm': ('mavlink_bridge/arm', True), 'takeoff': ('mavlink_bridge/takeoff', None),
     'offboard': ('mavlink_bridge/offboard', True), 'engage': ('planner/engage', True),
     'disengage': ('planner/engage', False), 'hand over': ('mavlink_bridge/offboard', False),
-    'land': ('mavlink_bridge/land', None)})
-KEYS: Final[Mapping[str, str]] = MappingProxyType(
-    {step[0]: step for step in ('check', 'arm', 'takeoff', 'offboard', 'engage', 'land')})
-
-
-def loopback(connection: str) -> bool:
-    """Return whether the bridge's ``connection`` is an address of this machine alone."""
-    network = re.fullmatch(r'(?:udpin|udpout|tcp):([^:\s]+):\d+', connection)
-    try:
-        return network is not None and (
-            network[1] == 'localhost' or ip_address(network[1]).is_loopback)
-    except ValueError:  # another name: it may be resolved to any address
-        return False
+    'land': ('mavlink_bridge/land', None)}
 
 
 @dataclass
@@ -78,23 +61,14 @@ class Reports:
         """Return a value of a node's diagnostics, or ''."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
 
-    def missing(self, now: float) -> list[str]:
-        """Return the nodes without a report within ``SILENCE``."""
-        return [node for node in NODES
-                if node not in self.nodes or now - self.nodes[node][0] > SILENCE]
-
-    def since(self, time: float) -> bool:
-        """Return whether every node has reported after a time."""
-        return all(self.nodes[node][0] > time for node in NODES)
-
     @property
     def streams(self) -> bool:
         """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
         return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
 
-    def due(self, checked: bool) -> str:
+    def due(self) -> str:
         """Return the first step whose result is not reported, '' while the vehicle follows."""
-        reached = {'check': checked, 'arm': self.value('mavlink_bridge', 'armed') == 'True',
+        reached = {'arm': self.value('mavlink_bridge', 'armed') == 'True',
                    'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
                    'offboard': self.bridge == 'ACTIVE',
                    'engage': self.value('planner', 'engaged') == 'True'}
@@ -117,85 +91,63 @@ class Reports:
 
 
 class Flight:
-    """
-    Decides which requests to make; every method returns those to make now, keys of ``SERVICES``.
+    """Decides which requests to make; a method returns those to make now, keys of ``SERVICES``."""
 
-    :param confirm: whether a key confirms each step. If not, each step is requested once, and a
-        refusal, a missing node or a step that is due again ends the flight.
-    """
-
-    def __init__(self, now: float, confirm: bool = True) -> None:
+    def __init__(self, now: float) -> None:
         self.code: int | None = None
         """The exit code, once the flight has ended."""
         self.lines: list[str] = []
         """Lines to print; the caller empties the list."""
-        self._confirm = confirm
-        self._answered = now  # of the last answer, s
-        self._checked = self._landing = False
+        self._start = self._answered = now  # s
+        self._landing = False
         self._ending: int | None = None
         self._question: str | None = None
-        self._missing: list[str] = []
         self._pending: set[str] = set()
-        self._requested: set[str] = set()
 
-    def step(self, reports: Reports, now: float) -> list[str]:
-        """Ask for the key of the step that is due, or request it."""
-        if self._ending is not None or self._pending:
-            return []
-        if missing := reports.missing(now):
-            late = now - self._answered > DISCOVERY
-            return self._name(missing, reports) if late else []
-        self._missing = []
-        if not reports.since(self._answered + SETTLING):
-            return []
+    def step(self, reports: Reports, now: float) -> None:
+        """Ask for the key of the step that is due; end after a landing or without a node."""
+        missing = [node for node in NODES if node not in reports.nodes]
+        if missing and now - self._start > DISCOVERY:
+            self.lines.append(f'missing: {", ".join(missing)}: '
+                              'ros2 launch flock_follower follower.launch.py starts it')
+            self.code = 1
+        if missing or self._pending or self._ending is not None or (
+                now - self._answered < SETTLING):
+            return
+        due = reports.due()
         if self._landing:
             if reports.value('mavlink_bridge', 'armed') == 'False':
                 self.lines.append('landed and disarmed')
-                self._ending = self.code = 0
-            return []
-        due = reports.due(self._checked)
-        if reports.bridge.startswith('NO_AUTOPILOT') or due == self._question:
-            return []
-        self._question = due
-        if self._confirm or not due:
-            self.lines.append(f'{reports.bridge}: press {due[0]} for {due}' if due else
-                              'the follower flies: press l to land; Ctrl-C brakes and hands over')
-            return []
-        if due in self._requested:
-            self.lines.append(f'{due} is due again, but --yes requests each step only once')
-            return self.end(1, reports)
-        return self._request(due)
+                self.code = 0
+        elif due != self._question and not reports.bridge.startswith('NO_AUTOPILOT'):
+            self._question = due
+            self.lines.append(
+                f'{reports.bridge}: press {due[0]} for {due}' if due else
+                'the follower flies: press l to land; Ctrl-C brakes and hands over')
 
     def press(self, key: str, reports: Reports) -> list[str]:
         """Take a key: the key of the step that is due confirms it; l lands at any step."""
-        step = KEYS.get(key, '')
         if self._ending is not None:
             return []
-        if step == 'land' and 'land' not in self._pending and (
-                reports.value('mavlink_bridge', 'flying') != 'False'
-                or 'takeoff' in self._pending):
+        airborne = reports.value('mavlink_bridge', 'flying') != 'False'
+        if key == 'l' and 'land' not in self._pending and (airborne or 'takeoff' in self._pending):
             self._landing = True
             return self._request('disengage', 'land')
-        ready = step and step == self._question and not self._pending and not self._landing
-        return self._request(step) if ready else []
+        confirmed = self._question and key == self._question[0] and not (
+            self._pending or self._landing)
+        return self._request(self._question) if confirmed and self._question else []
 
-    def answer(self, step: str, success: bool, message: str, reports: Reports,
-               now: float) -> list[str]:
-        """Take the answer to a request; after a refusal no further step is requested."""
+    def answer(self, step: str, success: bool, message: str, now: float) -> None:
+        """Take the answer to a request."""
         self._pending.discard(step)
         self._answered, self._question = now, None
         self.lines.append(message)
-        if step == 'check':
-            self._checked = success
         if step == 'land' and not success:
             self._landing = False
-        if self._ending is not None:
-            if step == 'hand over' and not success:
-                self._ending = 1
-            self.code = None if self._pending else self._ending
-        elif not (success or self._confirm or self._landing):
-            return self.end(1, reports)
-        return []
+        if step == 'hand over' and not success:
+            self._ending = 1
+        if self._ending is not None and not self._pending:
+            self.code = self._ending
 
     def end(self, code: int, reports: Reports, insist: bool = True) -> list[str]:
         """
@@ -222,16 +174,4 @@ class Flight:
 
     def _request(self, *steps: str) -> list[str]:
         self._pending |= {*steps}
-        self._requested |= {*steps}
         return list(steps)
-
-    def _name(self, missing: list[str], reports: Reports) -> list[str]:
-        """Name the missing nodes, once; end if nothing was requested before."""
-        if missing == self._missing:
-            return []
-        self._missing, self._question = missing, None
-        self.lines.append(f'missing: {", ".join(missing)} (no diagnostics for {SILENCE:g} s): '
-                          'ros2 launch flock_follower follower.launch.py starts it')
-        if not self._requested:
-            self._ending = self.code = 1
-        return [] if self._confirm else self.end(1, reports)

@@ -32,7 +32,7 @@ from rclpy.qos import QoSProfile
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import checked_name
-from flock_follower.messages import from_odometry, from_state
+from flock_follower.messages import from_odometry, from_state, OdometryState
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
@@ -64,14 +64,13 @@ class SharingNode(FlockNode):
         parameters = self.declare(
             SPECS, lambda values: checked_name(values['vehicle_name'] or namespace))
         self._sharing = Sharing(parameters.current)
-        self._own = OwnOdometry(self, parameters.values)
+        self._own = OwnOdometry(self, parameters.values, self._take_odom, depth=1)
         self._sent = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
         self._received = self.create_publisher(Odometry, RECEIVED_TOPIC, QoSProfile(depth=10))
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, best_effort())
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False)
         self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
         self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
-        self.diagnostics.values['vehicle_name'] = parameters.current
+        self.diagnostics.sources.append(self._senders)
         self.get_logger().info(f'this is {parameters.current}')
         self._timer = self.create_timer(PERIOD, self._tick)
 
@@ -79,21 +78,19 @@ class SharingNode(FlockNode):
         nanoseconds: int = self.get_clock().now().nanoseconds
         return nanoseconds
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        state = self._own.take(message, arrival)
-        if state is not None:
-            self._sharing.take_own(state)
+    def _take_odom(self, state: OdometryState, _: int) -> None:
+        self._sharing.take_own(state)
 
     def _take_neighbor(self, message: Odometry) -> None:
-        self._poll_odom()
+        self._own.poll()
         self._sharing.take_seen(from_odometry(message))
 
     def _take_message(self, message: Odometry) -> None:
-        self._poll_odom()
+        self._own.poll()
         self._sharing.take_message(from_odometry(message), self._now())
 
     def _tick(self) -> None:
-        self._poll_odom()
+        self._own.poll()
         now = self._now()
         for state in self._sharing.neighbors(now):
             self._received.publish(from_state(make, state))
@@ -108,14 +105,16 @@ class SharingNode(FlockNode):
         return (WARN, f'nothing received from others: {why}') if why else None
 
     def _sender_problem(self, now: float) -> Problem | None:
-        """Show the frame of every sender; return which clocks are implausible."""
-        senders = self._sharing.status(self._now())
-        self.diagnostics.parts['senders'] = {
-            f'frame of {sender.name}': sender.why or (
-                f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
-            for sender in senders}
-        odd = [f'{sender.name}: {sender.slow}' for sender in senders if sender.slow]
+        """Return which clocks of senders are implausible."""
+        odd = [f'{sender.name}: {sender.slow}' for sender in self._sharing.status(self._now())
+               if sender.slow]
         return (WARN, '; '.join(odd)) if odd else None
+
+    def _senders(self, now: float) -> dict[str, str]:
+        """Return the frame of every sender for /diagnostics."""
+        return {f'frame of {sender.name}': sender.why or (
+            f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
+            for sender in self._sharing.status(self._now())}
 
     def _rivals(self, now: float) -> Problem | None:
         return rivals(self, RECEIVED_TOPIC, 'publish on {}')

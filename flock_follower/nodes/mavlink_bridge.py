@@ -36,7 +36,6 @@ bridge is to do. The publisher thread publishes and logs what
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 import math
 import os
@@ -44,7 +43,6 @@ import sys
 import time
 from typing import Any
 
-from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
@@ -70,9 +68,7 @@ from flock_follower.messages import (
     from_trajectory,
     OdometryState,
     stamp_age,
-    stamp_to_nanoseconds,
 )
-from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import (
     internal_error,
@@ -100,16 +96,15 @@ UNNUMBERED = ('this middleware numbers no messages: that a second node commands 
               '/diagnostics, but does not brake')
 TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
-ENDED = Outcome(False, 'refused: the setpoint thread has ended or takes no more')
 
 
-@dataclass
 class _Call:
     """A call of a service; the setpoint thread begins its request."""
 
-    answer: Future
-    request: Request | None = None
-    outcome: Outcome | None = None
+    def __init__(self) -> None:
+        self.answer = Future()
+        self.request: Request | None = None
+        self.outcome: Outcome | None = None
 
     def begin(self, ask: Callable[[float], Request]) -> None:
         """Make the request, in the setpoint thread."""
@@ -155,17 +150,15 @@ class MavlinkBridge(FlockNode):
         self._odom_frame = 'odom'
         self._new_odom: list[tuple[OdometryState, float, float]] = []
         self._calls: list[_Call] = []
+        self._sources = CommandSources()
+        self._numbered = True
         self._stream = SetpointThread(
             self._bridge, 1.0 / values['stream_rate'],
-            lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
+            lambda messages, now: self._report.on_messages(messages, now), self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
-        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
-                                    self._publisher)
-        self._own = OwnOdometry(self, values)
-        self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
-
+        self._report = BridgeReport(self, self._bridge, self._stream, self._publisher)
         self._connect(values)
         self._publisher.start()
         self._stream.start()
@@ -178,31 +171,22 @@ class MavlinkBridge(FlockNode):
 
     def _connect(self, values: Mapping[str, Any]) -> None:
         """Create the subscriptions, timers and services."""
-        self._sources = CommandSources()
-        self._numbered = True
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command,
                        COMMANDS_QOS, required=False, informed=True)
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, best_effort(200), required=(
+        self._own = OwnOdometry(self, values, self._take_odom, self._even_clock, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
-        self.create_timer(1.0 / rate, self._hand_over_odom,
-                          clock=STEADY)
+        self.create_timer(1.0 / rate, self._hand_over_odom, clock=STEADY)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
         if values['report_to_gcs']:
-            ground_station = self._bridge.ground_station
-
-            def take(action: Callable[..., None], *value: Any) -> None:
-                self._stream.submit(partial(action, *value, time.monotonic()))
-            self.subscribe(String, 'planner/state', lambda message: take(
-                ground_station.take_state, message.data), LATCHED_QOS, required=False)
+            self.subscribe(String, 'planner/state', self._on_planner_state, LATCHED_QOS,
+                           required=False)
             self.create_timer(DISTANCE_PERIOD, self.poll(
-                Range, 'planner/distance', lambda message, _: take(
-                    ground_station.take_distance, message.header.frame_id, message.range),
-                best_effort(), required=False))
+                Range, 'planner/distance', self._on_distance, best_effort(), required=False))
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
@@ -214,8 +198,7 @@ class MavlinkBridge(FlockNode):
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
 
-    def _on_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
-        message, info = received
+    def _on_command(self, message: MultiDOFJointTrajectory, info: Mapping[str, Any]) -> None:
         now = time.monotonic()
         self._watch_commanders(info, now)
         command = from_trajectory(message, self._odom_frame)
@@ -223,8 +206,6 @@ class MavlinkBridge(FlockNode):
         if not self._even_clock.fresh('command/trajectory', command.stamp):
             return
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
-        if command.stamp > 0:
-            self._report.stamped('command/trajectory', source_age)
 
         def take() -> None:
             if refused := self._bridge.gate.take_command(command, age, now, source_age):
@@ -250,27 +231,25 @@ class MavlinkBridge(FlockNode):
         """Return whether the vehicle flies the commands."""
         return self._bridge.gate.permission.phase is Phase.ACTIVE
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        self._even_clock.now()
-        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
-            return
-        waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
-        now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
-        shift = self._even_clock.shift
-        state = self._own.take(message, arrival - shift, shift)
-        if state is None:
-            return
-        age = stamp_age(state.stamp, arrival - shift)
-        if state.stamp > 0:
-            self._report.stamped('odom', age)
+    def _on_planner_state(self, message: String) -> None:
+        self._stream.submit(lambda: self._bridge.ground_station.take_state(
+            message.data, time.monotonic()))
+
+    def _on_distance(self, message: Range, _: int) -> None:
+        self._stream.submit(lambda: self._bridge.ground_station.take_distance(
+            message.header.frame_id, message.range, time.monotonic()))
+
+    def _take_odom(self, state: OdometryState, arrival: int) -> None:
+        # Never in the future, if the clock was set.
+        now = time.monotonic() - max((self._even_clock.now() - arrival) * 1e-9, 0.0)
         self._odom_frame = state.frame
-        self._outputs.place = state, now
-        self._new_odom.append((state, age, now))
+        self._report.place = state, now
+        self._new_odom.append((state, stamp_age(state.stamp, arrival), now))
 
     def _hand_over_odom(self) -> None:
         """Take the odometry that waits, and hand it over; answer the services."""
         self._answer_calls()
-        self._poll_odom()
+        self._own.poll()
         taken, self._new_odom = self._new_odom, []
         if taken and not self._stream.submit(lambda: self._use_odom(taken)):
             self.diagnostics.reject('odom not taken', TOO_MANY)
@@ -283,17 +262,13 @@ class MavlinkBridge(FlockNode):
             'offboard': lambda now: requests.offboard(request.data, now),
             'takeoff': lambda now: requests.takeoff(self._settings.values['takeoff_height'], now),
             'land': requests.land}
-        call = _Call(Future())
+        call = _Call()
         self._calls.append(call)
         if not self._stream.submit(lambda: call.begin(ask[name]), call.refuse):
-            call.outcome = ENDED
+            call.refuse()
         self._answer_calls()
         response.success, response.message = await call.answer
-        log = self.get_logger()
-        if response.success:
-            log.info(response.message)
-        else:
-            log.warning(response.message)
+        self.get_logger().info(f'{name}: {response.message}')
         return response
 
     def _answer_calls(self, otherwise: Outcome | None = None) -> None:
@@ -318,9 +293,8 @@ class MavlinkBridge(FlockNode):
                 self._report.refused(f'odom {refused}', f'stamp {age:.3f} s old')
 
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
-        self._report.cycle(cycle, now)
         self._bridge.gate.limits = self._settings.current
-        self._outputs.on_cycle(now)
+        self._report.on_cycle(cycle, now)
 
 
 def _open_link(values: Mapping[str, Any]) -> Link:

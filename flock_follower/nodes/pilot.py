@@ -23,13 +23,12 @@ over: the node handles the signals itself, so that ROS runs until the services h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
 import math
 import os
 import select
 import signal
-import sys
 import termios
 import time
 import tty
@@ -43,52 +42,29 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.bags.live_line import LiveLine
-from flock_follower.checks.observations import Observations
 from flock_follower.nodes.call import patience
-from flock_follower.nodes.flight_steps import (
-    DISCOVERY,
-    Flight,
-    INTERRUPTED,
-    loopback,
-    Reports,
-    SERVICES,
-)
-from flock_follower.nodes.observer import Observer
+from flock_follower.nodes.flight_steps import Flight, INTERRUPTED, Reports, SERVICES
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
-from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
 
 
 class Pilot(Node):
-    """
-    Flies by keys.
+    """Flies by keys."""
 
-    :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
-    :param verdict: returns whether ``check`` permits the flight, and its findings as text.
-    :param seconds: time for which ``check`` listens.
-    """
-
-    def __init__(self, namespace: str, confirm: bool,
-                 verdict: Callable[[Observations], tuple[bool, str]], seconds: float) -> None:
+    def __init__(self, namespace: str) -> None:
         super().__init__('follow', namespace=namespace, start_parameter_services=False)
-        self._confirm, self._verdict, self._seconds = confirm, verdict, seconds
-        self._reports = Reports()
-        self._flight = Flight(time.monotonic(), confirm)
-        self._runner = SingleThreadedExecutor()
-        self._runner.add_node(self)
+        self._reports, self._flight = Reports(), Flight(time.monotonic())
         self._signals: list[int] = []
-        self._checking = False
         self._keyboard = True
         self._line = LiveLine()
         self._calls: dict[str, tuple[Any, float]] = {}
         self._callers = {step: self.create_client(Trigger if value is None else SetBool, service)
                          for step, (service, value) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
-        self.create_subscription(String, 'mavlink_bridge/state', lambda message: setattr(
-            self._reports, 'bridge', message.data), LATCHED_QOS)
+        self.create_subscription(String, 'mavlink_bridge/state', self._take_state, LATCHED_QOS)
         self.create_subscription(Range, 'planner/distance', self._take_distance, best_effort())
         self.create_subscription(
             BatteryState, 'mavlink/battery', self._take_battery, best_effort())
@@ -99,6 +75,9 @@ class Pilot(Node):
             if space == self.get_namespace().rstrip('/'):
                 self._reports.nodes[node] = time.monotonic(), {
                     pair.key: pair.value for pair in status.values}
+
+    def _take_state(self, message: String) -> None:
+        self._reports.bridge = message.data
 
     def _take_distance(self, message: Range) -> None:
         self._reports.distance = (
@@ -111,55 +90,35 @@ class Pilot(Node):
     def spin(self) -> int:
         """Fly, and return the exit code."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._on_signal)
-        if not self._confirm and (refused := self._real_vehicle()):
-            print(f'error: {refused}', file=sys.stderr)
-            return 1
+            # No more than that: the interrupted code may hold a lock that a call needs.
+            signal.signal(number, lambda number, _: self._signals.append(number))
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
         with _single_keys():
             while self._flight.code is None:
                 try:
-                    self._turn()
+                    executor.spin_once(timeout_sec=POLL_PERIOD)
+                    self._turn(time.monotonic())
                 except Exception as error:  # a second one ends the command
                     self._flight.lines.append(internal_error(error))
                     self._request(self._flight.end(1, self._reports))
         return self._flight.code
 
-    def _turn(self) -> None:
-        self._runner.spin_once(timeout_sec=POLL_PERIOD)
-        now = time.monotonic()
-        self._take_keys()
-        self._take_answers(now)
-        self._request(self._flight.step(self._reports, now))
-        self._show(now)
-
-    def _on_signal(self, number: int, _: object) -> None:
-        # No more than that: the interrupted code may hold a lock that a call needs.
-        self._signals.append(number)
-        if self._checking:
-            raise KeyboardInterrupt
-
-    def _real_vehicle(self) -> str:
-        """Return the reason if the bridge's ``connection`` may lead to a real autopilot, or ''."""
-        bridge, asked = RemoteParameters(self, 'mavlink_bridge'), False
-        end = time.monotonic() + DISCOVERY
-        while bridge.values is None:
-            if time.monotonic() > end:
-                return 'missing: mavlink_bridge, whose connection --yes must know'
-            self._runner.spin_once(timeout_sec=POLL_PERIOD)
-            asked = asked or bridge.ask(['connection'])
-        connection = str(bridge.values['connection'])
-        return '' if loopback(connection) else (
-            f'--yes: connection = {connection!r} of mavlink_bridge: must be a loopback address, '
-            'such as udpin:127.0.0.1:14540 of a simulator')
-
-    def _take_keys(self) -> None:
-        """Take signals and keys; a closed terminal brakes and hands over."""
+    def _turn(self, now: float) -> None:
         received, self._signals = self._signals, []
         for number in received:  # a logout sends several: only Ctrl-C, pressed again, insists
             self._request(self._flight.end(
                 INTERRUPTED, self._reports, insist=number == signal.SIGINT))
+        if self._keyboard:
+            self._take_keys()
+        self._take_answers(now)
+        self._flight.step(self._reports, now)
+        self._show(now)
+
+    def _take_keys(self) -> None:
+        """Take keys; a closed terminal brakes and hands over."""
         try:
-            if not self._keyboard or not select.select([0], [], [], 0.0)[0]:
+            if not select.select([0], [], [], 0.0)[0]:
                 return
             keys = os.read(0, 64)
         except OSError:
@@ -167,48 +126,27 @@ class Pilot(Node):
         for key in keys.decode('ascii', 'replace'):
             self._request(self._flight.press(key, self._reports))
         self._keyboard = bool(keys)
-        if not keys and self._confirm:  # --yes needs no keyboard
+        if not keys:
             self._flight.lines.append('the terminal is closed')
             self._request(self._flight.end(INTERRUPTED, self._reports, insist=False))
 
     def _request(self, steps: list[str]) -> None:
         for step in steps:
-            if step == 'check':
-                self._check()
-                continue
             service, value = SERVICES[step]
-            client = self._callers[step]
             request = Trigger.Request() if value is None else SetBool.Request(data=value)
-            self._calls[step] = client.call_async(request), time.monotonic() + patience(service)
-
-    def _check(self) -> None:
-        """Run the command ``check`` here; no key is read for its duration of some seconds."""
-        observer = Observer(self._seconds, self.get_namespace(), {}, None, '')
-        self._checking = True
-        try:
-            ready, text = self._verdict(observer.observe())
-        except ValueError as error:
-            ready, text = False, str(error)
-        except KeyboardInterrupt:
-            return
-        finally:
-            self._checking = False
-            observer.destroy_node()
-        self._request(self._flight.answer(
-            'check', ready, text, self._reports, time.monotonic()))
+            self._calls[step] = (self._callers[step].call_async(request),
+                                 time.monotonic() + patience(service))
 
     def _take_answers(self, now: float) -> None:
         for step, (future, end) in list(self._calls.items()):
             if future.done():
                 success, message = future.result().success, future.result().message
-            elif not self._callers[step].service_is_ready():
-                success, message = False, f'{step}: no service {SERVICES[step][0]}'
-            elif now > end:
-                success, message = False, f'{step}: no answer: the result is unknown'
+            elif now > end or not self._callers[step].service_is_ready():
+                success, message = False, f'{step}: no answer of {SERVICES[step][0]}'
             else:
                 continue
             del self._calls[step]
-            self._request(self._flight.answer(step, success, message, self._reports, now))
+            self._flight.answer(step, success, message, now)
 
     def _show(self, now: float) -> None:
         """Print; an error of the terminal must not prevent the handing over."""
@@ -235,8 +173,7 @@ def _single_keys() -> Iterator[None]:
             termios.tcsetattr(0, termios.TCSANOW, before)
 
 
-def fly(namespace: str, confirm: bool, verdict: Callable[[Observations], tuple[bool, str]],
-        seconds: float) -> int:
-    """Run the node and return the exit code; the arguments are those of :class:`Pilot`."""
+def fly(namespace: str) -> int:
+    """Run the node in a namespace, and return the exit code."""
     never_block_output()  # a stopped terminal must not prevent the handing over
-    return run(lambda: Pilot(namespace, confirm, verdict, seconds), ['follow'], Pilot.spin)
+    return run(lambda: Pilot(namespace), ['follow'], Pilot.spin)

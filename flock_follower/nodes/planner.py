@@ -40,7 +40,6 @@ from typing import Any
 
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
-import numpy as np
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Range
 from std_msgs.msg import Header, String
@@ -88,37 +87,36 @@ class Planner(FlockNode):
         super().__init__('planner', **kwargs)
         self._start: PlannerParams | None = None
         self._settings = self.declare(SPECS, self._build, self._flying)
-        self._loop = PlannerLoop(self._settings.values['require_bridge'])
+        values = self._settings.values
+        self._loop = PlannerLoop(values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
-        configured = cameras(self._settings.values)
+        configured = cameras(values)
         self._rpy = {camera.name: camera.rpy for camera in configured}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
-        self._decision: Decision | None = None
-        self._given_up = False
-        self._guarded = 0
-        self._limited = 0
+        self._decision = Decision(State.IDLE)
+        self._reported: tuple[State, bool] | None = None
         self._ticked = time.monotonic()
         self._even_clock = EvenClock(self)
         self._accelerations: dict[str, AccelerationState] = {}
+        self._own = OwnOdometry(self, values, self._take_odom, self._even_clock)
 
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
             self._poll_states(Odometry, MOTION_TOPIC, from_odometry, self._take_motion, 200),
-            self.poll(Odometry, 'odom', self._take_odom, best_effort(200)),
+            self._own.poll,
             self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
                               from_acceleration, self._take_acceleration, 100),
+            # Images without a leader in them: a silent publisher is no fault.
             self._poll_states(Odometry, 'neighbors', from_odometry, self._take_neighbor, 100,
-                              required=True),
+                              required=True, sporadic=True),
             self._poll_states(Odometry, 'neighbors/heard', from_odometry, self._take_received, 50),
             *(self.poll(CameraInfo, camera.camera_info,
                         partial(self._take_camera_info, camera=camera.name), best_effort(),
                         required=False) for camera in configured)]
         self._poll_frames = self.poll(
             Header, 'neighbors/frames', self._take_frame, best_effort(), required=False)
-        inputs = self.diagnostics.inputs
-        inputs['neighbors'].heartbeat = inputs['neighbors/frames']  # images without a leader
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, LATCHED_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, LATCHED_QOS, required=False)
@@ -126,10 +124,10 @@ class Planner(FlockNode):
             MultiDOFJointTrajectory, 'command/trajectory', QoSProfile(depth=1))
         self._states = self.create_publisher(String, 'planner/state', LATCHED_QOS)
         self._distances = self.create_publisher(Range, 'planner/distance', best_effort())
-        self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
+        self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
-        self._own = OwnOdometry(self, self._settings.values)
+        self.diagnostics.sources.append(self._values)
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
@@ -148,24 +146,36 @@ class Planner(FlockNode):
             self._settings.values['require_bridge'] or self._loop.engaged)
 
     def _poll_states(self, kind: Any, topic: str, convert: Callable[[Any], Any],
-                     take: Callable[[Any, int], None], depth: int,
-                     required: bool = False) -> Callable[[], None]:
+                     take: Callable[[Any, int], None], depth: int, required: bool = False,
+                     sporadic: bool = False) -> Callable[[], None]:
         """Poll a topic; ``take`` gets states, their stamps by the loop's clock, and arrivals."""
         def taken(message: Any, arrival: int) -> None:
             if self._even_clock.fresh(topic, stamp_to_nanoseconds(message.header.stamp)):
                 state = convert(message)
-                take(state._replace(stamp=self._even_clock.dated(state.stamp, arrival)), arrival)
-        return self.poll(kind, topic, taken, best_effort(depth), required=required)
+                take(state._replace(stamp=self._even_clock.dated(state.stamp, arrival)),
+                     arrival - self._even_clock.shift)
+        return self.poll(kind, topic, taken, best_effort(depth), required=required,
+                         sporadic=sporadic)
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        shift = self._even_clock.shift
-        if not self._even_clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
-            return
-        state = self._own.take(message, arrival - shift, shift)
-        if state is not None:
-            if not self._even_clock.simulated:
-                state = state._replace(stamp=min(state.stamp, arrival - shift))
-            self._loop.take_odometry(state, arrival - shift)
+    def _take_odom(self, state: OdometryState, arrival: int) -> None:
+        if not self._even_clock.simulated:
+            state = state._replace(stamp=min(state.stamp, arrival))
+        self._loop.take_odometry(state, arrival)
+
+    def _take_motion(self, state: OdometryState, arrival: int) -> None:
+        self._loop.take_odometry(state, arrival)
+
+    def _take_acceleration(self, state: AccelerationState, _: int) -> None:
+        self._accelerations[state.child] = state
+
+    def _take_neighbor(self, state: OdometryState, _: int) -> None:
+        reported = self._accelerations.get(state.child)
+        if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
+            state = with_acceleration(state, reported)
+        self._loop.take_neighbor(state)
+
+    def _take_received(self, state: OdometryState, _: int) -> None:
+        self._loop.take_neighbor(state, received=True)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -178,31 +188,11 @@ class Planner(FlockNode):
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
         return time.monotonic() - self._bridge_received
 
-    def _take_neighbor(self, state: OdometryState, _: int) -> None:
-        reported = self._accelerations.get(state.child)
-        if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
-            state = with_acceleration(state, reported)
-        self._loop.take_neighbor(state)
-
-    def _take_received(self, state: OdometryState, _: int) -> None:
-        self._loop.take_neighbor(state, received=True)
-
-    def _take_motion(self, state: OdometryState, arrival: int) -> None:
-        self._loop.take_odometry(state, arrival - self._even_clock.shift)
-
-    def _take_acceleration(self, state: AccelerationState, _: int) -> None:
-        self._accelerations[state.child] = state
-
-    def _take_camera_info(self, message: CameraInfo, _: int = 0, camera: str = '') -> None:
+    def _take_camera_info(self, message: CameraInfo, _: int, camera: str) -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model
-        if calibration == self._calibrations.get(camera):
-            return
-        self._calibrations[camera] = calibration
-        self._loop.take_camera_info(message, self._rpy[camera], camera)
-        left, right, up, down = (f'{math.degrees(max(angles)):.0f}'
-                                 for angles in list(zip(*self._loop.view))[:4])
-        self.get_logger().info('keeps the leader in sight of the camera: degrees to the left '
-                               f'{left}, right {right}, up {up}, down {down}')
+        if calibration != self._calibrations.get(camera):
+            self._calibrations[camera] = calibration
+            self._loop.take_camera_info(message, self._rpy[camera], camera)
 
     def _take_armed_at(self, message: PointStamped) -> None:
         if math.isfinite(message.point.z):
@@ -226,25 +216,23 @@ class Planner(FlockNode):
 
     def _serve_engage(self, request: SetBool.Request,
                       response: SetBool.Response) -> SetBool.Response:
-        response.success = True
-        if not request.data:
-            self._loop.engage(False)
-            response.message = 'disengaged: no more commands'
-        else:
-            before = 'already ' if self._loop.engaged else ''
-            self._loop.engage(True)
-            missing = self._missing()
+        before = 'already ' if self._loop.engaged else ''
+        self._loop.engage(request.data)
+        missing = self._missing()
+        response.success, response.message = True, 'disengaged: no more commands'
+        if request.data:
             response.message = f'{before}engaged' + (
                 f'; waiting for: {"; ".join(missing)}' if missing else '')
         self.get_logger().info(response.message)
         return response
 
     def _missing(self) -> list[str]:
-        """Return the missing condition before it follows."""
+        """Return what must come before it follows."""
         fault = self._loop.odometry_fault(self._even_clock.now(), self._settings.current)
-        missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
-        missing += filter(None, [self._loop.waiting(self._bridge_age())])
-        return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
+        return [*filter(None, [
+            f'{fault} on {self.resolve_topic_name("odom")}' if fault else '',
+            self._loop.waiting(self._bridge_age()),
+            '' if self._loop.memory.neighbors else 'no neighbor seen yet'])]
 
     def _tick(self) -> None:
         self._even_clock.now()  # a clock that was set is found before what waits is judged by it
@@ -266,53 +254,45 @@ class Planner(FlockNode):
             stamp = nanoseconds_to_stamp(nanoseconds + self._even_clock.shift)
             self._distances.publish(Range(
                 header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
-        self._publish_state(decision, self._loop.seconds(nanoseconds))
+        self._report(decision)
 
-    def _publish_state(self, decision: Decision, now: float) -> None:
-        """Publish the state where it changed, and keep what /diagnostics shows of the tick."""
+    def _report(self, decision: Decision) -> None:
+        """Publish the state if it has changed."""
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
-        before, self._decision = self._decision, decision
-        if before is None or decision.state is not before.state or (
-                self._loop.memory.given_up > self._given_up):
+        reported = decision.state, self._loop.memory.given_up
+        if reported != self._reported:
+            self._reported = reported
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
-        self._given_up = self._loop.memory.given_up
-        self._limited += bool(decision.limits)
-        self._guarded += decision.guarded
-        values = {'state': decision.state.value, 'reason': decision.reason,
-                  'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
-                  'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
-                  'guarded_commands': self._guarded, 'limits': decision.limits,
-                  'warnings': '; '.join(decision.warnings),
-                  'edges': ', '.join(decision.edges), 'known': len(decision.known)}
-        self.diagnostics.parts['tick'] = values
-        if decision.acceleration is not None:
-            values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
-        if self._bridge is not None:
-            values['bridge_age_s'] = f'{self._bridge_age():.3f}'
-        memory = self._loop.memory
-        if memory.own is not None:
-            values['odom_age_s'] = f'{now - memory.own.stamp:.3f}'
-        for name, n in memory.neighbors.items():
-            values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
-        for each in decision.known:
-            values[f'{each.name}_is'] = ', '.join([
-                each.member.role, 'heard' if each.received else 'seen',
-                *(['edge'] if each.name in decision.edges else [])])
+        self._decision = decision
+
+    def _values(self, _: float) -> dict[str, Any]:
+        """Return the values of the newest tick for /diagnostics."""
+        decision, memory = self._decision, self._loop.memory
+        now = self._loop.seconds(self._even_clock.now())
+        states = {'odom': memory.own, **memory.neighbors}
+        return {
+            'state': decision.state.value, 'reason': decision.reason,
+            'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
+            'missed_ticks': self._loop.missed, 'limits': decision.limits,
+            'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),
+            **{f'{name}_age_s': f'{now - state.stamp:.3f}'
+               for name, state in states.items() if state is not None},
+            **{f'{each.name}_is': f'{each.member.role}, {"heard" if each.received else "seen"}'
+               for each in decision.known}}
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked
         if silent <= TICK_TIMEOUT:
             return None
-        clock = 'is /clock published?' if self.get_parameter('use_sim_time').value else (
-            'the executor is blocked')
+        clock = 'is /clock published?' if self._even_clock.simulated else 'the executor is blocked'
         return ERROR, f'no tick for {silent:.0f} s: {clock}'
 
     def _state_problem(self, now: float) -> Problem | None:
         decision = self._decision
-        if decision is None or decision.reason == 'not engaged':
+        if decision.reason in ('', 'not engaged') and not decision.warnings:
             return None
         if decision.state is not State.TRACK:
             return WARN, f'{decision.state.value}: {decision.reason}'
@@ -323,7 +303,7 @@ class Planner(FlockNode):
         if view and all(field.outside(0.0) for field in view) and (
                 self._settings.current.yaw_mode == 'leader'):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view or self._decision is None or self._decision.state is State.IDLE:
+        if view or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
                       'that keep the leader in the image')

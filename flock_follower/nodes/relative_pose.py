@@ -54,14 +54,11 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.perception.images import compute_in_one_thread
-from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
 
-# What comes between two images must not be lost: 200 messages are 1 s at 200 Hz.
-ODOM_QOS = best_effort(200)
 POLL_PERIOD = 0.1  # s between two looks at odometry where no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
@@ -74,40 +71,29 @@ class _Camera:
         self.name = values.name
         self.of = f' of camera {values.name}' if values.name else ''
         self.dropping_since: float | None = None
-        self.last_rejection = ''
+        self._last_rejection = ''
         self._node = node
-        compressed = transport == 'compressed'
-        topic = values.images(transport)
-        self._other_transport = 'raw' if compressed else 'compressed'
-        self._other_topic = values.images(self._other_transport)
-        node.subscribe(CompressedImage if compressed else Image, topic,
-                       partial(node.take_image, self), best_effort(), of=self.of, largest=None)
+        node.subscribe(CompressedImage if transport == 'compressed' else Image,
+                       values.images(transport), partial(node.take_image, self), best_effort(),
+                       largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
-                       best_effort(), of=self.of)
-        self._images = node.diagnostics.rates[f'{topic}_hz']
+                       best_effort())
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
-        node.diagnostics.checks += [self._transport_problem, self._processing_problem]
+        node.diagnostics.checks.append(self._processing_problem)
 
     def reject(self, reason: str, detail: str = '') -> None:
         """Count that an image, or something in it, was dropped."""
-        self.last_rejection = f'{reason}: {detail}' if detail else reason
+        self._last_rejection = f'{reason}: {detail}' if detail else reason
         self.dropping_since = self.dropping_since or time.monotonic()
         self._node.diagnostics.reject(f'{reason}{self.of}', detail)
-
-    def _transport_problem(self, now: float) -> Problem | None:
-        """Point to the other image topic where only that one is published."""
-        if self._images.count or not self._node.count_publishers(self._other_topic):
-            return None
-        return WARN, (f'{self._node.resolve_topic_name(self._other_topic)} is published: set '
-                      f'image_transport to {self._other_transport}')
 
     def _processing_problem(self, now: float) -> Problem | None:
         if self.dropping_since is None or now - self.dropping_since < UNSEEN_TIMEOUT:
             return None
         return ERROR, (f'no image{self.of} processed for {now - self.dropping_since:.0f} s: '
-                       f'{self.last_rejection}')
+                       f'{self._last_rejection}')
 
 
 class RelativePose(FlockNode):
@@ -126,9 +112,8 @@ class RelativePose(FlockNode):
 
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
-                                    awaited=self._awaited)
-        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, ODOM_QOS,
+        self._own = OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited)
+        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
                                       required=False, awaited=self._awaited)
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
@@ -136,9 +121,8 @@ class RelativePose(FlockNode):
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', QoSProfile(depth=10))
         self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
-        self.diagnostics.checks += [
-            self._sight_problem, self._duplicate_problem, self._show_learnt]
-        self._own = OwnOdometry(self, self._values)
+        self.diagnostics.checks += [self._sight_problem, self._duplicate_problem]
+        self.diagnostics.sources.append(self._learnt)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=STEADY)
@@ -161,17 +145,12 @@ class RelativePose(FlockNode):
     def poll_odom(self) -> None:
         """Take the odometry that waits, and before it the motion that is flown on without it."""
         self._poll_motion()
-        self._poll_odom()
+        self._own.poll()
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
-        self._use_odometry(from_odometry(message))
+        self._use_odometry(from_odometry(message), arrival)
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        state = self._own.take(message, arrival)
-        if state is not None:
-            self._use_odometry(state)
-
-    def _use_odometry(self, state: OdometryState) -> None:
+    def _use_odometry(self, state: OdometryState, arrival: int) -> None:
         if self._perceiver.take_odometry(state):
             self.diagnostics.reject(*JUMPED)
         self._process_pending()
@@ -187,11 +166,8 @@ class RelativePose(FlockNode):
 
     def _take_range(self, message: Range) -> None:
         self.poll_odom()
-        measured = from_range(message)
-        if (rejection := self._perceiver.take_range(measured)) is not None:
+        if (rejection := self._perceiver.take_range(from_range(message))) is not None:
             self.diagnostics.reject(*rejection)
-            return
-        self.diagnostics.rate(f'ranges_{measured.name}').tick(time.monotonic())
         self._use_ranges()
 
     def _use_ranges(self) -> None:
@@ -228,10 +204,10 @@ class RelativePose(FlockNode):
     def _count(self, seen: Processed) -> None:
         """Update the diagnostics with the result of an image, and draw it if anybody looks."""
         image, sighting, camera = seen.image, seen.sighting, self._cameras[seen.image.camera]
-        for reason, detail in sighting.rejections:
-            camera.reject(reason, detail)
         now = time.monotonic()
         age = self.get_clock().now().nanoseconds - image.stamp_ns
+        for reason, detail in sighting.rejections:
+            camera.reject(reason, detail)
         for name in sighting.estimates:
             self.diagnostics.rate(name).tick(now)
             if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
@@ -239,9 +215,7 @@ class RelativePose(FlockNode):
         self.diagnostics.latency('processing').add(seen.decoding + seen.perception)
         if seen.usable:
             self._processed, camera.dropping_since = now, None
-            rate = self.diagnostics.rate('processed')
-            rate.tick(now)
-            self.diagnostics.values['images_processed'] = rate.count
+            self.diagnostics.rate('processed').tick(now)
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
@@ -257,31 +231,28 @@ class RelativePose(FlockNode):
         self._accelerations.publish(acceleration)  # first: the planner has it with the state
         self._neighbors.publish(state)
 
-    def _show_learnt(self, now: float) -> Problem | None:
-        """Show the estimates of clock offsets, noise and range errors."""
-        values = self.diagnostics.values
+    def _learnt(self, now: float) -> dict[str, object]:
+        """Return the estimates of clock offsets, noise and range errors for /diagnostics."""
+        values: dict[str, object] = {'images_processed': self.diagnostics.rate('processed').count}
         for name, camera in self._tracker.cameras.items():
-            noise = camera.noise
-            values[_key('time_offset', name)] = camera.time_offset.describe
-            values[_key('attitude_noise_rad', name)] = f'{noise.attitude:.5f}'
-            values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
+            values |= {
+                _key('time_offset', name): camera.time_offset.describe,
+                _key('attitude_noise_rad', name): f'{camera.noise.attitude:.5f}',
+                _key('distance_noise_percent', name): f'{100.0 * camera.noise.distance:.2f}'}
         for name, bias in self._tracker.ranging.biases.items():
-            self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value:.3f}'
-            self.diagnostics.values[f'range_outliers_{name}_percent'] = (
-                f'{100.0 * bias.gate.outliers:.1f}')
-        return None
+            values |= {f'range_bias_{name}_m': f'{bias.value:.3f}',
+                       f'range_outliers_{name}_percent': f'{100.0 * bias.gate.outliers:.1f}'}
+        return values
 
     def _sight_problem(self, now: float) -> Problem | None:
         if now - self._processed > UNSEEN_TIMEOUT:
             return None  # nothing can be seen without images
-        unseen = [f'{n.name} (marker {_ids(n)} of {self._tracker.config.dictionary})'
-                  for n in self._tracker.config.neighbors
+        unseen = [f'{n.name} (marker {", ".join(str(m.marker_id) for m in n.markers)} of '
+                  f'{self._tracker.config.dictionary})' for n in self._tracker.config.neighbors
                   if now - self._seen[n.name] > UNSEEN_TIMEOUT]
-        if not unseen:
-            return None
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
-        return WARN, f'not in sight: {", ".join(unseen)}{instead}'
+        return (WARN, f'not in sight: {", ".join(unseen)}{instead}') if unseen else None
 
     def _duplicate_problem(self, now: float) -> Problem | None:
         for name, (seen, estimate) in self._duplicates.items():
@@ -297,10 +268,6 @@ class RelativePose(FlockNode):
 def _key(what: str, camera: str) -> str:
     """Return how a value of a camera is called: the only one has no name."""
     return f'{what} {camera}' if camera else what
-
-
-def _ids(neighbor: MarkedNeighbor) -> str:
-    return ', '.join(str(marker.marker_id) for marker in neighbor.markers)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -13,340 +13,233 @@
 # limitations under the License.
 
 """
-The visualizer node: the flight as markers and transforms for RViz and Foxglove.
+The visualizer node: the flight as markers for RViz and Foxglove.
 
-Publishes ``visualizer/markers`` (leader, band, command, field of view, guard), and, if tf2_msgs is
-installed, ``odom -> base_link -> camera`` and ``odom -> leader`` on ``/tf``. It works only while a
-viewer subscribes, and no other node waits for it. ``nodes.shapes`` has the shapes;
-the band and the cameras are parameters of planner and relative_pose.
+Publishes ``visualizer/markers`` in the frame of ``odom`` while a viewer subscribes: the follower
+with its state and command, and each neighbour with its velocity, the ellipsoid of its position and
+the planner's band about it. No other node waits for it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 import math
 import sys
-import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Point, TransformStamped
+from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
+import numpy as np
+from numpy.typing import ArrayLike
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo
-from std_msgs.msg import ColorRGBA, String
+from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flock_follower.geometry import quaternion_from_rpy, R_FLU_OPTICAL, Transform
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
 from flock_follower.messages import (
     Command,
     from_odometry,
     from_trajectory,
+    NANOSECONDS,
     OdometryState,
     set_quaternion,
-    set_stamp,
     set_vector,
 )
-from flock_follower.nodes.shapes import (
-    Band,
-    CameraSight,
-    image_corners,
-    PlannerReport,
-    Shape,
-    shapes,
-    Snapshot,
-)
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
-from flock_follower.nodes.support.diagnostics import publishers, STEADY
-from flock_follower.nodes.support.inputs import (
-    BASE,
-    best_effort,
-    LATCHED_QOS,
-    StaticChild,
-    TF_STATIC,
-    transform_message,
-)
+from flock_follower.nodes.support.diagnostics import STEADY
+from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import FlockNode, run, Waiting
-from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras, CameraValues
-from flock_follower.parameters.spec import check_values, NAMES, Spec
-from flock_follower.ranges import Range
+from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.spec import Spec
+from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 
-MARKERS_TOPIC = 'visualizer/markers'
-TF = '/tf'
-#: Whether to broadcast odom -> base_link.
-AUTO, ALWAYS, NEVER = ODOM_TF = 'auto', 'always', 'never'
-ASK_PERIOD = 3.0  # s between two requests for parameters of planner and relative_pose
-SETTLING = 2.0  # s in which tf_static is received before a camera's frame is taken as unknown
+SPECS: list[Spec] = []
+PERIOD = 0.1  # s between two drawings
+ASK_PERIOD = 3.0  # s between two requests for the band, which can be changed in flight
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
-IDLE_PERIOD = 0.2  # s between two looks for a viewer
-ODOMETRY = ('odom_child_position', 'odom_child_rpy')
-PLANNER = ('d0', 'd1', 'radius')
+LARGEST = 65536  # bytes of a message on /diagnostics
 
-SPECS = [
-    Spec('rate', 10.0, 'rate of markers and transforms, while a '
-                       'viewer subscribes', Range(1.0, 50.0, 'Hz')),
-    Spec('odom_tf', AUTO,
-         'whether to broadcast odom -> base_link: auto, while no other node publishes on /tf (an '
-         'odometry normally does); always; never', ODOM_TF),
-]
+DEGENERATE = 1e-3  # m: nothing is drawn shorter than this, viewers refuse sizes of zero
+DEVIATIONS = 2.0  # of the ellipsoids
+VELOCITY_TIME = 1.0  # s: an arrow of velocity ends where it leads in this time
+ACCELERATION_SCALE = 0.5  # m of arrow per m/s^2
+UNSEEN = 0.25  # s without an image of it after which a neighbour is drawn in grey
+FORGOTTEN = 10.0  # s after which it is drawn no more
+SILENT = 0.5  # s after which a command is drawn no more
+ABOVE = np.array([0.0, 0.0, 0.3])  # m: the place of a label
+BODY_SIZE = (0.35, 0.35, 0.1)  # m
+TEXT_SIZE = (0.0, 0.0, 0.15)  # m: the height
+
+Color = tuple[float, float, float, float]
+"""Red, green, blue and opacity, each in [0, 1]."""
+
+SEEN, GREY, ELLIPSOID = (0.2, 0.5, 1.0, 0.9), (0.7, 0.7, 0.7, 0.9), (0.2, 0.5, 1.0, 0.25)
+EDGE, INNER, OUTER = (1.0, 1.0, 1.0, 0.6), (0.95, 0.3, 0.2, 0.7), (0.2, 0.8, 0.9, 0.7)
+COMMAND, GUARDED = (0.3, 0.9, 0.3, 1.0), (1.0, 0.55, 0.0, 1.0)
+STATES = {'TRACK': (0.3, 0.9, 0.3, 0.9), 'COAST': (0.95, 0.85, 0.2, 0.9),
+          'SEARCH': (1.0, 0.55, 0.0, 0.9), 'HOLD': (1.0, 0.3, 0.2, 0.9),
+          'RELATIVE': (0.8, 0.3, 0.9, 0.9)}
 
 
 class Visualizer(FlockNode):
-    """
-    Draws the messages of the other nodes while a viewer subscribes.
-
-    Its inputs are subscribed to only then, and wait until a tick takes them: 200 messages per
-    second cost 2 % of a core even if no callback takes them.
-    """
+    """Draws the newest messages of the other nodes; without a viewer it takes none."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('visualizer', **kwargs)
-        values = self.declare(SPECS, lambda checked: checked).values
-        self._period = 1.0 / values['rate']
+        self.declare(SPECS, dict)
         self._own: OdometryState | None = None
         self._neighbors: dict[str, OdometryState] = {}
         self._command: Command | None = None
-        self._report = PlannerReport()
-        self._cameras: dict[str, CameraSight] = {}
-        self._frames: dict[str, str] = {}
-        self._asked, self._started = -math.inf, time.monotonic()
-        self._perception = RemoteParameters(self, 'relative_pose', self._take_perception)
+        self._report: dict[str, str] = {}
+        """The planner's newest values on /diagnostics."""
         self._planner = RemoteParameters(self, 'planner')
-        self._inputs: list[tuple[Any, str, Callable[[Any], None], QoSProfile]] = [
-            (Odometry, 'odom', self._take_odom, best_effort()),
-            (Odometry, 'neighbors', self._take_neighbor, best_effort(10)),
-            (Odometry, 'neighbors/heard', self._take_neighbor, best_effort(10)),
-            (MultiDOFJointTrajectory, 'command/trajectory', self._take_command, best_effort()),
-            (String, 'planner/state', self._take_state, LATCHED_QOS),
-            (DiagnosticArray, '/diagnostics', self._take_diagnostics, best_effort(10))]
-        self._open: list[Subscription] = []
-        self._static = StaticChild(self)
-        self._transforms = TransformBroadcaster(self, self._static, values['odom_tf'])
-        self._markers = self.create_publisher(MarkerArray, MARKERS_TOPIC, 1)
-        self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=STEADY)
+        self._polls = [
+            self.poll(Odometry, 'odom', self._take_odom, best_effort()),
+            self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False),
+            self.poll(Odometry, 'neighbors/heard', self._take_neighbor, best_effort(10),
+                      required=False),
+            self.poll(MultiDOFJointTrajectory, 'command/trajectory', self._take_command,
+                      best_effort(), required=False),
+            self.poll(DiagnosticArray, '/diagnostics', self._take_diagnostics, best_effort(10),
+                      required=False, largest=LARGEST)]
+        self._markers = self.create_publisher(MarkerArray, 'visualizer/markers', QoSProfile(
+            depth=1))
+        self.create_timer(PERIOD, self._tick, clock=STEADY)
+        self.create_timer(ASK_PERIOD, self._ask, clock=STEADY)
 
-    def _take_odom(self, message: Odometry) -> None:
+    def _take_odom(self, message: Odometry, _: int) -> None:
         self._own = from_odometry(message)
 
-    def _take_neighbor(self, message: Odometry) -> None:
+    def _take_neighbor(self, message: Odometry, _: int) -> None:
         state = from_odometry(message)
-        before = self._neighbors.get(state.child)
-        if before is None or state.stamp >= before.stamp or state.stamp < before.stamp - 10**9:
-            self._neighbors[state.child] = state
+        self._neighbors[state.child] = state
 
-    def _take_command(self, message: MultiDOFJointTrajectory) -> None:
-        self._command = from_trajectory(message, self._frame or message.header.frame_id)
+    def _take_command(self, message: MultiDOFJointTrajectory, _: int) -> None:
+        self._command = from_trajectory(message, message.header.frame_id)
 
-    def _take_state(self, message: String) -> None:
-        if message.data != self._report.state:  # why, and the rest, come with /diagnostics
-            self._report = PlannerReport(message.data)
-
-    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+    def _take_diagnostics(self, message: DiagnosticArray, _: int) -> None:
         planner = f'{self.get_namespace().strip("/")}/planner'.lstrip('/')
         for status in message.status:
             if status.name == planner:
-                reported = {pair.key: pair.value for pair in status.values}
-                self._report = PlannerReport(
-                    reported.get('state', ''), reported.get('reason', ''),
-                    reported.get('limits', ''),
-                    tuple(filter(None, reported.get('edges', '').split(', '))))
+                self._report = {pair.key: pair.value for pair in status.values}
 
-    def _take_perception(self, values: dict[str, Any]) -> None:
-        """Take the parameters of relative_pose; subscribe to the calibration of each camera."""
-        given = check_values(CAMERA_SPECS, {
-            name: value for name, value in values.items()
-            if name.startswith(('camera.', NAMES))})
-        for camera in cameras({**values, **given}):
-            self._inputs.append((CameraInfo, camera.camera_info,
-                                 partial(self._take_camera_info, camera), best_effort()))
-
-    def _take_camera_info(self, camera: CameraValues, message: CameraInfo) -> None:
-        link = Transform.from_quaternion(camera.position, quaternion_from_rpy(*camera.rpy))
-        self._cameras[camera.name] = CameraSight(
-            link @ Transform(R_FLU_OPTICAL), image_corners(
-                message.width, message.height, message.k,
-                message.distortion_model == 'equidistant'))
-        self._frames[camera.name] = message.header.frame_id or (
-            f'camera_{camera.name}' if camera.name else 'camera')
+    def _ask(self) -> None:
+        self._planner.ask(['d0', 'd1', 'radius'])
 
     def _tick(self) -> None:
         """Take the messages that wait and draw them, if a viewer subscribes."""
-        drawn = self._markers.get_subscription_count() > 0
-        listened = self._transforms.wanted
-        self.diagnostics.values['watched'] = drawn or listened
-        period = round(1e9 * (self._period if drawn or listened else IDLE_PERIOD))
-        if self._timer.timer_period_ns != period:
-            self._timer.timer_period_ns = period
-        if not (drawn or listened):
-            self._forget()
+        if not self._markers.get_subscription_count():
             return
-        self._ask()
-        self._take_inputs()
-        known = self._known()
-        if listened:
-            self._broadcast(known)
-        if drawn:
-            stamp = nanoseconds_to_stamp(known.now)
-            self._markers.publish(MarkerArray(
-                markers=[marker(shape, self._frame, stamp) for shape in shapes(known)]))
-            self.diagnostics.rate('drawn').tick(time.monotonic())
-
-    def _forget(self) -> None:
-        """Unsubscribe: a viewer that comes later is to see no old state."""
-        for subscription in self._open:
-            self.destroy_subscription(subscription)
-        self._open.clear()
-        self._own = self._command = None
-        self._neighbors.clear()
-
-    def _take_inputs(self) -> None:
-        """Subscribe, if that is not yet done, and take the messages that wait."""
-        for kind, topic, _, qos in self._inputs[len(self._open):]:
-            self._open.append(self.create_subscription(
-                kind, topic, lambda _: None, qos, callback_group=Waiting()))
-        for (kind, topic, callback, _), subscription in zip(self._inputs, self._open):
-            while (taken := subscription.handle.take_message(kind, False)) is not None:
-                try:
-                    callback(taken[0])
-                except ValueError as error:
-                    self.diagnostics.reject(f'invalid {topic}', str(error))
-
-    def _ask(self) -> None:
-        """Ask the other nodes for their parameters: the band can be changed in flight."""
-        now = time.monotonic()
-        if now - self._asked >= ASK_PERIOD:
-            self._asked = now
-            self._planner.ask(PLANNER)
-            if self._perception.values is None:
-                self._perception.ask()
-
-    @property
-    def _frame(self) -> str:
-        """Return the frame of the odometry, which all else is in."""
+        for poll in self._polls:
+            poll()
+        now = self.get_clock().now()
+        drawn = [marker for state in self._neighbors.values()
+                 for marker in self._neighbor(state, now.nanoseconds)]
         if self._own is not None:
-            return self._own.frame
-        return next((state.frame for state in self._neighbors.values()), '')
+            drawn += self._follower(self._own, now.nanoseconds)
+        for marker in drawn:
+            marker.header.stamp = now.to_msg()
+        self._markers.publish(MarkerArray(markers=drawn))
 
-    def _known(self) -> Snapshot:
-        band = self._planner.values
-        return Snapshot(
-            self.get_clock().now().nanoseconds, self._pose(), tuple(self._neighbors.values()),
-            self._command, self._report,
-            None if band is None else Band(*(band[name] for name in PLANNER)), self._cameras)
+    def _guarded(self) -> list[str]:
+        """Return the guard's reasons among the limits of the planner's command."""
+        return [reason for reason in REASONS if reason in self._report.get('limits', '')]
 
-    def _pose(self) -> tuple[int, Transform] | None:
-        """Return the stamp of the newest odometry, ns, and where base_link is by it."""
-        state = self._own
-        if state is None:
-            return None
-        T_base_child = self._static.transform(state.child) or Transform()
-        values = self._perception.values or {}
-        position, rpy = (values.get(name, ()) for name in ODOMETRY)
-        if any(position) or any(rpy):
-            T_base_child = Transform.from_quaternion(position, quaternion_from_rpy(*rpy))
-        T_odom_child = Transform.from_quaternion(state.position, state.quaternion)
-        return state.stamp, T_odom_child @ T_base_child.inverse()
+    def _neighbor(self, state: OdometryState, now: int) -> list[Marker]:
+        """Return a neighbour, its velocity, ellipsoid, edge of the graph, and band."""
+        name, frame, at = state.child, state.frame, state.position
+        age = (now - state.stamp) / NANOSECONDS
+        if age > FORGOTTEN:
+            return []
+        color, label = (SEEN, name) if age <= UNSEEN else (
+            GREY, f'{name}, not seen for {age:.1f} s')
+        drawn = [box(frame, name, at, state.quaternion, color),
+                 *arrow(frame, f'{name} velocity', at, VELOCITY_TIME * state.velocity, color),
+                 text(frame, f'{name} name', at + ABOVE, label, color)]
+        if np.all(np.isfinite(state.pose_covariance[:3, :3])):
+            drawn.append(ellipsoid(frame, f'{name} covariance', at, state.pose_covariance[:3, :3]))
+        band, attended = self._planner.values, name in self._report.get('edges', '').split(', ')
+        if attended and self._own is not None:
+            drawn.append(lines(frame, f'{name} edge', [self._own.position, at], EDGE, 0.02))
+        if attended and band is not None:
+            drawn += [circle(frame, f'{name} {edge}', at, math.sqrt(band[edge]) + band['radius'],
+                             color, 0.05 if reason in self._guarded() else 0.015)
+                      for edge, color, reason in (('d0', INNER, SEPARATION),
+                                                  ('d1', OUTER, COHESION))]
+        return drawn
 
-    def _broadcast(self, known: Snapshot) -> None:
-        if known.own is not None and self._transforms.owns_odometry:
-            stamp, pose = known.own
-            self._transforms.move(stamp, self._frame, BASE, pose)
-        for state in known.neighbors:
-            self._transforms.move(state.stamp, state.frame, state.child, Transform.from_quaternion(
-                state.position, state.quaternion))
-        if time.monotonic() - self._started < SETTLING:
-            return
-        for name, camera in self._cameras.items():
-            frame = self._frames[name]
-            if not self._transforms.fix(known.now, BASE, frame, camera.T_body_optical):
-                self.diagnostics.values[f'frame {frame}'] = (
-                    'published on /tf_static by another node')
+    def _follower(self, own: OdometryState, now: int) -> list[Marker]:
+        """Return the follower with its state and its command."""
+        at, guarded, state = own.position, self._guarded(), self._report.get('state', 'no planner')
+        color = STATES.get(state, GREY)
+        label = [state, *(f'guard: {reason}' for reason in guarded)]
+        if state != 'TRACK':
+            label.append(self._report.get('reason', ''))
+        drawn = [box(own.frame, 'follower', at, own.quaternion, color),
+                 text(own.frame, 'state', at + ABOVE, '\n'.join(filter(None, label)), color)]
+        command = self._command
+        if command is not None and command.ages(now)[0] <= SILENT:
+            drawn += arrow(own.frame, 'command', at, ACCELERATION_SCALE * np.asarray(
+                command.acceleration, float), GUARDED if guarded else COMMAND)
+        return drawn
 
 
-def marker(shape: Shape, frame: str, stamp: Any) -> Marker:
+def box(frame: str, name: str, position: Array, quaternion: Array, color: Color) -> Marker:
+    """Return a vehicle at a pose."""
+    return placed(frame, name, Marker.CUBE, position, BODY_SIZE, color, quaternion)
+
+
+def text(frame: str, name: str, position: Array, label: str, color: Color) -> Marker:
+    """Return text that faces the viewer."""
+    return placed(frame, name, Marker.TEXT_VIEW_FACING, position, TEXT_SIZE, color, text=label)
+
+
+def ellipsoid(frame: str, name: str, centre: Array, covariance: Array) -> Marker:
+    """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
+        axes[:, 0] = -axes[:, 0]
+    size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), DEGENERATE)
+    return placed(frame, name, Marker.SPHERE, centre, size, ELLIPSOID, matrix_to_quaternion(axes))
+
+
+def arrow(frame: str, name: str, start: Array, along: Array, color: Color) -> list[Marker]:
+    """Return an arrow from a place (3,) along a vector (3,); none if it has no length."""
+    if np.linalg.norm(along) <= DEGENERATE:
+        return []
+    marker = lines(frame, name, [start, start + along], color, 0.04)
+    marker.type, marker.scale.y, marker.scale.z = Marker.ARROW, 0.08, 0.1
+    return [marker]
+
+
+def circle(frame: str, name: str, centre: Array, radius: float, color: Color,
+           width: float) -> Marker:
+    """Return a level circle about a place (3,)."""
+    angle = np.linspace(0.0, math.tau, 49)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    return lines(frame, name, centre + radius * ring, color, width)
+
+
+def lines(frame: str, name: str, points: ArrayLike, color: Color, width: float) -> Marker:
+    """Return a line through points (n, 3)."""
+    marker = placed(frame, name, Marker.LINE_STRIP, np.zeros(3), (width, 0.0, 0.0), color)
+    marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, float).tolist()]
+    return marker
+
+
+def placed(frame: str, name: str, kind: int, position: Array, size: ArrayLike, color: Color,
+           quaternion: Array = IDENTITY_QUATERNION, text: str = '') -> Marker:
     """Return the message of a shape; its name is the namespace, so that each can be hidden."""
-    message = Marker(ns=shape.name, type=getattr(Marker, shape.kind), action=Marker.ADD,
-                     text=shape.text, lifetime=Duration(seconds=LIFETIME).to_msg())
-    message.header.frame_id, message.header.stamp = frame, stamp
-    set_vector(message.pose.position, shape.position)
-    set_quaternion(message.pose.orientation, shape.quaternion)
-    set_vector(message.scale, shape.size)
-    red, green, blue, opacity = shape.color
-    message.color = ColorRGBA(r=red, g=green, b=blue, a=opacity)
-    message.points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
-    return message
-
-
-class TransformBroadcaster:
-    """
-    Broadcasts the frames that a follower knows; nothing if tf2_msgs is not installed.
-
-    A frame has one parent: it jumps if two nodes broadcast its transform. So ``odom -> base_link``
-    is left to the odometry, which normally broadcasts it (REP-105), and the frame of a camera to
-    the node that broadcasts it on ``/tf_static``.
-
-    :param odom_tf: one of ``ODOM_TF``.
-    """
-
-    def __init__(self, node: Node, static: StaticChild, odom_tf: str) -> None:
-        self._node, self._static, self._odom_tf = node, static, odom_tf
-        self._type = transform_message()
-        self._stamps: dict[str, int] = {}
-        self._fixed: dict[str, TransformStamped] = {}
-        if self._type is not None:
-            self._moving = node.create_publisher(self._type, TF, QoSProfile(depth=100))
-            self._still = node.create_publisher(self._type, TF_STATIC, LATCHED_QOS)
-
-    @property
-    def wanted(self) -> bool:
-        """Return whether a node subscribes to moving frames."""
-        return self._type is not None and self._moving.get_subscription_count() > 0
-
-    @property
-    def owns_odometry(self) -> bool:
-        """Return whether to broadcast odom -> base_link here."""
-        others = set(publishers(self._node, TF)) - {self._node.get_fully_qualified_name()}
-        return self._odom_tf == ALWAYS or (self._odom_tf == AUTO and not others)
-
-    def move(self, stamp: int, frame: str, child: str, pose: Transform) -> None:
-        """Broadcast the pose of a frame, ``T_frame_child``, once for each stamp, ns."""
-        if not frame or not child or self._stamps.get(child) == stamp or not self.wanted:
-            return
-        self._stamps[child] = stamp
-        self._moving.publish(self._type(transforms=[_stamped(stamp, frame, child, pose)]))
-
-    def fix(self, stamp: int, frame: str, child: str, pose: Transform) -> bool:
-        """
-        Broadcast the pose of a static frame; return False if another node broadcasts it.
-
-        :param stamp: ns, without meaning for listeners.
-        """
-        if self._type is None:
-            return True
-        if child not in self._fixed and self._static.knows(child):
-            return False
-        stamped = _stamped(stamp, frame, child, pose)
-        before = self._fixed.get(child)
-        if before is None or before.transform != stamped.transform:
-            self._fixed[child] = stamped
-            # All of them: of a latched topic only the last message is kept.
-            self._still.publish(self._type(transforms=list(self._fixed.values())))
-        return True
-
-
-def _stamped(stamp: int, frame: str, child: str, pose: Transform) -> TransformStamped:
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = frame
-    set_stamp(message.header.stamp, stamp)
-    set_vector(message.transform.translation, pose.translation)
-    set_quaternion(message.transform.rotation, pose.quaternion)
-    return message
+    red, green, blue, opacity = color
+    marker = Marker(ns=name, type=kind, action=Marker.ADD, text=text,
+                    lifetime=Duration(seconds=LIFETIME).to_msg(),
+                    color=ColorRGBA(r=red, g=green, b=blue, a=opacity))
+    marker.header.frame_id = frame
+    set_vector(marker.pose.position, position)
+    set_quaternion(marker.pose.orientation, quaternion)
+    set_vector(marker.scale, size)
+    return marker
 
 
 def main(args: list[str] | None = None) -> int:

@@ -55,10 +55,6 @@ class StaticFrames:
         """Set the pose of a frame in its parent."""
         self._parents[child] = parent, T_parent_child
 
-    def knows(self, frame: str) -> bool:
-        """Return whether a frame has a parent."""
-        return frame in self._parents
-
     def pose(self, frame: str, on: str) -> Transform | None:
         """Return ``T_on_frame``, or None if the two frames are not connected."""
         above, below = self._to_root(frame), self._to_root(on)

@@ -43,6 +43,13 @@ REMOVED = {
     'j_max': 'the jerk of setpoints is not limited: remove the line',
     'check_parameters': 'they are always compared: remove the line',
     'silent_at_rest': 'the bridge requests hold mode 3 s after the last command',
+    'paused': 'call replay/pause',
+    'clock': 'replay always publishes /clock: remove the line',
+    'duration': 'the playback ends with the bag: remove the line',
+    'remap': 'remap as ROS does: -r odom:=vio',
+    'wait_for': 'replay waits for a subscriber of each topic that it plays',
+    'odom_tf': 'the visualizer broadcasts no transforms: remove the line',
+    'rate': 'the visualizer always draws at 10 Hz: remove the line',
     **dict.fromkeys((
         'sigma', 'theta', 'T_g', 'handover_time', 'max_position_std', 'max_velocity_std',
         'angular_noise', 'attitude_noise', 'max_gap', 'max_extrapolation',

@@ -45,36 +45,22 @@ INSTALLED = {'etc/systemd/system/flock_follower@.service', SETTINGS,
              'usr/local/lib/flock_follower/follower.env'}
 
 
-def test_everything_it_writes_is_printed_and_undone(tmp_path: Path) -> None:
-    printed = install(tmp_path).stdout
-    assert files(tmp_path).keys() == INSTALLED
-    for file in INSTALLED:
-        assert f'write {tmp_path / file}\n' in printed
-    undone = install(tmp_path, '--undo').stdout
+def test_it_prints_and_writes_its_files_and_undoes_them(tmp_path: Path) -> None:
+    planned = install(tmp_path, '--dry-run').stdout
     assert files(tmp_path) == {}
-    for file in INSTALLED:
-        assert f'rm {tmp_path / file}\n' in undone
-    assert 'rm ' not in install(tmp_path, '--undo').stdout
-
-
-def test_what_the_unit_runs_is_what_is_installed(tmp_path: Path) -> None:
-    install(tmp_path)
+    assert install(tmp_path).stdout == planned
     there = files(tmp_path)
+    assert there.keys() == INSTALLED
+    assert all(f'write {tmp_path / file}\n' in planned for file in INSTALLED)
     unit = there['etc/systemd/system/flock_follower@.service']
     assert '\nUser=pilot\n' in unit
     assert '\nExecStart=/bin/bash /usr/local/lib/flock_follower/start ' in unit
     assert (tmp_path / 'usr/local/lib/flock_follower/start').stat().st_mode & 0o111
     assert '\nWORKSPACE=/home/pilot/ws\n' in there[SETTINGS]
-
-
-def test_a_dry_run_prints_the_same_and_writes_nothing(tmp_path: Path) -> None:
-    planned = install(tmp_path, '--dry-run').stdout
+    install(tmp_path, '--name', 'drone2')
+    assert 'etc/flock_follower/drone2.env' in files(tmp_path)
+    install(tmp_path, '--undo')
     assert files(tmp_path) == {}
-    assert install(tmp_path).stdout == planned
-    before = files(tmp_path)
-    planned = install(tmp_path, '--undo', '--dry-run').stdout
-    assert files(tmp_path) == before
-    assert install(tmp_path, '--undo').stdout == planned
 
 
 def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: Path) -> None:
@@ -84,14 +70,6 @@ def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: 
         assert f'yours, unchanged: {tmp_path / SETTINGS}' in install(
             tmp_path, *arguments).stdout
     assert files(tmp_path) == {SETTINGS: 'WORKSPACE=/mine\n'}
-
-
-def test_each_vehicle_has_settings_of_its_own(tmp_path: Path) -> None:
-    install(tmp_path)
-    install(tmp_path, '--name', 'drone2')
-    assert {SETTINGS, 'etc/flock_follower/drone2.env'} <= files(tmp_path).keys()
-    install(tmp_path, '--undo')
-    assert files(tmp_path) == {}
 
 
 @pytest.mark.parametrize(('arguments', 'reported'), [

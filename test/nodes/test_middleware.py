@@ -15,7 +15,6 @@
 """Planner and bridge keep off shared memory, in which other processes can make them wait."""
 
 import os
-from pathlib import Path
 import shutil
 import subprocess
 import sys
@@ -23,12 +22,7 @@ from unittest import mock
 
 import pytest
 
-from flock_desk.runs.processes import (
-    free_udp_port,
-    private_environment,
-    Processes,
-    wait_until,
-)
+from flock_desk.runs.processes import wait_until
 from flock_follower.files import resource
 from flock_follower.nodes import mavlink_bridge, planner
 from flock_follower.nodes.observer import processes
@@ -118,16 +112,6 @@ def test_the_bridge_and_the_planner_run_without(module, monkeypatch):
     with mock.patch.dict(os.environ, {PROFILE: OWN}):
         module.main([])
     assert profiles == [UDP]
-
-
-def test_the_bridge_warns_where_it_must_share_memory(tmp_path):
-    profile = tmp_path / 'own.xml'
-    profile.write_text(Path(OWN).read_text().replace('flock_follower', 'of_the_user'))
-    environment = {**private_environment(), PROFILE: str(profile)}
-    with Processes(environment, tmp_path) as processes:
-        processes.start('bridge', 'flock_follower.nodes.mavlink_bridge', [
-            '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
-        wait_until(lambda: 'shares memory' in processes.log('bridge'), 20.0, 'the warning')
 
 
 @pytest.mark.parametrize(('given', 'far'), [

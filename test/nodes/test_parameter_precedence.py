@@ -23,7 +23,7 @@ import pytest
 import rclpy
 
 from flock_follower.nodes.planner import Planner
-from flock_follower.nodes.support.parameters import ValidatedNode
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.files import files_in, read_parameters, TABLE
 
 OWN = 'planner:\n  ros__parameters:\n    v_max: 0.9\n'
@@ -33,7 +33,7 @@ ALL = '/**:\n  ros__parameters:\n    v_max: 0.7\n'
 
 def flown(*arguments: str) -> float:
     rclpy.init(args=['planner', '--ros-args', *arguments])
-    with mock.patch.object(ValidatedNode, 'parameter_files',
+    with mock.patch.object(FlockNode, 'parameter_files',
                            files_in(['planner', '--ros-args', *arguments])):
         node = Planner()
     try:

@@ -24,7 +24,6 @@ from driven import Driven, overrides, START
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 import numpy as np
 import pytest
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -33,8 +32,6 @@ from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.nodes.support.diagnostics import NONE_SENDING
-from flock_follower.nodes.support.inputs import LATCHED_QOS
 
 STEP = 20_000_000  # ns
 AHEAD = (2.0, 0.0, 2.0)  # m: where the leader is
@@ -94,15 +91,6 @@ def rig(ros: None) -> Iterator[Rig]:
     made = Rig()
     yield made
     made.close()
-
-
-def test_silence_of_neighbors_is_a_fault_only_if_no_image_is_processed(rig: Rig) -> None:
-    neighbors = rig.diagnostics.inputs['neighbors']
-    neighbors._since -= 10.0
-    assert 'no /neighbors for 10 s: no publisher' in rig.problems()
-    neighbors._reason = lambda: NONE_SENDING  # images without a leader in them
-    assert 'no /neighbors for ' not in rig.problems()
-    assert 'no /neighbors for ' in rig.problems(ahead=2.6)
 
 
 def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(rig: Rig) -> None:
@@ -184,7 +172,6 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     rig.fly()
     assert rig.counters['invalid camera_info'] == 1
     assert 'no /camera_info: flies without bounds' in rig.problems()
-    rig.give('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
     place, push = PointStamped(), AccelWithCovarianceStamped()
     place.point.z = 0.4
     rig.give('mavlink_bridge/armed_at', place)
@@ -192,38 +179,24 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     push.header.frame_id, push.accel.accel.linear.x = 'leader', 0.3
     rig.give('neighbors/acceleration', push)
     rig.run(0.1)
-    assert 'camera_info: flies' not in rig.problems()
     assert rig.node._loop.ground == 0.4
     assert 0.0 < rig.node._loop.memory.motions['leader'].acceleration[0] <= 0.3  # smoothed
-    assert rig.values['leader_is'] == 'leader, seen, edge' and rig.values['edges'] == 'leader'
+    assert rig.values['leader_is'] == 'leader, seen' and rig.values['edges'] == 'leader'
+    rig.run(0.9, (0.8, 0.0, 2.0))  # half a second of it is taken for a jump
+    assert rig.values['warnings'].startswith('leader 0.80 m away')
+    assert rig.values['warnings'] in rig.problems()
     rig.run(1.1, topic='neighbors/heard')
-    assert rig.values['follower_2_is'] == 'follower, heard, edge'
+    assert rig.values['follower_2_is'] == 'follower, heard'
     assert rig.state == 'TRACK' and 'leader_is' not in rig.values
     assert 'is /clock published?' in rig.problems(ahead=5.0)
-
-
-def test_a_second_bridge_and_a_leader_too_near_are_reported(rig: Rig) -> None:
-    rig.fly()
-    rig.run(0.9, (0.8, 0.0, 2.0))  # half a second of it is taken for a jump
-    second = Node('second')
-    publishers = [second.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
-                  for _ in range(2)]
-    rig.wait(lambda: '2 publishers say on /mavlink_bridge/state' in rig.problems())
-    rig.diagnostics.publish()
-    (status,) = rig.sent['diagnostics'][-1].status
-    values = {v.key: v.value for v in status.values}
-    assert (status.name, values['state'], len(publishers)) == ('planner', 'TRACK', 2)
-    assert values['warnings'].startswith('leader 0.80 m away')
-    assert values['warnings'] in status.message and int(values['guarded_commands']) > 0
-    second.destroy_node()
 
 
 def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig: Rig) -> None:
     assert 'd1 = 8.0: must be a number in [d0' in rig.set(a_max=1.0, d0=9.0)
     assert rig.node.get_parameter('a_max').value == 2.5
+    assert 'must be at most 2.5: its value at the start' in rig.set(a_max=2.51)
     rig.fly()
     assert rig.set(require_bridge=False) and rig.set(coast_timeout=0.4)
-    assert 'must be at most 2.5, its value at the start' in rig.set(a_max=2.51)
     assert 'cannot be switched off in flight' in rig.set(guard=False)
     assert rig.set(v_max=0.3, a_max=0.1) == ''
     assert 'must be at most 0.3: in flight it can only be lowered' in rig.set(v_max=0.4)

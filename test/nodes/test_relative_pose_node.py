@@ -19,18 +19,30 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 from driven import Driven, overrides, START
+from geometry_msgs.msg import TransformStamped
 from marker_images import make_camera, render, SIDE
 import numpy as np
 import pytest
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
 
-from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import from_odometry, MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds
+from flock_follower.geometry import (
+    quaternion_from_rpy,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    Transform,
+)
+from flock_follower.messages import (
+    from_odometry,
+    MOTION_TOPIC,
+    RELATIVE,
+    set_quaternion,
+    stamp_to_nanoseconds,
+)
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
@@ -187,20 +199,15 @@ def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
     assert r.counters['no odometry yet'] == 1 and 'no /odom for' in r.problems(ahead=4.0)
 
 
-def test_compressed_images_are_taken_by_parameter_and_the_other_transport_is_pointed_to(
+def test_compressed_images_are_taken_by_parameter(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(image_transport='compressed')
-    camera = Node('camera')
-    camera.create_publisher(Image, 'image_raw', 1)
-    r.wait(lambda: '/image_raw is published: set image_transport to raw' in r.problems())
     r.odom(0.0)
     message = CompressedImage(format='jpeg', data=array(
         'B', cv2.imencode('.jpg', image)[1].tobytes()))
     message.header.stamp = nanoseconds_to_stamp(START)
     r.give('image_raw/compressed', message)
     np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
-    assert 'is published' not in r.problems()
-    camera.destroy_node()
 
 
 def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time(
@@ -228,37 +235,28 @@ def test_a_wrong_marker_is_named_beside_the_wanted_one(
     assert not r.found
 
 
-@pytest.mark.parametrize(('text', 'changes'), [
-    ('must be one of mono8', {'encoding': 'jpeg2000'}), ('step = 639: ', {'step': 639}),
-    ('data has 0 bytes', {'data': array('B')}),
-    ('image = 640x240: camera_info is for 640x480', {'height': 240})])
-def test_a_corrupt_image_is_dropped_counted_and_explained(
-        rig: Callable[..., Rig], image: GrayImage, text: str, changes: dict[str, Any]) -> None:
-    r = rig()
-    r.odom(0.0)
-    r.image(0.0, image, **changes)
-    assert r.counters == {'invalid image': 1} and not r.found
-    assert text in r.problems(ahead=4.0)
-    r.image(0.0, image)
-    assert r.found and r.problems() == ''
-
-
-@pytest.mark.parametrize(('text', 'changes'), [
-    ('K = 0: the camera is not calibrated', {'k': np.zeros(9)}),
-    ("distortion_model = 'barrel'", {'distortion_model': 'barrel'}),
-    ('width = 0: must be an integer in [1, 65535] px', {'binning_x': 2**32 - 1}),
-    ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)})])
-def test_a_corrupt_camera_info_is_dropped_counted_and_explained(
-        rig: Callable[..., Rig], image: GrayImage, text: str, changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize(('text', 'changes', 'counters'), [
+    ('must be one of mono8', {'encoding': 'jpeg2000'}, {'invalid image': 1}),
+    ('image = 640x240: camera_info is for 640x480', {'height': 240}, {'invalid image': 1}),
+    ('K = 0: the camera is not calibrated', {'k': np.zeros(9)},
+     {'invalid camera_info': 1, 'no usable camera_info': 1}),
+    ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)},
+     {'invalid camera_info': 1, 'no usable camera_info': 1})])
+def test_what_is_corrupt_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage, text: str, changes: dict[str, Any],
+        counters: dict[str, int]) -> None:
     r = rig(max_wait=0.0)
     r.odom(0.0)
-    r.give('camera_info', calibration(**changes))
-    r.image(0.0, image)
-    assert r.counters == {'invalid camera_info': 1, 'no usable camera_info': 1} and not r.found
+    if 'invalid image' in counters:
+        r.image(0.0, image, **changes)
+    else:
+        r.give('camera_info', calibration(**changes))
+        r.image(0.0, image)
+    assert r.counters == counters and not r.found
     assert text in r.problems(ahead=4.0)
     r.give('camera_info', calibration())
     r.image(0.0, image)
-    assert r.found
+    assert r.found and r.problems() == ''
 
 
 def test_the_debug_image_is_drawn_only_while_someone_looks(
@@ -302,10 +300,8 @@ def test_out_of_sight_its_distance_goes_on_as_told_by_ranges(
     along = sight / distance
     assert along @ state.pose_covariance[:3, :3] @ along < 0.1 ** 2
     assert np.trace(state.pose_covariance[:3, :3]) > 0.5 ** 2
-    r.problems()
     assert float(r.values['range_bias_leader_m']) == pytest.approx(0.2, abs=0.03)
     assert float(r.values['range_outliers_leader_percent']) == 0.0
-    assert r.diagnostics.rates['ranges_leader_hz'].count == 81
 
 
 def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..., Rig]) -> None:
@@ -323,6 +319,23 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
         'range outside its limits': 2, 'invalid odom': 1,
         'range stamp repeated, too old or ahead of the odometry': 1}
     assert not r.found
+
+
+def test_the_child_frame_of_odom_is_placed_by_tf_static_and_wrong_axes_are_reported(
+        rig: Callable[..., Rig]) -> None:
+    r, imu = rig(), TransformStamped(child_frame_id='imu')
+    rolled = quaternion_from_rpy(np.pi / 2.0, 0.0, 0.0)
+    for k in range(20):
+        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
+                                   OWN.translation, rolled, np.zeros(3)))
+    assert 'axes of odom: base_link has y up instead of z' in r.problems()
+    imu.header.frame_id = 'base_link'
+    set_quaternion(imu.transform.rotation, rolled)
+    r.node._own._static.take(SimpleNamespace(transforms=[imu]))
+    for k in range(20, 60):
+        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
+                                   OWN.translation, rolled, np.zeros(3)))
+    assert 'axes of odom' not in r.problems()
 
 
 def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
@@ -369,8 +382,8 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
     assert len(r.found) == 3
     assert r.counters == {'no usable camera_info of camera left': 1}
     reported = r.problems(ahead=4.0)
-    assert 'no /left/camera_info of camera left for 4 s' in reported
-    assert 'no /left/image_raw of camera left for 4 s' in reported
+    assert 'no /left/camera_info for 4 s' in reported
+    assert 'no /left/image_raw for 4 s' in reported
     assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
     assert 'no image of camera front processed' not in reported
     assert r.values['camera front'] == '640x480 plumb_bob' and 'camera left' not in r.values

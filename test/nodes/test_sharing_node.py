@@ -96,7 +96,7 @@ def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     assert flock.rear.sent['neighbors/heard'] == []  # it sees who is in front
     assert 'nothing received' not in front.problems()
     assert front.values['frame of rear'].startswith('known to 0.')
-    assert front.values['vehicle_name'] == 'front' and front.counters['not aligned with rear'] > 0
+    assert front.counters['not aligned with rear'] > 0
 
     bad = to_odometry(nanoseconds_to_stamp(front.now), 'front/odom', 'front', np.zeros(3),
                       quaternion_from_yaw(0.0), np.zeros(3))

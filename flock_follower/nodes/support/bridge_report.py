@@ -12,99 +12,92 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Diagnostics of the MAVLink bridge: link, mode, setpoints, latency and problems."""
+"""
+Topics, log and diagnostics of the MAVLink bridge.
+
+The setpoint thread calls ``on_messages`` and ``on_cycle``, which decide from the bridge's state
+and pass functions to the publisher thread; events for the diagnostics wait for the executor's.
+"""
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 import math
 import time
+from typing import Any
 
-from rclpy.node import Node
+from geometry_msgs.msg import PointStamped
+from nav_msgs.msg import Odometry
+from pymavlink.dialects.v20 import all as mavlink
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
 
 from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
-from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
-from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
+from flock_follower.mavlink.telemetry import Battery, estimate
+from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
+from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
-from flock_follower.parameters.planner_table import SPECS
+from flock_follower.nodes.support.runtime import FlockNode
 
-PLANNER_PERIOD = 5.0  # s between two requests for the planner's bounds
+PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
+STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
+PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
-CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
-SHOWN = 5.0  # s for which a clock mismatch is shown
-#: Bounds of the planner, those of the bridge that they lie in, and the direction that is wider.
-PLANNER_BOUNDS = {'altitude_min': ('height_min', -1.0), 'altitude_max': ('height_max', 1.0),
-                  'range_max': ('radius_max', 1.0)}
+STUCK = 0.2  # s without a setpoint that was due
 #: Limits that planner and bridge are to have alike.
 LIMITS = ('a_max', 'v_max')
-HEIGHTS_DIFFER = 1.0  # m, between barometer and estimate, above which it is a warning
-STUCK = 0.2  # s without a setpoint that was due
 
 
 class BridgeReport:
-    """Collects events of the setpoint thread and reports them from the executor's thread."""
+    """Publishes and reports what the bridge does."""
 
-    def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
-                 stream: SetpointThread, publisher: PublisherThread) -> None:
-        self._node = node
-        self._diagnostics = diagnostics
-        self._bridge = bridge
-        self._stream = stream
-        self._publisher = publisher
+    def __init__(self, node: FlockNode, bridge: Bridge, stream: SetpointThread,
+                 publisher: PublisherThread) -> None:
+        self._node, self._diagnostics = node, node.diagnostics
+        self._bridge, self._stream, self._publisher = bridge, stream, publisher
         self._start = time.monotonic()
+        self.place: tuple[OdometryState, float] | None = None
+        """The newest odometry, and when it came by the monotonic clock, s."""
+        self.planner = RemoteParameters(node, 'planner')
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
-        self._brakes: Counter[str] = Counter()
         self._last: Cycle | None = None
         self._stuck_since = math.inf
-        self._mismatch = (-math.inf, '')
-        self._was_alive = False
-        self._fault = ''
-        self._reboots = 0
-        self._reported_check: ParameterCheck | None = None
-        self.planner = RemoteParameters(node, 'planner')
-        node.create_timer(PLANNER_PERIOD, lambda: self.planner.ask([*PLANNER_BOUNDS, *LIMITS]))
-        self._logged: dict[Request, bool] = {}  # whether its result is logged, too
+        self._announced = ('', -math.inf)
+        self._armed: bool | None = None
+        self._last_estimate = -math.inf
+        self._lines: tuple[str, ...] | None = None
         self._bytes = (self._start, 0, 0)
-        alive, housekeeping = self._while_alive, bridge.housekeeping
-        diagnostics.checks += [
-            self._collect,
-            partial(_problem, ERROR, self._link_fault),
-            partial(_problem, ERROR, alive(housekeeping.unreceived)),
-            partial(_problem, WARN, alive(self._estimate_fault)),
-            partial(_problem, WARN, alive(housekeeping.too_slow)),
-            partial(_problem, WARN, bridge.gate.misaligned),
-            self._envelope_problem,
-            partial(_problem, ERROR, self._clock_fault),
-            self._setpoint_problem,
-            partial(_problem, ERROR, alive(self._forwarding_fault)),
-            self._publisher_problem]
+        self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
+        self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
+            bridge.gate.limits.relative_flight) else None
+        self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
+        self._states = node.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
+        self._armed_at = node.create_publisher(
+            PointStamped, 'mavlink_bridge/armed_at', LATCHED_QOS)
+        node.create_timer(PLANNER_PERIOD, lambda: self.planner.ask(LIMITS))
+        self._diagnostics.sources.append(self._values)
+        self._diagnostics.checks += [
+            self._collect, self._setpoint_problem, self._publisher_problem,
+            *(partial(_problem, level, reason) for level, reason in (
+                (ERROR, self._link_fault), (ERROR, self._unreceived), (ERROR, self._ended),
+                (ERROR, self._forwarding_fault),
+                (WARN, self._estimate_fault), (WARN, self._too_slow),
+                (WARN, bridge.gate.misaligned), (WARN, bridge.gate.thrust_error),
+                (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
 
     # From any thread.
-
-    def cycle(self, cycle: Cycle, now: float) -> None:
-        """Record a cycle; called from the setpoint thread."""
-        shown = self._diagnostics
-        if cycle.sent:
-            self._events.append(lambda: shown.rate('stream').tick(now))
-        due = cycle.setpoint.kind != NONE and not cycle.sent
-        self._stuck_since = min(self._stuck_since, now) if due else math.inf
-        if (first := cycle.first) is not None:
-            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
-            self._events.append(lambda: shown.latency('tick_latency').add(now - first.time))
-        before = self._last.setpoint.kind if self._last else ''
-        if before == COMMAND and cycle.setpoint.kind != COMMAND:
-            self._brakes[cycle.setpoint.reason] += 1
-        self._last = cycle
 
     def fault(self, where: str, error: Exception) -> None:
         """Record an exception."""
@@ -114,161 +107,175 @@ class BridgeReport:
         """Record a dropped input."""
         self._events.append(lambda: self._diagnostics.reject(reason, detail))
 
-    def stamped(self, name: str, age: float) -> None:
-        """Note stamps of another clock, by their age, s."""
-        if abs(age) > CLOCK_MISMATCH:
-            self._mismatch = (time.monotonic(), f'{name} is stamped {abs(age):.0f} s in the '
-                              f'{"past" if age > 0 else "future"}: does use_sim_time differ '
-                              'between the nodes, or the clock between the machines?')
+    # The setpoint thread.
+
+    def on_cycle(self, cycle: Cycle, now: float) -> None:
+        """Record a cycle, and publish the state."""
+        shown, first = self._diagnostics, cycle.first
+        if cycle.sent:
+            self._events.append(lambda: shown.rate('stream').tick(now))
+        if first is not None:
+            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+        due = cycle.setpoint.kind != NONE and not cycle.sent
+        self._stuck_since = min(self._stuck_since, now) if due else math.inf
+        self._last = cycle
+        self._announce(now)
+
+    def on_messages(self, messages: list[Any], now: float) -> None:
+        """Publish what has just arrived from the autopilot."""
+        self._announce(now)
+        bridge, telemetry = self._bridge, self._bridge.telemetry
+        position, attitude, battery = (
+            telemetry.local_position, telemetry.attitude, telemetry.battery)
+        if position is not None and position.time == now and attitude is not None:
+            age = bridge.housekeeping.timesync.age(position.time_boot_ms, round(now * 1e9))
+            if distrusted := bridge.distrusted(now):
+                self.refused('mavlink/odom not published', f'its velocity {distrusted}')
+            elif known := estimate(position, attitude, age):
+                self._send_estimate(*known)
+        motion = bridge.motion
+        if motion is not None and attitude is not None and attitude.time == now and self._motions:
+            self._publish(self._motions, lambda: self._odometry_message(*motion))
+        if battery is not None and battery.time == now:
+            self._publish(self._battery, lambda: self._battery_message(battery))
+        self._send_arming(now)
+
+    def _announce(self, now: float) -> None:
+        """Publish the state; log the autopilot's texts, and the state if it has changed."""
+        state, (before, announced) = self._bridge.state(now), self._announced
+        if state != before or now - announced >= STATE_PERIOD - 1e-3:
+            self._announced = state, now
+            self._publish(self._states, lambda: String(data=state))
+        if state != before:
+            self._publisher.submit(lambda: self._info(f'state: {state}'))
+        for text in self._bridge.texts.new(now):
+            log = (self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info)
+            self._publisher.submit(partial(log, f'autopilot: {text.text}'))
+
+    def _send_arming(self, now: float) -> None:
+        """Publish the place of arming by the odometry, if there is any."""
+        status, place = self._bridge.telemetry.status, self.place
+        if status is None or status.armed == self._armed:
+            return
+        begun, self._armed = self._armed is False and status.armed, status.armed
+        if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
+            self._publish(self._armed_at, lambda: _point(place[0]))
+
+    def _send_estimate(self, state: OdometryState, valid: float) -> None:
+        if valid <= self._last_estimate:
+            # TIMESYNC has just corrected the age of messages, so the stamp steps back.
+            self.refused('mavlink/odom not newer', 'a stamp before that of the last one')
+            return
+        self._last_estimate = valid
+        self._publish(self._odometry, lambda: self._odometry_message(state, valid))
+
+    def _publish(self, publisher: Publisher, make: Callable[[], Any]) -> None:
+        """Have the publisher thread make a message and publish it; odometry if subscribed."""
+        def publish() -> None:
+            if self._node.context.ok() and (
+                    publisher is not self._odometry or publisher.get_subscription_count()):
+                publisher.publish(make())
+        self._publisher.submit(publish)
+
+    # The publisher thread.
+
+    def _info(self, text: str) -> None:
+        self._node.get_logger().info(text)
+
+    def _warn(self, text: str) -> None:
+        self._node.get_logger().warning(text)
+
+    def _odometry_message(self, state: OdometryState, valid: float) -> Any:
+        """Return the message of a state of a time, s, on the monotonic clock."""
+        system, monotonic = self._node.read_clocks()
+        waited = max(0, round((monotonic - valid) * 1e9))
+        return from_state(make, state._replace(stamp=max(0, system - waited)))
+
+    def _battery_message(self, battery: Battery) -> BatteryState:
+        message = BatteryState(
+            voltage=battery.voltage, percentage=battery.remaining, present=True,
+            # In ROS a current that discharges is negative.
+            current=-battery.current, temperature=math.nan,
+            charge=math.nan, capacity=math.nan, design_capacity=math.nan)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message
 
     # The executor's thread.
 
-    def _planner_differs(self) -> str:
-        """Return which limits of the planner are others, which bounds of it set wider, or ''."""
-        values, limits = self.planner.values or {}, self._bridge.gate.limits
-        usual = {spec.name: spec.default for spec in SPECS}
-        found = [f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
-                 'mavlink_bridge: the lower one acts' for name in LIMITS
-                 if values.get(name) not in (None, getattr(limits, name))]
-        found += [f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
-                  f'{getattr(limits, bound):g} m, which acts'
-                  for name, (bound, sign) in PLANNER_BOUNDS.items()
-                  if values.get(name) not in (None, usual[name])
-                  and sign * (values[name] - getattr(limits, bound)) > 0.0]
-        return '; '.join(found)
-
     def _collect(self, now: float) -> Problem | None:
-        """Drain the events, write the log lines that are due, and update all values."""
+        """Run the events; log once which parameters differ from the recommended ones."""
         while self._events:
             self._events.popleft()()
-        self._log_link(now)
-        self._log_parameters()
-        self._log_own_requests()
-        self._diagnostics.parts['bridge'] = {
-            **self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)}
+        result = self._bridge.housekeeping.parameters.result()
+        if result is not None and result.lines != self._lines:
+            self._lines = result.lines
+            for line in result.lines:
+                self._warn(f'parameter {line}')
+            if not result.lines:
+                self._info(f'{result.answered} parameters of the autopilot are as recommended')
         return None
+
+    def _values(self, now: float) -> dict[str, object]:
+        return {**self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)}
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
         """Return the state of autopilot and flight; why offboard, and arming, would be refused."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
-        status, flying = bridge.status(now), telemetry.flying(now)
-        lost = 'lost' if telemetry.status else 'never received'
-        unready = bridge.unready(now)
-        return {
-            'link': 'alive' if status else lost,
+        status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
+        result = bridge.housekeeping.parameters.result()
+        values: dict[str, object] = {
+            'link': 'alive' if status else 'lost' if telemetry.status else 'never received',
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
-            'mode': status.mode if status else '',
-            'armed': status.armed if status else '',
-            'system_status': status.system_status if status else '',
-            'flying': '' if flying is None else flying,
-            'state': bridge.state(now),
-            'withheld': bridge.withheld(),
-            'reboots': self._reboots,
+            'mode': status.mode if status else '', 'armed': status.armed if status else '',
+            'flying': '' if flying is None else flying, 'state': bridge.state(now),
             'handed_over': bridge.end.why,
-            REFUSED: bridge.refusal(now) if bridge.alive(now) else '',
-            **({} if unready is None else {NOT_READY: unready})}
+            REFUSED: bridge.refusal(now) if bridge.alive(now) else ''}
+        if unready is not None:
+            values[NOT_READY] = unready
+        if result is not None:
+            values['parameters'] = (f'{result.differing} of {result.answered} differ, '
+                                    f'{result.unanswered} unanswered')
+            values |= {PARAMETER + name: rest for name, _, rest in (
+                line.partition(' ') for line in result.lines)}
+        return values
 
     def _gate_values(self, now: float) -> dict[str, object]:
         """Return the newest setpoint, and the checks and estimates of the gate."""
         gate, setpoint = self._bridge.gate, self._last.setpoint if self._last else None
-        place, altitude = gate.place(now), self._bridge.telemetry.sensor_altitude
-        difference, alone = gate.yaw_difference(now), gate.relative.lasts(now)
+        place, difference = gate.place(now), gate.yaw_difference(now)
         return {
-            'setpoint': setpoint.kind if setpoint else 'none',
-            'reason': setpoint.reason if setpoint else '',
+            'setpoint': setpoint.kind if setpoint else NONE,
             'limited_by': setpoint.limited if setpoint else '',
-            'without_odometry_s': '' if math.isnan(alone) else f'{alone:.1f}',
-            'setpoints_sent': self._diagnostics.rate('stream').count,
-            'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
-            'velocity_difference_m_s': f'{gate.velocity_difference:.2f}',
             'wind_m_s2': f'{gate.wind:.2f}',
             'height_m': 'unknown' if place.height is None else f'{place.height:.2f}',
-            'height_source': 'unknown' if altitude is None else altitude.source,
             'distance_from_start_m': 'unknown' if place.offset is None else (
                 f'{math.hypot(*place.offset.tolist()):.2f}'),
-            'jumps': gate.jumps,
             'displacement_check': (
                 'height only: the autopilot fuses the odometry, which proves nothing'
-                if gate.fused else 'odometry against the autopilot, and height'),
-            **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()}}
+                if gate.fused else 'odometry against the autopilot, and height')}
 
     def _link_values(self, now: float) -> dict[str, object]:
-        """Return rates, bytes per second and their share of a serial line, clock, counters."""
+        """Return rates, the share of a serial line in use, and counters."""
         bridge, link = self._bridge, self._bridge.link
         before, came, went = self._bytes
         self._bytes = now, link.bytes_received, link.bytes_sent
         values: dict[str, object] = {
+            'late_cycles': self._stream.late,
             'dropped: publishing took too long': self._publisher.dropped,
-            'longest_pause_s': f'{bridge.telemetry.arrivals.longest_pause(now):.2f}'}
-        for way, count in (('in', link.bytes_received - came), ('out', link.bytes_sent - went)):
-            rate = count / max(now - before, 1e-3)
-            values[f'bytes_per_s_{way}'] = round(rate)
-            if link.transport.capacity:
-                values[f'line_{way}_percent'] = f'{100.0 * rate / link.transport.capacity:.0f}'
-        for name, (hertz, _) in bridge.housekeeping.rates(now).items():
-            values[f'{name}_hz'] = f'{hertz:.1f}'
-        if (best := bridge.housekeeping.timesync.best) is not None:
-            values['timesync_offset_ms'] = f'{best.offset * 1e-6:.3f}'
-            values['timesync_round_trip_ms'] = f'{best.way * 1e-6:.3f}'
-        if (forwarder := bridge.forwarder) is not None:
-            values['odometry_resets'] = forwarder.reset_counter
-            values.update({f'odometry: {k}': n for k, n in forwarder.counters.copy().items()})
-        values.update({f'ignored: {k}': n for k, n in link.ignored.copy().items()})
+            'longest_pause_s': f'{bridge.telemetry.arrivals.longest_pause(now):.2f}',
+            **{f'{name}_hz': f'{hertz:.1f}'
+               for name, (hertz, _) in bridge.housekeeping.rates(now).items()},
+            **{f'ignored: {kind}': count for kind, count in link.ignored.copy().items()}}
+        if link.transport.capacity:
+            full = link.transport.capacity * max(now - before, 1e-3)
+            values['line_in_percent'] = f'{100.0 * (link.bytes_received - came) / full:.0f}'
+            values['line_out_percent'] = f'{100.0 * (link.bytes_sent - went) / full:.0f}'
+        if bridge.forwarder is not None:
+            values |= {f'odometry: {k}': n for k, n in bridge.forwarder.counters.copy().items()}
         return values
 
-    def _log_link(self, now: float) -> None:
-        """Log losses and recoveries."""
-        transport, log = self._bridge.link.transport, self._node.get_logger()
-        alive, fault, reboots = self._bridge.alive(now), transport.fault, self._reboots
-        if fault and not self._fault:
-            log.warning(f'{transport.url}: {fault}; trying again until it is back')
-        elif self._fault and not fault:
-            log.info(f'{transport.url}: open')
-        if alive and not self._was_alive:
-            log.info(f'HEARTBEAT received on {transport.url}')
-        self._reboots = self._bridge.telemetry.reboots
-        if self._reboots > reboots:
-            log.warning('the autopilot has rebooted: offboard must be requested again')
-        self._was_alive, self._fault = alive, fault
-
-    def _log_parameters(self) -> None:
-        """Log once which parameters differ from the recommended ones, and why it matters."""
-        check = self._bridge.housekeeping.parameters
-        result = check.result()
-        if result is None:
-            return
-        lines = {name: rest for name, _, rest in (line.partition(' ') for line in result.lines)}
-        self._diagnostics.parts['parameters'] = {
-            'parameters': f'{result.differing} of {result.answered} differ, '
-                          f'{result.unanswered} unanswered',
-            **{f'{PARAMETER}{name}': rest for name, rest in lines.items()}}
-        if check is self._reported_check:
-            return
-        self._reported_check = check
-        for line in result.lines:
-            self._node.get_logger().warning(f'parameter {line}')
-        if result.answered and not result.lines:
-            self._node.get_logger().info(
-                f'{result.answered} parameters of the autopilot are as recommended')
-
-    def _log_own_requests(self) -> None:
-        """Log the bridge's own requests and their results."""
-        log = self._node.get_logger()
-        for request, why in ((self._bridge.blind_landing, 'no valid velocity'),
-                             (self._bridge.handover, self._bridge.end.why)):
-            if request is not None and request not in self._logged:
-                self._logged[request] = False
-                log.error(f'the bridge requests {request.goal.name}: {why}')
-            if request is not None and request.outcome is not None and not self._logged[request]:
-                self._logged[request] = True
-                write = log.warning if request.outcome.success else log.error
-                write(request.outcome.message)
-
     # Problems; '' or None without one.
-
-    def _while_alive(self, reason: Callable[[float], str]) -> Callable[[float], str]:
-        return lambda now: reason(now) if self._bridge.alive(now) else ''
 
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
@@ -278,13 +285,18 @@ class BridgeReport:
             return f'no autopilot on {transport.url}: {transport.fault}'
         if math.isfinite(received):
             return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
-        if now - self._start < SILENCE:
-            return ''
-        return f'no autopilot on {transport.url}: {self._bridge.link.silence()}'
+        return '' if now - self._start < SILENCE else (
+            f'no autopilot on {transport.url}: {self._bridge.link.silence()}')
+
+    def _unreceived(self, now: float) -> str:
+        return self._bridge.housekeeping.unreceived(now) if self._bridge.alive(now) else ''
+
+    def _too_slow(self, now: float) -> str:
+        return self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
 
     def _estimate_fault(self, now: float) -> str:
         telemetry = self._bridge.telemetry
-        if now - self._start < SILENCE:
+        if now - self._start < SILENCE or not self._bridge.alive(now):
             return ''
         missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
@@ -295,36 +307,33 @@ class BridgeReport:
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
-    def _clock_fault(self, now: float) -> str:
-        seen, what = self._mismatch
-        return what if now - seen < SHOWN else ''
+    def _ended(self, now: float) -> str:
+        """Return the requests by which the bridge itself ends a flight, and their results."""
+        return '; '.join(
+            f'the bridge requests {request.goal.name}: {why}'
+            + (f' ({request.outcome.message})' if request.outcome else '')
+            for request, why in ((self._bridge.blind_landing, 'no valid velocity'),
+                                 (self._bridge.handover, self._bridge.end.why))
+            if request is not None and why)
+
+    def _battery_unknown(self, now: float) -> str:
+        status = self._bridge.status(now)
+        return 'the autopilot does not know its battery: battery_low cannot act' if (
+            status and status.armed and self._bridge.end.battery_unknown(now)) else ''
+
+    def _planner_differs(self, now: float) -> str:
+        """Return which limits of the planner are others, or ''."""
+        values, limits = self.planner.values or {}, self._bridge.gate.limits
+        return '; '.join(
+            f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
+            'mavlink_bridge: the lower one acts' for name in LIMITS
+            if values.get(name) not in (None, getattr(limits, name)))
 
     def _forwarding_fault(self, now: float) -> str:
         forwarder = self._bridge.forwarder
         silence = 0.0 if forwarder is None else forwarder.silence(now)
-        if silence <= LONGEST_GAP:
-            return ''
-        return ('forward_odometry: none sent yet' if math.isinf(silence) else
-                f'forward_odometry: none sent for {silence:.1f} s')
-
-    def _envelope_problem(self, now: float) -> Problem | None:
-        """Return what ends the flight, and which of these checks cannot act."""
-        bridge, gate = self._bridge, self._bridge.gate
-        if bridge.end.why:
-            return ERROR, f'handed over to the autopilot: {bridge.end.why}'
-        if warning := gate.thrust_error(now) or self._planner_differs():
-            return WARN, warning
-        status = bridge.status(now)
-        if status is None or not status.armed:
-            return None
-        height, estimate = gate.heights.height(now), bridge.telemetry.height_above_home(now)
-        if height is not None and estimate is not None and (
-                abs(height - estimate) > HEIGHTS_DIFFER):
-            return WARN, (f'the autopilot estimates its height above home as {estimate:.1f} m, '
-                          f'the barometer says {height:.1f} m')
-        if bridge.end.battery_unknown(now):
-            return WARN, 'the autopilot does not know its battery: battery_low cannot act'
-        return None
+        return f'forward_odometry: none sent for {silence:.1f} s' if (
+            silence > LONGEST_GAP and self._bridge.alive(now)) else ''
 
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:
@@ -362,3 +371,11 @@ def _problem(level: bytes, reason: Callable[[float], str], now: float) -> Proble
     """Return the reason as a problem, None if it is ''."""
     text = reason(now)
     return (level, text) if text else None
+
+
+def _point(state: OdometryState) -> PointStamped:
+    message = PointStamped()
+    message.header.stamp = nanoseconds_to_stamp(state.stamp)
+    message.header.frame_id = state.frame
+    set_vector(message.point, state.position)
+    return message

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Steps of the system clock: stamps and ages are corrected if it is set, for example by NTP.
+Steps of the system clock: stamps are corrected if it is set, for example by NTP.
 
 A message's stamp is of the system clock, which may jump; the monotonic clock never does. The
 caller reads both clocks at the same time and passes both times.
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 
-from flock_follower.messages import NANOSECONDS, stamp_age
+from flock_follower.messages import NANOSECONDS
 
 #: A smaller change, s, is slewing or a late reading, and followed as it is.
 LEAST_STEP = 0.1
@@ -68,18 +68,3 @@ class ClockWatch:
             return False
         now = self._offset + (self._monotonic + LEAST_STEP) * NANOSECONDS
         return not self._first <= stamp <= now
-
-    def age(self, stamp: int, received: float, system: int, monotonic: float) -> float | None:
-        """
-        Return the age of a message, s: the larger of its stamp's and its reception's.
-
-        None if it was stamped before the last step, when its age is not known.
-
-        :param stamp: of the message, ns; 0: it has none.
-        :param received: when it was received, by the monotonic clock, s.
-        :param system: system clock, ns, and :param monotonic: monotonic clock, s: now.
-        """
-        self.take(system, monotonic)
-        if self.before_step(stamp):
-            return None
-        return max(stamp_age(stamp, system), monotonic - received)

@@ -22,7 +22,7 @@ its clock or its inputs have stopped.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import time
 import traceback
 from typing import Any, Final
@@ -38,7 +38,7 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
-NONE_SENDING = 'none sending'
+SILENCE = 2.0  # s without a message of a required topic that is reported
 #: The clock of timers that setting the system clock must not stop.
 STEADY: Final = Clock(clock_type=ClockType.STEADY_TIME)
 Problem = tuple[bytes, str]
@@ -112,21 +112,20 @@ class Latency:
 
 
 class Input:
-    """One subscribed topic; it finds the reason for a silence."""
+    """
+    One subscribed topic; it finds the reason for a silence.
 
-    def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile,
-                 timeout: float, required: bool, of: str = '') -> None:
-        self._node = node
-        self._type_name = type_name
-        self._qos = qos
-        self._timeout = timeout
-        self._required = required
-        self._of = of
+    :param required: whether silence is a fault. :param sporadic: it is none while a publisher is
+        there that sends nothing.
+    """
+
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile, required: bool,
+                 sporadic: bool) -> None:
+        self._node, self._type_name, self._qos = node, type_name, qos
+        self._required, self._sporadic = required, sporadic
         self._since = time.monotonic()
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
-        self.heartbeat: Input | None = None
-        """Another topic of the publisher: while it arrives, silence of this one is no fault."""
 
     def arrived(self) -> None:
         """Record the arrival of a message."""
@@ -134,15 +133,12 @@ class Input:
         self.rate.tick(self._since)
 
     def problem(self, now: float) -> Problem | None:
-        """Return why the topic has been silent for longer than its timeout, or None."""
+        """Return why a required topic has been silent for longer than SILENCE, or None."""
         silent = now - self._since
-        if not self._required or silent <= self._timeout:
+        reason = self._reason() if self._required and silent > SILENCE else ''
+        if not reason:
             return None
-        reason = self._reason()
-        if reason.endswith(NONE_SENDING) and self.heartbeat and (
-                now - self.heartbeat._since <= self._timeout):
-            return None
-        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {reason}'
+        return ERROR, f'no {self.topic} for {silent:.0f} s: {reason}'
 
     def _reason(self) -> str:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -155,40 +151,38 @@ class Input:
             verdict, why = qos_check_compatible(publisher.qos_profile, self._qos)
             if verdict == QoSCompatibility.ERROR:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
-        return f'{len(publishers)} publisher(s), {NONE_SENDING}'
+        return '' if self._sporadic else f'{len(publishers)} publisher(s), none sending'
 
 
 class Diagnostics:
     """
     The diagnostics of one node.
 
-    ``values`` holds key-value pairs, ``parts`` those that are replaced together, ``counters`` the
-    rejections by reason, ``checks`` functions that return a problem ``(level, message)`` or None
-    and are asked at each publication; one that raises is an internal error and hides no other. The
+    ``counters`` are the rejections by reason, ``values`` what a node sets. At each publication
+    ``checks`` return a problem ``(level, message)`` or None, and ``sources`` return more values,
+    both at a monotonic time, s; one that raises is an internal error and hides no other. The
     status shows the worst problem; every problem is also logged at most once per 5 s.
     """
 
-    def __init__(self, node: Node, period: float = 1.0) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
         self.values: dict[str, Any] = {}
-        self.parts: dict[str, dict[str, Any]] = {}
+        self.sources: list[Callable[[float], Mapping[str, Any]]] = []
         self.counters: Counter[str] = Counter()
         self.rates: dict[str, Rate] = {}
         self.latencies: dict[str, Latency] = {}
         self.checks: list[Callable[[float], Problem | None]] = []
-        self.inputs: dict[str, Input] = {}
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = node.create_timer(period, self.publish, clock=STEADY)
+        node.create_timer(1.0, self.publish, clock=STEADY)
 
-    def watch(self, topic: str, msg_type: Any, qos: QoSProfile, *, timeout: float = 2.0,
-              required: bool = True, of: str = '') -> Input:
-        """Return an :class:`Input` whose silence shows in the status, ``of`` after its name."""
+    def watch(self, topic: str, msg_type: Any, qos: QoSProfile, required: bool,
+              sporadic: bool) -> Input:
+        """Return an :class:`Input` whose silence shows in the status."""
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
-        watched = Input(self._node, topic, type_name, qos, timeout, required, of)
+        watched = Input(self._node, topic, type_name, qos, required, sporadic)
         self.checks.append(watched.problem)
-        self.inputs[topic] = watched
         self.rates[f'{topic}_hz'] = watched.rate
         return watched
 
@@ -226,22 +220,32 @@ class Diagnostics:
         # rclpy allows one severity per call site.
         if level == ERROR:
             logger.error(message)
-        elif level == WARN:
-            logger.warning(message)
         else:
-            logger.info(message)
+            logger.warning(message)
+
+    def _asked(self, function: Callable[[float], Any], now: float) -> Any:
+        try:
+            return function(now)
+        except Exception as error:
+            self.internal_error(f'in {getattr(function, "__name__", function)}', error)
+            return None
 
     def problems(self, now: float) -> list[Problem]:
         """Return every current problem, the worst first."""
-        found = []
-        for check in self.checks:
-            try:
-                found.append(check(now))
-            except Exception as error:
-                self.internal_error(f'in check {getattr(check, "__name__", check)}', error)
+        found = [self._asked(check, now) for check in self.checks]
         found += [(ERROR, message) for last, message in self._internal.values()
                   if now - last < ERROR_SHOWN]
         return sorted(filter(None, found), key=lambda problem: problem[0], reverse=True)
+
+    def shown(self, now: float) -> dict[str, Any]:
+        """Return all values at a monotonic time, s."""
+        values = dict(self.values)
+        for source in self.sources:
+            values |= self._asked(source, now) or {}
+        for name, latency in self.latencies.items():
+            values |= latency.values(name)
+        values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
+        return values | {f'rejected: {reason}': n for reason, n in self.counters.items()}
 
     def publish(self) -> None:
         """Publish the status now (called at 1 Hz)."""
@@ -253,13 +257,8 @@ class Diagnostics:
             name=self._node.get_fully_qualified_name().lstrip('/'),
             level=problems[0][0] if problems else OK,
             message='; '.join(message for _, message in problems) or 'running')
-        values = dict(self.values)
-        for part in (*self.parts.values(), *(
-                latency.values(name) for name, latency in self.latencies.items())):
-            values |= part
-        values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
-        values |= {f'rejected: {reason}': n for reason, n in self.counters.items()}
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        status.values = [KeyValue(key=key, value=str(value))
+                         for key, value in self.shown(now).items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)

@@ -25,16 +25,16 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.geometry import Transform
-from flock_follower.messages import OdometryState, to_array
+from flock_follower.messages import OdometryState, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.support.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.odometry.buffer import StaticFrames
-from flock_follower.odometry.derivation import NONE
+from flock_follower.odometry.derivation import AUTO, NONE
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.spec import filled
 
-BASE, TF_STATIC = 'base_link', '/tf_static'
+BASE = 'base_link'
 LARGEST = 65536  # bytes of a message on /tf_static: about 500 transforms
 #: Reliable, and the last message is kept for subscribers that start later. Never KEEP_ALL: a
 #: stopped subscriber would block the publisher.
@@ -85,20 +85,18 @@ class EvenClock:
 
 
 class StaticChild:
-    """
-    The frames of ``/tf_static``; none if tf2_msgs is not installed.
+    """The frames of ``/tf_static``; none if tf2_msgs is not installed, as in the PyPI runtime."""
 
-    :param changed: is called after each message.
-    """
-
-    def __init__(self, node: Node, changed: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: Node) -> None:
         self._frames = StaticFrames()
-        self._changed = changed
-        if (kind := transform_message()) is not None:
-            subscribe = (partial(node.subscribe, required=False, largest=LARGEST)
-                         if isinstance(node, FlockNode) else node.create_subscription)
-            subscribe(kind, TF_STATIC, self.take, QoSProfile(
-                depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        try:
+            from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+        except ImportError:
+            return
+        subscribe = (partial(node.subscribe, required=False, largest=LARGEST)
+                     if isinstance(node, FlockNode) else node.create_subscription)
+        subscribe(TFMessage, '/tf_static', self.take, QoSProfile(
+            depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def take(self, message: Any) -> None:
         """Take a TFMessage."""
@@ -107,85 +105,64 @@ class StaticChild:
             self._frames.add(
                 stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
                     to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
-        self._changed()
 
     def transform(self, child: str) -> Transform | None:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
-        return None if child == BASE else self._frames.pose(child, BASE)
-
-    def knows(self, frame: str) -> bool:
-        """Return whether a frame has a parent on ``/tf_static``."""
-        return self._frames.knows(frame)
-
-
-def transform_message() -> Any:
-    """Return the type of the messages on /tf; None without tf2_msgs, as in the PyPI runtime."""
-    try:
-        from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
-    except ImportError:
-        return None
-    return TFMessage
+        return None if child in ('', BASE) else self._frames.pose(child, BASE)
 
 
 class OwnOdometry:
     """
-    Reads a node's ``odom``; counts dropped messages, and reports the frames in use.
+    Subscribes ``odom``; counts dropped messages, and reports the frames in use.
 
     :param values: the node's parameters, see ``odometry.reader.SourceParams``.
+    :param use: is called with the own state, of base_link, and the arrival of its message, ns;
+        both on the node's clock, or on ``clock`` if one is given.
     :raises ValueError: if a parameter is out of range.
     """
 
-    def __init__(self, node: FlockNode, values: Mapping[str, Any]) -> None:
+    def __init__(self, node: FlockNode, values: Mapping[str, Any],
+                 use: Callable[[OdometryState, int], None], clock: EvenClock | None = None,
+                 depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
-        self._node = node
-        self._described = self._child = self._placed = ''
-        node.diagnostics.checks += [self._problem, self._axes_problem]
+        self._node, self._use, self._clock, self._placed = node, use, clock, ''
+        node.diagnostics.checks.append(self._problem)
+        node.diagnostics.sources.append(self._values)
         configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
-        self._static = None if configured else StaticChild(node, self._place)
+        self._static = None if configured else StaticChild(node)
+        self.poll = node.poll(Odometry, 'odom', self._take, best_effort(depth), **options)
+        """Takes the messages that wait, see ``FlockNode.poll``."""
 
-    def _place(self) -> None:
-        """Pass the pose of the child frame from tf_static to the source, if published."""
-        pose = self._static.transform(self._child) if self._static and self._child else None
-        if pose is not None and self._placed != self._child:
-            self._placed = self._child  # a static transform is passed once
+    def _take(self, message: Odometry, arrival: int) -> None:
+        child, shift = message.child_frame_id, 0
+        if self._clock is not None:
+            self._clock.now()
+            shift = self._clock.shift
+            if not self._clock.fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
+                return
+        if self._static and child != self._placed and (
+                pose := self._static.transform(child)) is not None:
+            self._placed = child  # a static transform is passed once
             self.source.place_child(pose)
-            self._node.get_logger().info(
-                f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE} by '
-                'tf_static')
-
-    def take(self, message: Odometry, arrival: int, shift: int = 0) -> OdometryState | None:
-        """
-        Return the own state, of base_link; None if the message repeats the last one.
-
-        :param arrival: when it came, ns of the node's clock.
-        :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
-            ``arrival`` and the stamp returned are on one that goes on evenly (``EvenClock``).
-        :raises ValueError: if the message is invalid.
-        """
-        if message.child_frame_id != self._child:
-            self._child = message.child_frame_id
-            self._place()
-        state = self.source.take(message, arrival, shift)
+            self._node.get_logger().info(f'{child} is at {pose.translation.round(3).tolist()} m '
+                                         f'on {BASE} by tf_static')
+        state = self.source.take(message, arrival - shift, shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
-        described = self.source.twist.describe
-        if described != self._described:
-            self._node.get_logger().info(f'velocity of odom: {described}')
-            self._described = self._node.diagnostics.values['odom_twist'] = described
-        return state
+        if state is not None:
+            self._use(state, arrival - shift)
+
+    def _values(self, now: float) -> dict[str, str]:
+        source = self.source
+        return {'odom_twist': source.twist.describe, 'odom_latency_s': f'{source.latency:.3f}',
+                'odom_lacks': '; '.join(
+                    f'{what}: {instead}' for what, instead in sorted(source.missing.items()))}
 
     def _problem(self, now: float) -> Problem | None:
-        source, values = self.source, self._node.diagnostics.values
-        values['odom_latency_s'] = f'{source.latency:.3f}'
-        values['odom_lacks'] = '; '.join(
-            f'{what}: {instead}' for what, instead in sorted(source.missing.items()))
-        twist = source.twist
-        if twist.wanted in (twist.found, NONE) or not twist.found:
-            return None
-        if twist.found == NONE or twist.wanted in ('child', 'odom'):
+        twist, fault = self.source.twist, self.source.up.fault
+        if fault:
+            return WARN, f'axes of odom: {fault}'
+        if twist.found not in ('', twist.wanted) and twist.wanted != NONE and (
+                twist.found == NONE or twist.wanted != AUTO):
             return WARN, f'velocity of odom: {twist.describe}'
         return None
-
-    def _axes_problem(self, now: float) -> Problem | None:
-        fault = self.source.up.fault
-        return (WARN, f'axes of odom: {fault}') if fault else None

@@ -16,48 +16,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import functools
 import gc
 import inspect
 import itertools
-import math
 import os
 import stat
 import sys
 import time
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import EventHandler
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from rclpy.waitable import Waitable
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
-from flock_follower.nodes.support.parameters import usage, ValidatedNode
+from flock_follower.nodes.support.parameters import Parameters, usage
 from flock_follower.odometry.cdr import read_odometry
-from flock_follower.parameters.files import files_in
+from flock_follower.parameters.files import files_in, shared, unheeded
+from flock_follower.parameters.spec import Spec
 
 Message = TypeVar('Message')
+T = TypeVar('T')
 #: Functions that read a type from its bytes faster than rclpy; the results have the same fields.
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 #: Bytes of the largest small message. rclpy takes 13 s to deserialise one of 17 MB, and no other
 #: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
-EVENTS_TIME = 0.02  # s of each second in which QoS events are served
 READING_TIME = 1e-3  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
 
@@ -86,62 +86,82 @@ class Waiting(CallbackGroup):
         """Do nothing."""
 
 
-class FlockNode(ValidatedNode):
+class FlockNode(Node):
     """
     A node with validated parameters, diagnostics, and callbacks that cannot kill it.
 
     An exception of a callback of a subscription, a timer or a service counts in /diagnostics as
     an internal error and is logged at most once per 5 s; the node lives on. That holds for the
-    callbacks of rclpy itself, too: ``/clock`` and the services of the parameters.
+    callbacks of rclpy itself, too: ``/clock`` and the services of the parameters. Entities have no
+    QoS events: to wait for them took a third of the time of every wait, and ``diagnostics.Input``
+    finds what does not fit.
+
+    ``parameter_files`` are those of the command line; ``run`` sets them. rclpy is silent if none
+    of their sections is for the node.
     """
 
+    parameter_files: ClassVar[Sequence[str]] = ()
+
     def __init__(self, name: str, **kwargs: Any) -> None:
-        self._events = Waiting(lambda: time.monotonic() < self._events_until)
-        self._events_until = math.inf
-        super().__init__(name, **kwargs)
+        self._table: Parameters[Any] | None = None
+        super().__init__(name, automatically_declare_parameters_from_overrides=True, **kwargs)
         self.diagnostics = Diagnostics(self)
-        self.diagnostics.checks.append(self._look_at_events)
 
-    def add_waitable(self, waitable: Waitable) -> None:
+    def declare(self, specs: Sequence[Spec], build: Callable[[dict[str, Any]], T],
+                flying: Callable[[], bool] = lambda: False) -> Parameters[T]:
         """
-        Add an entity that the executor waits for, as rclpy does; QoS events once a second.
+        Declare the node's parameters; see :class:`Parameters`.
 
-        Each publisher and subscription has two QoS events, which report incompatible nodes and
-        are rare. Waiting for all these events took a third of the time of every wait.
+        :raises ValueError: also for a parameter file that seems to mean the node and misses it.
         """
-        if isinstance(waitable, EventHandler):
-            waitable.callback_group = self._events
-        super().add_waitable(waitable)
+        name = self.get_fully_qualified_name()
+        for path in self.parameter_files:
+            if warning := unheeded(path, name):
+                self.get_logger().warning(warning)
+        self._table = table = Parameters(self, specs, build, flying,
+                                         shared(self.parameter_files, name))
+        return table
 
-    def _look_at_events(self, now: float) -> None:
-        self._events_until = now + EVENTS_TIME
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all or none; the reason of a refusal names parameter, value and range."""
+        try:
+            if self._table is not None:
+                parameter_list = self._table.check(parameter_list)
+            return super().set_parameters_atomically(parameter_list)
+        except ParameterException:
+            raise  # rclpy answers it: an unknown or an immutable parameter
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            self._caught('on parameters', error)
+            return SetParametersResult(successful=False, reason=internal_error(error))
 
-    def subscribe(self, msg_type: type[Message], topic: str,
-                  callback: Callable[[Any], None], qos: QoSProfile, *,
-                  timeout: float = 2.0, required: bool = True, of: str = '',
-                  informed: bool = False, largest: int | None = SMALL_MESSAGE,
-                  **kwargs: Any) -> Subscription:
+    def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
+        """Set one by one; see :meth:`set_parameters_atomically`."""
+        return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
+
+    def subscribe(self, msg_type: type[Message], topic: str, callback: Callable[..., None],
+                  qos: QoSProfile, *, required: bool = True, informed: bool = False,
+                  largest: int | None = SMALL_MESSAGE) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
         A ValueError is an invalid message and counts under its topic; any other exception counts
-        as an internal error with its place. A ``required`` topic that is silent for longer than
-        ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
-        qualifies its name there. ``informed``: the callback gets the message and rclpy's message
-        info as one pair. A message of more than ``largest`` bytes is refused before it is
-        deserialised, and counted; None: any size is taken.
+        as an internal error with its place. The silence of a ``required`` topic shows in
+        /diagnostics with the reason. ``informed``: the callback gets rclpy's message info, too. A
+        message of more than ``largest`` bytes is refused before it is deserialised, and counted;
+        None: any size is taken.
         """
-        take = self._watched(
-            msg_type, topic, (lambda message, info: callback((message, info))) if informed
-            else (lambda message, _: callback(message)), qos, timeout, required, of,
-            largest=largest)
+        take = self._taker(
+            msg_type, topic, callback if informed else lambda message, _: callback(message),
+            qos, required, False, largest)
         return self.create_subscription(
-            msg_type, topic, (lambda message, info: take(message, info)) if informed
-            else (lambda message: take(message, None)), qos, raw=largest is not None, **kwargs)
+            msg_type, topic, lambda message, info: take(message, info), qos,
+            raw=largest is not None)
 
     def poll(self, msg_type: type[Message], topic: str,
              callback: Callable[[Message, int], None], qos: QoSProfile, *,
-             timeout: float = 2.0, required: bool = True, of: str = '',
+             required: bool = True, sporadic: bool = False,
              awaited: Callable[[], bool] = lambda: False,
              largest: int = SMALL_MESSAGE) -> Callable[[], None]:
         """
@@ -153,38 +173,28 @@ class FlockNode(ValidatedNode):
         ``use_sim_time`` it always does: the rate of that time is unknown, and so is the time of
         arrival of a message that has waited.
         """
-        if self.get_parameter('use_sim_time').value:
-            self.subscribe(
-                msg_type, topic, lambda message: callback(
-                    message, self.get_clock().now().nanoseconds), qos, timeout=timeout,
-                required=required, of=of, largest=largest)
-            return lambda: None
+        simulated = bool(self.get_parameter('use_sim_time').value)
 
-        def taken(message: Any, info: Any) -> None:
-            now = time.time_ns()
-            age = now - (info['received_timestamp'] or now)
-            # Bounded: the clock may have been set meanwhile.
-            arrival = self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT)
-            callback(message, arrival)
+        def taken(message: Any, info: Mapping[str, Any]) -> None:
+            callback(message, self.get_clock().now().nanoseconds if simulated
+                     else self.arrival(info))
 
-        take = _guarded(self._watched(msg_type, topic, taken, qos, timeout, required, of,
-                                      largest=largest),
+        take = _guarded(self._taker(msg_type, topic, taken, qos, required, sporadic, largest),
                         lambda error: self._caught(f'on {topic}', error))
         handle = self.create_subscription(
             msg_type, topic, lambda message, info: take(message, info), qos,
-            callback_group=Waiting(awaited), raw=True).handle
+            callback_group=Waiting((lambda: True) if simulated else awaited), raw=True).handle
 
         def poll() -> None:
             while (received := handle.take_message(msg_type, True)) is not None:
                 take(*received)
         return poll
 
-    def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
-                 qos: QoSProfile, timeout: float, required: bool, of: str, *,
-                 largest: int | None) -> Callable[[Any, Any], None]:
+    def _taker(self, msg_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
+               qos: QoSProfile, required: bool, sporadic: bool,
+               largest: int | None) -> Callable[[Any, Any], None]:
         """Return a function of a message, as bytes if its size is bounded, and its info."""
-        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
-                                         of=of)
+        watched = self.diagnostics.watch(topic, msg_type, qos, required, sporadic)
         read = READERS.get(msg_type, functools.partial(_deserialize, msg_type))
 
         def take(message: Any, info: Any) -> None:
@@ -199,6 +209,14 @@ class FlockNode(ValidatedNode):
                 self.diagnostics.reject(f'invalid {topic}', str(error))
         return take
 
+    def arrival(self, info: Mapping[str, Any]) -> int:
+        """Return when the message of an info arrived, ns of this node's clock."""
+        now, received = time.time_ns(), info['received_timestamp']
+        # Bounded: the clock may have been set meanwhile.
+        waited = min(max(now - received, 0), LONGEST_WAIT) if received else 0
+        clock: int = self.get_clock().now().nanoseconds
+        return clock - waited
+
     def read_clocks(self) -> tuple[int, float]:
         """Return this node's clock, ns, and the monotonic one, s, read at the same time."""
         for _ in range(3):  # a pause between two readings would look like a clock that was set
@@ -209,11 +227,18 @@ class FlockNode(ValidatedNode):
                 break
         return system, 0.5 * (before + after)
 
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
+        """Create a publisher as rclpy does, without QoS events."""
+        return super().create_publisher(*args, **kwargs, event_callbacks=PublisherEventCallbacks(
+            use_default_callbacks=False))
+
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[..., Any],
                             *args: Any, **kwargs: Any) -> Subscription:
-        """Subscribe as rclpy does, guarded."""
-        return super().create_subscription(msg_type, topic, _guarded(
-            callback, lambda error: self._caught(f'on {topic}', error)), *args, **kwargs)
+        """Subscribe as rclpy does, guarded, and without QoS events."""
+        return super().create_subscription(
+            msg_type, topic,
+            _guarded(callback, lambda error: self._caught(f'on {topic}', error)), *args, **kwargs,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
                      *args: Any, **kwargs: Any) -> Timer:
@@ -230,33 +255,16 @@ class FlockNode(ValidatedNode):
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
                        *args: Any, **kwargs: Any) -> Service:
-        """
-        Serve as rclpy does, guarded.
-
-        A request whose callback raises, or returns no response, is answered with ``success``
-        false and the error in ``message``, if the type has these fields.
-        """
+        """Serve as rclpy does; a request whose callback raises is answered with the error."""
         def answer(error: Exception) -> Any:
             self._caught(f'in service {srv_name}', error)
             response = srv_type.Response()
-            if hasattr(response, 'success'):
-                response.success = False
-            if hasattr(response, 'message'):
+            if hasattr(response, 'message'):  # of SetBool and Trigger; success is false
                 response.message = internal_error(error)
             return response
 
         return super().create_service(
-            srv_type, srv_name, _guarded(callback, answer, srv_type.Response), *args, **kwargs)
-
-    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set all or none; a callback that raises refuses the change, with the error as reason."""
-        try:
-            return super().set_parameters_atomically(parameter_list)
-        except ParameterException:
-            raise  # rclpy answers it: an unknown or an immutable parameter
-        except Exception as error:
-            self._caught('on parameters', error)
-            return SetParametersResult(successful=False, reason=internal_error(error))
+            srv_type, srv_name, _guarded(callback, answer), *args, **kwargs)
 
     def _caught(self, where: str, error: Exception) -> None:
         if not self.context.ok():
@@ -271,34 +279,23 @@ def _deserialize(msg_type: Any, data: bytes) -> Any:
         raise ValueError(f'not a {msg_type.__name__} message: {error}') from None
 
 
-def _guarded(callback: Callable[..., Any], caught: Callable[[Exception], Any],
-             result: type | None = None) -> Callable[..., Any]:
-    """
-    Return a callback that never raises; the result of ``caught`` replaces an exception.
-
-    :param result: the type that the callback must return; None: any.
-    """
-    def checked(returned: Any) -> Any:
-        if result is not None and not isinstance(returned, result):
-            raise TypeError(f'{type(returned).__name__} returned, not {result.__name__}')
-        return returned
-
-    if inspect.iscoroutinefunction(callback):
-        @functools.wraps(callback)
-        async def waiting(*args: Any) -> Any:
-            try:
-                return checked(await callback(*args))
-            except Exception as error:
-                return caught(error)
-        return waiting
+def _guarded(callback: Callable[..., Any],
+             caught: Callable[[Exception], Any]) -> Callable[..., Any]:
+    """Return a callback that never raises; the result of ``caught`` replaces an exception."""
+    @functools.wraps(callback)
+    async def waiting(*args: Any) -> Any:
+        try:
+            return await callback(*args)
+        except Exception as error:
+            return caught(error)
 
     @functools.wraps(callback)
     def plain(*args: Any) -> Any:
         try:
-            return checked(callback(*args))
+            return callback(*args)
         except Exception as error:
             return caught(error)
-    return plain
+    return waiting if inspect.iscoroutinefunction(callback) else plain
 
 
 def spin(node: Node) -> None:
@@ -348,7 +345,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
         on_signal(rclpy.get_default_context().try_shutdown)
-        ValidatedNode.parameter_files = files_in(arguments)
+        FlockNode.parameter_files = files_in(arguments)
         try:
             node = factory()
         except (ValueError, OSError, NameValidationException) as error:
