@@ -53,7 +53,8 @@ def test_two_whole_flights_from_arming_to_landing_need_nothing_but_the_services(
         for what, arguments in (('offboard', [False]), ('land', [])):
             assert flight.ask(what, *arguments).success
         assert flight.mode == flight.modes.land
-        flight.fly_until(lambda: not flight.controller.armed, 15.0)
+        # Until a HEARTBEAT shows it: asked before, the bridge would arm in LAND.
+        flight.fly_until(lambda: not flight.bridge.telemetry.status.armed, 15.0)
         assert flight.vehicle.landed
         assert flight.bridge.state(flight.now).startswith('INACTIVE')
 
