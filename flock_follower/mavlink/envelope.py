@@ -239,15 +239,14 @@ class HeightEstimator:
     """The height of one vehicle; times are monotonic, s."""
 
     def __init__(self) -> None:
-        self.steps = 0
-        """Number of jumps of the sensor, and so of the reference."""
+        self.stepped = -math.inf
+        """When the sensor, and so the reference, has jumped last, s."""
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None
         self._time = -math.inf
         self._reference: float | None = None
         self._differences: deque[tuple[float, float]] = deque()
-        self._stepped = -math.inf
 
     def take(self, altitude: float, climb_rate: float | None, now: float) -> str:
         """
@@ -282,8 +281,7 @@ class HeightEstimator:
         while now - self._differences[0][0] > 2.0 * STEP_TIME:
             self._differences.popleft()
         if climb_rate is not None and self._jumped(now):
-            self.steps += 1
-            self._stepped = now
+            self.stepped = now
             self._differences.clear()
             self._altitude = expected + difference
             if self._reference is not None:
@@ -339,5 +337,5 @@ class HeightEstimator:
 
     def lost(self, now: float) -> str:
         """Return why a height that was known cannot be used at ``now``, or ''."""
-        jumped = self._reference is not None and now - self._stepped < STEP_PAUSE
+        jumped = self._reference is not None and now - self.stepped < STEP_PAUSE
         return first_reason((self.missing(now), 'height stale'), (jumped, 'height jumped'))
