@@ -16,7 +16,7 @@
 #   make setup     only make the virtual environment that the others use
 #   make clean     remove everything that these made
 # Measure it
-#   make bench-simulation   speed of flocks of 10,000 agents (needs 9 GB of memory), make bench-graph-law their safety
+#   make bench-simulation   speed of a flock of 10,000 agents, make bench-graph-law their safety
 #   make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 #   make bench-planner      CPU time of the planner's tick, and its projection beside other solvers (minutes)
 #   make bench-markers      how far and how near a marker, and a panel of two, are seen (five minutes)
@@ -132,7 +132,6 @@ flights: setup
 	@$(RUN) -m flock_desk.flights --scenario all --runs $(RUNS)
 
 bench-simulation: setup
-	@echo 'takes up to 9 GB of memory, and some minutes (less: benchmarks/simulation.py --agents 3000)'
 	@$(RUN) benchmarks/simulation.py
 
 bench-graph-law: setup

@@ -29,6 +29,7 @@ from itertools import pairwise
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import yaml
 
@@ -37,7 +38,6 @@ from flock_desk.camera.renderer import (
     board,
     Face,
     marker_print,
-    render_in_one_thread,
     Renderer,
     Sensor,
     T_BODY_MARKER,
@@ -172,7 +172,7 @@ def rms(values: list[float]) -> float:
 def main() -> None:
     """Print the detections."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
-    render_in_one_thread()
+    cv2.setNumThreads(1)
     carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),
                'panel': parse(yaml.safe_load(panel_entry(layout(DICTIONARY, [0, 1], SIZES))))}
     renderers = {name: Renderer(CAMERA, Sensor(), printed(config.neighbors[0].markers))

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 import ipaddress
 import math
 from pathlib import Path
@@ -33,39 +34,58 @@ import sys
 import time
 from typing import Any, Final
 
+from flock_desk.runs.console import guarded, Options, parsed
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
-from flock_follower.mavlink.link import Signing
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
 
+OPTIONS: Final[Options] = {
+    '--connect': {'default': '127.0.0.1:14540', 'metavar': 'HOST:PORT',
+                  'help': 'where a bridge listens; loopback only (%(default)s)'},
+    '--personality': {'choices': tuple(PROFILES), 'default': 'px4',
+                      'help': 'whose modes, masks and answers (%(default)s)'},
+    '--start': {'choices': STARTS, 'default': 'airborne',
+                'help': 'hovering, or on the ground armed or disarmed (%(default)s)'},
+    '--altitude': {'type': float, 'default': 2.0, 'metavar': 'M',
+                   'help': 'of a hovering start, m (%(default)s)'},
+    '--yaw': {'type': float, 'default': 0.0, 'metavar': 'DEG',
+              'help': 'at the start, degrees anticlockwise from east (%(default)s)'},
+    '--param-file': {'default': '', 'metavar': 'FILE',
+                     'help': 'set the parameters of a file such as config/px4.params, but those '
+                             'for forwarded odometry'},
+    '--param': {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
+                'help': 'set a parameter of the autopilot; may be repeated'},
+    '--log': {'default': '', 'metavar': 'FILE.npz',
+              'help': 'write the true state and every setpoint received'}}
+_VALID: Final = {'altitude': Range(0.1, 1000.0, 'm'), 'yaw': Range(-360.0, 360.0, 'degrees')}
+
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the embedded autopilot until SIGINT, SIGTERM or its end; return the exit code."""
-    options = parser().parse_args(args)
-    try:
-        address = loopback_address(options.connect)
-        start = time.monotonic()
-        autopilot = EmbeddedAutopilot(now=start, **settings(options))
-        serve(options, start, autopilot, [Endpoint(address, autopilot)])
-    except (OSError, ValueError) as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
+    """Run the embedded autopilot until SIGINT or SIGTERM; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='autopilot', description='An embedded autopilot for tests and the demo.')
+    return guarded(partial(_fly, parsed(parser, args, OPTIONS, valid=_VALID)))
+
+
+def _fly(options: argparse.Namespace) -> int:
+    address = loopback_address(options.connect)
+    autopilot = EmbeddedAutopilot(now=time.monotonic(), **settings(options))
+    serve(options.log, autopilot, [Endpoint(address, autopilot)])
     return 0
 
 
-def serve(options: argparse.Namespace, start: float, autopilot: EmbeddedAutopilot,
-          ends: Sequence[Endpoint]) -> None:
+def serve(log: str, autopilot: EmbeddedAutopilot, ends: Sequence[Endpoint]) -> None:
     """
-    Fly in real time until SIGINT, SIGTERM or the end of ``options.duration``; write the log.
+    Fly in real time until SIGINT or SIGTERM; write the log to a file, if one is named.
 
     :param ends: the links; the first is that of ``autopilot``.
     """
     stop: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
-    while not stop and time.monotonic() - start < options.duration:
+    while not stop:
         ends[0].receive(autopilot.next_step - time.monotonic())
         due = autopilot.next_step
         if time.monotonic() >= due:
@@ -75,8 +95,30 @@ def serve(options: argparse.Namespace, start: float, autopilot: EmbeddedAutopilo
                 end.step(due)
     for end in ends:
         end.close()
-    if options.log:
-        autopilot.log.save(options.log)
+    if log:
+        autopilot.log.save(log)
+
+
+def settings(options: argparse.Namespace) -> dict[str, Any]:
+    """
+    Return the parameters of ``EmbeddedAutopilot`` that the command line gives.
+
+    :raises ValueError: for a parameter without a number. :raises OSError: for an unreadable file.
+    """
+    parameters = {}
+    if options.param_file:
+        text = Path(options.param_file).read_text(encoding='utf-8')
+        parameters.update({entry.name: entry.value for entry in read_recommendations(
+            text, forwarding=False)})
+    for text in options.param:
+        name, _, value = text.partition('=')
+        try:
+            parameters[name] = float(value)
+        except ValueError:
+            raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
+    return {'personality': options.personality, 'start': options.start,
+            'altitude': options.altitude, 'yaw': math.radians(options.yaw),
+            'parameters': parameters}
 
 
 def loopback_address(text: str) -> tuple[str, int]:
@@ -130,76 +172,6 @@ class Endpoint:
     def _send(self, datagrams: list[bytes]) -> None:
         for data in datagrams:
             self._transport.write(data)
-
-
-def settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the parameters of ``EmbeddedAutopilot`` that the command line gives."""
-    signing = None
-    if options.signing_key_file:
-        signing = Signing.from_file(options.signing_key_file, time.time()).state
-    parameters = {}
-    if options.param_file:
-        text = Path(options.param_file).read_text(encoding='utf-8')
-        parameters.update({entry.name: entry.value for entry in read_recommendations(
-            text, forwarding=False)})
-    for text in options.param:
-        name, _, value = text.partition('=')
-        try:
-            parameters[name] = float(value)
-        except ValueError:
-            raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
-    return {'personality': options.personality, 'start': options.start,
-            'altitude': options.altitude, 'yaw': math.radians(options.yaw),
-            'system_id': options.system_id, 'parameters': parameters,
-            'arming_denial': options.deny_arming, 'ready_after': options.ekf_ready,
-            'signing': signing}
-
-
-def _number(low: float, high: float) -> Any:
-    def number(text: str) -> float:
-        value, valid = float(text), Range(low, high)
-        if not valid.holds(value):
-            raise argparse.ArgumentTypeError(f'{text}: must be {valid}')
-        return value
-    return number
-
-
-_OPTIONS: Final[dict[str, dict[str, Any]]] = {
-    'connect': {'default': '127.0.0.1:14540', 'metavar': 'HOST:PORT',
-                'help': 'where a bridge listens; loopback only (%(default)s)'},
-    'personality': {'choices': tuple(PROFILES), 'default': 'px4',
-                    'help': 'whose modes, masks and answers (%(default)s)'},
-    'start': {'choices': STARTS, 'default': 'airborne',
-              'help': 'hovering, or on the ground armed or disarmed (%(default)s)'},
-    'altitude': {'type': _number(0.1, 1000.0), 'default': 2.0, 'metavar': 'M',
-                 'help': 'of a hovering start, m (%(default)s)'},
-    'yaw': {'type': _number(-360.0, 360.0), 'default': 0.0, 'metavar': 'DEG',
-            'help': 'at the start, degrees anticlockwise from east (%(default)s)'},
-    'system-id': {'type': int, 'default': 1, 'metavar': 'ID',
-                  'help': 'MAVLink system id (%(default)s)'},
-    'ekf-ready': {'type': _number(0.0, 3600.0), 'default': 0.0, 'metavar': 'S',
-                  'help': 'until a landed vehicle knows its position, s (%(default)s)'},
-    'deny-arming': {'default': '', 'metavar': 'REASON', 'help': 'refuse arming with this reason'},
-    'param-file': {'default': '', 'metavar': 'FILE',
-                   'help': 'set the parameters of a file such as config/px4.params, but those for '
-                           'forwarded odometry'},
-    'param': {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
-              'help': 'set a parameter of the autopilot; may be repeated'},
-    'signing-key-file': {'default': '', 'metavar': 'FILE',
-                         'help': 'sign messages, and accept only signed ones'},
-    'duration': {'type': _number(0.0, 1e9), 'default': math.inf, 'metavar': 'S',
-                 'help': 'stop after this long, s (never)'},
-    'log': {'default': '', 'metavar': 'FILE.npz',
-            'help': 'write the true state and every setpoint received'}}
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='autopilot', description='An embedded autopilot for tests and the demo.')
-    for name, option in _OPTIONS.items():
-        parser.add_argument(f'--{name}', **option)
-    return parser
 
 
 if __name__ == '__main__':

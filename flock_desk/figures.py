@@ -40,7 +40,7 @@ import numpy as np
 
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
-from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
+from flock_desk.flocks.agents import Leader, Model, simulate, simulate_graph, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
@@ -73,17 +73,7 @@ _FLOCK: Options = {
     '--agents': {'type': int, 'metavar': 'N', 'help': 'how many, instead of the paper'},
     '--dim': {'type': int, 'choices': (2, 3), 'default': 2, 'help': '%(default)s'},
     '--seed': {'type': int, 'default': 1, 'help': 'of the start; %(default)s'},
-    '--model': {'choices': tuple(MODELS), 'default': 'flocking', 'help': '%(default)s'},
-    '--band': {'choices': ('paper', 'flight'), 'default': 'flight',
-               'help': '1 to 2.25 or 1 to 8 m^2; %(default)s'},
-    '--neighbors': {'choices': ('all', 'graph', 'nearest'),
-                    'help': 'graph for the flocking law, all for the other models'},
-    '--coupling': {'choices': ('flock', 'pair'), 'default': 'flock',
-                   'help': 'whose disagreement scales the forces; %(default)s'},
-    '--duration': {'type': float, 'default': 20.0, 'help': 's; %(default)s'},
-    '--dt': {'type': float, 'default': 0.005, 'help': 's; %(default)s'},
-    '--method': {'choices': ('auto', 'whole', 'blocked'), 'default': 'auto',
-                 'help': 'of the sum over all pairs; %(default)s'}}
+    '--duration': {'type': float, 'default': 20.0, 'help': 's; %(default)s'}}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -123,8 +113,8 @@ def redraw(out: Path) -> list[str]:
             for model, name in MODELS.items():
                 progress.start(f'{scenario}: {name}')
                 runs[scenario][model] = simulate(
-                    start.positions, start.velocities, paper.PARAMS, duration=duration,
-                    model=model, leader=lead, sample_period=0.005, progress=progress.share)
+                    *start, paper.PARAMS, duration=duration, model=model, leader=lead,
+                    sample_period=0.005, progress=progress.share)
         alone, led = ({MODELS[model]: run for model, run in by_model.items()}
                       for by_model in runs.values())
         continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
@@ -206,21 +196,14 @@ def redraw_controllers(out: Path, path: Path) -> tuple[list[str], list[str]]:
 def one_flock(options: argparse.Namespace) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of its files."""
     from flock_desk.runs import paper_plots as plots
-    params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
-    usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
-    neighbors: Neighbors = options.neighbors or usual
-    start = random_start(options.agents, options.dim, params, options.seed)
+    start = random_start(options.agents, options.dim, paper.FLIGHT_PARAMS, options.seed)
     with Progress(2) as progress:
-        progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
-        run = simulate(
-            start.positions, start.velocities, params, duration=options.duration,
-            model=options.model, neighbors=neighbors, coupling=options.coupling,
-            integrator='semi_implicit', sample_period=0.05, method=options.method,
-            dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
-            progress=progress.share)
-        m = run.metrics
-        name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
-                f'seed{options.seed}')
+        progress.start(f'{options.agents} agents, {options.dim}-D')
+        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=options.duration,
+                             progress=progress.share)
+        m, graph = run.metrics, run.graph
+        assert graph is not None
+        name = f'flock_{options.agents}_{options.dim}d_seed{options.seed}'
         progress.start(f'drawing {name}')
         written = plots.save(plots.flock(run), options.out / name)
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
@@ -228,12 +211,11 @@ def one_flock(options: argparse.Namespace) -> list[str]:
     values = (m.time, m.min_r2, m.max_r2, m.mean_distance, m.speed, m.disagreement, m.order)
     write_csv(options.out / f'{name}.csv', columns, zip(*([_text(v, 6) for v in column]
                                                           for column in values)))
-    row_ = row(f'{options.agents} agents, {options.dim}-D', MODELS[options.model], run)
+    row_ = row(f'{options.agents} agents, {options.dim}-D', MODELS['flocking'], run)
     print('\n'.join(aligned([COLUMNS, row_])))
-    if run.graph is not None:
-        print(f'neighbour graph: {len(run.graph.edges)} edges, of them '
-              f'{int(np.sum(np.asarray(run.joined) > 0.0))} joined after the start; '
-              'max r2 is over the edges')
+    print(f'neighbour graph: {len(graph.edges)} edges, of them '
+          f'{np.count_nonzero(graph.joined > 0.0)} joined after the start; '
+          'max r2 is over the edges')
     return [written, f'{name}.csv']
 
 

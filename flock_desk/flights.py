@@ -29,10 +29,7 @@ from itertools import groupby
 import os
 from pathlib import Path
 import sys
-import time
 from typing import NamedTuple
-
-import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.controllers import CONTROLLERS, IN_FLOCKS
@@ -53,9 +50,7 @@ from flock_desk.scenarios.scenario_file import (
     load,
     names,
     ScenarioError,
-    with_flock,
 )
-from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
@@ -99,8 +94,6 @@ class Flown(NamedTuple):
     """What a task gives."""
 
     runs: Measures
-    cpu: Array
-    """CPU time of every tick of every planner, s."""
     exits: list[str]
     """Which runs left the band, when and why, one line each."""
 
@@ -111,9 +104,6 @@ _OPTIONS: Options = {
                       f'{" and ".join(IN_FLOCKS)} only (all)'},
     '--keys': {'action': 'store_true',
                'help': 'print every key of a scenario file with its default and range'},
-    '--flock': {'nargs': '+', 'default': [], 'metavar': 'KEY=VALUE',
-                'help': "other values for the scenarios' flock: followers=12 words=false "
-                "'fails={follower: 2, at: 20}'"},
     '--runs': {'type': int, 'default': 200, 'help': 'of each (%(default)s)'},
     '--jobs': {'type': int, 'default': os.cpu_count() or 1,
                'help': 'processes (one per processor)'},
@@ -142,11 +132,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _campaign(options: argparse.Namespace) -> int:
     scenarios = chosen(options.scenario)
-    if options.flock:
-        changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
-        scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
     options.output.mkdir(parents=True, exist_ok=True)
-    results, cpu, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
+    results, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
                                   options.seed, options.scheduler)
     path = options.output / 'flights.json'
     write_summary(results, path)
@@ -155,10 +142,6 @@ def _campaign(options: argparse.Namespace) -> int:
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
     if flocks:
         print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCK_NOTES}\n')
-        print('CPU time of a tick of each follower, mean and p99, ms')
-    for name in flocks:
-        mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
-        print(f'  {shorten(name):<22}{1e3 * mean:6.2f}{1e3 * p99:8.2f}')
     if any(exits.values()):
         print('\nleft the band with law and guard:')
     for name, lines in exits.items():
@@ -187,13 +170,12 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
 
 def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int, jobs: int,
             seed: int, scheduler: str = ''
-            ) -> tuple[Results, dict[str, Array], dict[str, list[str]]]:
+            ) -> tuple[Results, dict[str, list[str]]]:
     """
     Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
     Return ``{scenario: {controller: {measure: value}}}``, and of each scenario, with law and guard
-    (without it, with the first controller), the CPU times of all ticks, s, which are never twice
-    the same, and the runs that left the band.
+    (without it, with the first controller), the runs that left the band.
     """
     def of_scenario(scenario: Scenario) -> list[str]:
         return [name for name in controllers if scenario.flock is None or name in IN_FLOCKS
@@ -217,7 +199,6 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
              for s in scenarios}
     return ({s.name: {name: summary(joined([part.runs for part in parts[s.name, name]]))
                       for name in of_scenario(s)} for s in scenarios},
-            {name: np.concatenate([part.cpu for part in flown]) for name, flown in shown.items()},
             {name: [line for part in flown for line in part.exits]
              for name, flown in shown.items()})
 
@@ -242,15 +223,14 @@ def shorten(name: str) -> str:
 
 def _fly(task: Task) -> Flown:
     _, law, guard = CONTROLLERS[task.controller]
-    flights = fly(task.scenario, task.runs, guard, cpu_time=time.thread_time, law=law)
-    rows, cpu = measure(flights), flights.cpu.ravel()
-    many = task.scenario.company.followers
+    flights = fly(task.scenario, task.runs, guard, law)
+    rows, many = measure(flights), task.scenario.company.followers
     exits = []
-    for left in band_exits(flights):
-        run, follower = divmod(left.row, many)
+    for row, why in band_exits(flights):
+        run, follower = divmod(row, many)
         which = f'follower {follower + 1} ' if many > 1 else ''
-        exits.append(f'run {task.runs[run]}: {which}{left}')
-    return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), cpu, exits)
+        exits.append(f'run {task.runs[run]}: {which}{why}')
+    return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), exits)
 
 
 if __name__ == '__main__':

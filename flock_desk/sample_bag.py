@@ -112,7 +112,7 @@ class Recording:
     def __init__(self, variant: Variant, seed: int = 1) -> None:
         self.variant, self.seed = variant, seed
         # Longer than recorded, so that the last image's exposure ends within the flight.
-        self.flight = fly(variant.duration + 0.1, seed, variant.swing)
+        self.leader, self.follower = fly(variant.duration + 0.1, seed, variant.swing)
         count = round(variant.duration * IMAGE_RATE)
         self.image_stamps_ns = [START_NS + _FIRST_IMAGE_NS + k * 1000 * _MS // IMAGE_RATE
                                 for k in range(count)]
@@ -129,7 +129,7 @@ class Recording:
         # Rounded: the last bits differ between processors.
         return [Odometry(o.time, o.position.round(6), o.quaternion.round(8), o.linear.round(6),
                          o.angular.round(6), o.pose_covariance.round(12), o.twist_covariance)
-                for o in odometry(self.flight.follower, times, ODOMETRY, self.seed)]
+                for o in odometry(self.follower, times, ODOMETRY, self.seed)]
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -140,8 +140,8 @@ class Recording:
         """Return image k (height, width), mono8."""
         times = self.variant.sensor.times(_seconds(self.image_stamps_ns[k]))
         return self.renderer.image(
-            k, [self.flight.follower.pose(t) @ T_BODY_OPTICAL for t in times],
-            [self.flight.leader.pose(t) for t in times])
+            k, [self.follower.pose(t) @ T_BODY_OPTICAL for t in times],
+            [self.leader.pose(t) for t in times])
 
     def image(self, k: int) -> BagMessage:
         """Return image k as it is recorded."""
@@ -179,8 +179,8 @@ class Recording:
             _odometry_message(topic, child, stamp, arrival,
                               true_odometry(track, _seconds(stamp)))
             for topic, child, track in (
-                ('/truth/odom', 'base_link', self.flight.follower),
-                ('/truth/neighbors', 'leader', self.flight.leader))]
+                ('/truth/odom', 'base_link', self.follower),
+                ('/truth/neighbors', 'leader', self.leader))]
 
     def odom(self) -> list[BagMessage]:
         """Return the follower's odometry."""

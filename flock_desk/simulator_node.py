@@ -36,13 +36,13 @@ import os
 import sys
 import time
 
+import cv2
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 from flock_desk.autopilot import Endpoint, loopback_address
-from flock_desk.camera.renderer import render_in_one_thread
 from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
@@ -130,8 +130,6 @@ class Simulator(FlockNode):
         """When the bridge ended the scenario before its time, s, and with which words."""
         self._line = LiveLine()
         self._delay = SchedulingDelay(os.getppid()) if self._values['end_if_busy'] else None
-        self._lateness = self.diagnostics.latency('lateness')
-        self._rendering = self.diagnostics.latency('rendering')
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
         seed = self._values['seed']
         # It takes a second or two: the clock starts after it.
@@ -141,8 +139,8 @@ class Simulator(FlockNode):
         self._vehicle: EmbeddedVehicle | ExternalVehicle
         self._end: Endpoint | ExternalVehicles
         leader: ExternalLeader | None = None
+        self.diagnostics.checks.append(self._problem)
         if self._external is None:
-            self.diagnostics.checks.append(self._lateness_problem)
             self._outputs.armed_below()  # armed in the air: the bridge cannot know from where
             self._start = time.monotonic()
             self._vehicle = EmbeddedVehicle(
@@ -151,7 +149,6 @@ class Simulator(FlockNode):
                                  self._vehicle.autopilot)
         else:
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
-            self.diagnostics.checks.append(self._external_problem)
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
@@ -172,16 +169,13 @@ class Simulator(FlockNode):
 
     def _links(self) -> ExternalVehicles | None:
         """Return the links to external vehicles, or None."""
-        leader = self._values['leader_truth_connection']
-        topic = self._values['leader_topic']
-        if self._values['vehicle'] == 'embedded':
-            if leader:
-                raise ValueError(f'leader_truth_connection = {leader!r}: only with vehicle = '
-                                 "'external'; the embedded vehicle follows the scenario's leader")
+        vehicle, leader = self._values['vehicle'], self._values['leader_truth_connection']
+        excluded = 'leader_truth_connection' if vehicle == 'embedded' else 'leader_topic'
+        if self._values[excluded]:
+            raise ValueError(f'{excluded} = {self._values[excluded]!r}: not with vehicle = '
+                             f'{vehicle!r}')
+        if vehicle == 'embedded':
             return None
-        if topic:
-            raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
-                             "'embedded'; that of an external one comes by MAVLink")
         return ExternalVehicles(
             ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
             ExternalAutopilot(leader, self._values['leader_target_system'],
@@ -212,7 +206,10 @@ class Simulator(FlockNode):
         next_service = 0.0
         try:
             while self.context.ok() and not self._finished():
-                self._wait(next_service)
+                # An external vehicle is stepped once a pose has come, which ends the wait.
+                wake = min(self._step_due() if self._external is None else math.inf, next_service,
+                           self._start + self._outputs.next_image)
+                self._end.receive(wake - time.monotonic())
                 now = time.monotonic()
                 while (now if self._external is None
                        else self._external.known(now)) >= self._step_due():
@@ -224,25 +221,16 @@ class Simulator(FlockNode):
                     next_service = now + SERVICE_PERIOD
                     for _ in range(1 if self._ahead is None else MESSAGES):
                         executor.spin_once(timeout_sec=0.0)
-                    self._show(now)
-                    if self._delay is not None and self._flight.began_ns is not None:
-                        self._delay.check(now)
-                    if self._external is not None and (gone := self._external.gone(now)):
-                        print(f'error: {gone}', file=sys.stderr)
-                        return 1
-        except TooBusyError as error:
+                    self._watch(now)
+            self._line.end()
+            if self._values['log'] and self.context.ok():
+                self._save_log()
+        except (OSError, TooBusyError) as error:
             print(f'error: {error}', file=sys.stderr)
-            return TOO_BUSY_EXIT_CODE
+            return TOO_BUSY_EXIT_CODE if isinstance(error, TooBusyError) else 1
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
-        self._line.end()
-        if self._values['log'] and self.context.ok():
-            try:
-                self._save_log()
-            except OSError as error:
-                print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
-                return 1
         return 0
 
     def _save_log(self) -> None:
@@ -284,16 +272,8 @@ class Simulator(FlockNode):
         """Return when the next step begins, s: always whole steps, lost time is flown through."""
         return self._start + (self._flight.time_ns + STEP_NS) * 1e-9
 
-    def _wait(self, next_service: float) -> None:
-        """Receive from the autopilot until the next step, image or service is due."""
-        # An external vehicle is stepped once a pose has come, which ends the wait.
-        wake = min(self._step_due() if self._external is None else math.inf, next_service,
-                   self._start + self._outputs.next_image)
-        self._end.receive(wake - time.monotonic())
-
     def _step(self) -> None:
         due = self._step_due()
-        self._lateness.add(time.monotonic() - due)
         if isinstance(self._vehicle, EmbeddedVehicle):  # an external simulator has its own wind
             self._vehicle.autopilot.controller.wind = self._flight.scenario.wind(self._flight.time)
         self._end.step(due)
@@ -309,10 +289,8 @@ class Simulator(FlockNode):
             self._log.add('odom', self._epoch_ns + sampled_ns, *_logged(estimate))
         if (distance := self._flight.measured()) is not None:
             self._outputs.range(now_ns, distance)
-        began = time.monotonic()
-        frame = self._flight.look(round((began - self._start) * 1e9))
+        frame = self._flight.look(round((time.monotonic() - self._start) * 1e9))
         if frame is not None:
-            self._rendering.add(time.monotonic() - began)
             self._take_image(self._epoch_ns + frame.stamp_ns, frame)
 
     def _take_image(self, stamp_ns: int, frame: RenderedImage) -> None:
@@ -337,37 +315,35 @@ class Simulator(FlockNode):
                 not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
-    def _external_problem(self, now: float) -> Problem | None:
-        assert self._external is not None
+    def _problem(self, now: float) -> Problem | None:
+        if self._external is None:
+            late = now - self._step_due()
+            return None if late < LATE else (
+                ERROR, f'{late:.1f} s late: this machine is too slow, or too busy')
         if stalled := self._external.stalled(now, self._flight.time_ns):
             return ERROR, stalled
         slow = self._external.slow(now)
         return (WARN, slow) if slow else None
 
-    def _lateness_problem(self, now: float) -> Problem | None:
-        late = now - self._step_due()
-        if late < LATE:
-            return None
-        return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
+    def _watch(self, now: float) -> None:
+        """
+        Update the live line and the values of /diagnostics.
 
-    def _show(self, now: float) -> None:
-        """Update the live line and the values of /diagnostics."""
+        :raises TooBusyError: if the nodes wait too long for a processor.
+        :raises OSError: if an external vehicle is gone for good.
+        """
         flight = self._flight
-        self.diagnostics.values.update({
-            'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
-            'skipped_images': flight.skipped_images})
-        if self._external is not None:
-            self.diagnostics.values.update({
-                f'{name}_from': source for name, source in self._external.sources.items()})
-        if not self._line.due(now):
-            return
-        speed = sum(c * c for c in flight.follower.linear.tolist()) ** 0.5
-        when = ('waiting' if flight.began_ns is None
-                else f'{flight.time:5.1f} of {self._duration:g} s')
-        apart = flight.distance
-        where = 'no leader' if math.isnan(apart) else f'distance {apart:.2f} m'
-        self._line.show(f'{when}  {where}  {self._state or "no planner":<6}  '
-                        f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
+        if self._delay is not None and flight.began_ns is not None:
+            self._delay.check(now)
+        if self._external is not None and (gone := self._external.gone(now)):
+            raise OSError(gone)
+        self.diagnostics.values['time_s'] = f'{flight.time:.2f}'
+        self.diagnostics.values['skipped_images'] = flight.skipped_images
+        if self._line.due(now):
+            when = ('waiting' if flight.began_ns is None
+                    else f'{flight.time:5.1f} of {self._duration:g} s')
+            self._line.show(f'{when}  distance {flight.distance:.2f} m  '
+                            f'{self._state or "no planner":<6}')
 
 
 def _logged(state: Odometry) -> tuple[Array, Array, Array]:
@@ -378,7 +354,7 @@ def _logged(state: Odometry) -> tuple[Array, Array, Array]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the scenario, 1 or 3 for what cannot be flown."""
-    render_in_one_thread()
+    cv2.setNumThreads(1)  # OpenCV's threads take twice the time, waiting
     return run(Simulator, args, Simulator.fly)
 
 

@@ -34,12 +34,10 @@ BLIND = {
         f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 
 
-def setpoint(east=0.0, north=0.0, up=0.0, *, mask=MASK_YAW, yaw=0.0, frame=1, position_up=0.0,
-             velocity_east=0.0, target=1):
+def setpoint(east=0.0, north=0.0, up=0.0, *, mask=MASK_YAW, yaw=0.0, frame=1, target=1):
     """Return a SET_POSITION_TARGET_LOCAL_NED; yaw is ENU."""
     return mavlink.MAVLink_set_position_target_local_ned_message(
-        0, target, 1, frame, mask, 0.0, 0.0, -position_up, 0.0, velocity_east, 0.0, north, east,
-        -up, math.pi / 2 - yaw, 0.0)
+        0, target, 1, frame, mask, *[0.0] * 6, north, east, -up, math.pi / 2 - yaw, 0.0)
 
 
 def odometry(position, velocity=(0.0, 0.0, 0.0), *, yaw=0.0, frame=mavlink.MAV_FRAME_LOCAL_FRD,
@@ -136,11 +134,15 @@ class Flight(SteppedAutopilot):
         return [m.get_type() for m in self.messages]
 
     def last(self, kind):
-        return [m for m in self.messages if m.get_type() == kind][-1]
+        return self.all(kind)[-1]
 
-    def last_heartbeat(self):
-        self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 0.0)
-        return self.last('HEARTBEAT')
+    def ask(self, message, rate=20.0):
+        """Ask for a message by name at a rate, Hz, and return the results."""
+        number = getattr(mavlink, f'MAVLINK_MSG_ID_{message}')
+        return self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / rate)
+
+    def all(self, kind):
+        return [m for m in self.messages if m.get_type() == kind]
 
     def texts(self):
-        return [m.text.strip('\x00\t') for m in self.messages if m.get_type() == 'STATUSTEXT']
+        return [m.text.strip('\x00\t') for m in self.all('STATUSTEXT')]

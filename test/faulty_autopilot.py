@@ -20,6 +20,7 @@ for each fault, and all that ``flock_desk.autopilot`` takes; ``--truth HOST:PORT
 listener who asks for the true pose, as the real simulators send it.
 """
 
+import argparse
 from dataclasses import dataclass
 import heapq
 import itertools
@@ -32,6 +33,7 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
+from flock_desk.runs.console import parsed
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
@@ -41,35 +43,24 @@ class Fault:
     """
     One fault; times in s.
 
-    On the line, as the autopilot sees it: 'drop', 'delay', 'duplicate', 'garbage'. Of commands:
-    'refuse'. Of the vehicle: 'pilot', 'barometer', 'battery', 'reboot'.
+    On the line: 'drop', 'delay'. Of the vehicle: 'pilot', 'battery', 'reboot'.
     """
 
     kind: str
     at: float
     """Since the start, or since what ``after`` says."""
     duration: float = math.inf
-    direction: str = 'both'  # or sent, received
+    direction: str = 'both'  # or sent, received: as the autopilot sees it
     share: float = 1.0
-    """Of the messages, those that it befalls, by lot."""
+    """Share of the messages that it affects, by chance."""
     message: str = ''
-    """The only message type that it befalls; '' for all."""
+    """The only message type that it affects; '' for all."""
     by: float = 0.0
     """The delay."""
-    size: int = 32
-    """How many bytes of garbage."""
-    command: str = ''
-    """The command refused, without MAV_CMD_."""
-    reason: str = ''
-    """STATUSTEXT of the refusal."""
     mode: str = ''
-    """The mode that the pilot switches to ..."""
-    climb: float = 0.0
-    """... and how far the pilot then climbs, m."""
-    offset: float = 0.0
-    """Added to the barometer's height, m."""
-    remaining: float | None = 1.0
-    """What is left in the battery, a share of its capacity; None: unknown."""
+    """The mode that the pilot switches to."""
+    remaining: float = 1.0
+    """Remaining charge of the battery, a share."""
     after: str = 'start'  # or setpoint: the first that was received
 
     def active(self, now):
@@ -81,7 +72,7 @@ class FaultyLine:
 
     def __init__(self, faults, direction, seed):
         self._faults = [fault for fault in faults if fault.direction in (direction, 'both')
-                        and fault.kind in ('drop', 'delay', 'duplicate', 'garbage')]
+                        and fault.kind in ('drop', 'delay')]
         self._random = random.Random(f'{seed} {direction}')
         self._queue, self._numbers = [], itertools.count()
 
@@ -95,7 +86,7 @@ class FaultyLine:
         return arrived
 
     def _send(self, data, now):
-        copies, arrival, number = 1, now, message_id(data)
+        arrival, number = now, message_id(data)
         for fault in self._faults:
             concerned = not fault.message or number == getattr(
                 mavlink, f'MAVLINK_MSG_ID_{fault.message}')
@@ -103,13 +94,8 @@ class FaultyLine:
                 continue
             if fault.kind == 'drop':
                 return
-            if fault.kind == 'garbage':  # before, within or behind what was sent
-                cut = self._random.choice([0, self._random.randint(0, len(data)), len(data)])
-                data = data[:cut] + self._random.randbytes(fault.size) + data[cut:]
-            copies += fault.kind == 'duplicate'
-            arrival += fault.by if fault.kind == 'delay' else 0.0
-        for _ in range(copies):
-            heapq.heappush(self._queue, (arrival, next(self._numbers), data))
+            arrival += fault.by
+        heapq.heappush(self._queue, (arrival, next(self._numbers), data))
 
 
 def message_id(data):
@@ -138,15 +124,13 @@ class FaultyAutopilot(EmbeddedAutopilot):
             if begins <= since and fault not in self._begun:
                 self._begun.add(fault)
                 self._begin(fault, now)
-        self.barometer.offset = sum(
-            f.offset for f in self.faults if f.kind == 'barometer' and f.active(since))
         return self._sent.carry([*self._answers([], now), *super().step(now)], since)
 
     def _begin(self, fault, now):
         if fault.kind == 'reboot':
             self.reboot(now, fault.duration)
         elif fault.kind == 'pilot':
-            self.controller.pilot_switches(fault.mode, fault.climb)
+            self.controller.pilot_switches(fault.mode)
         elif fault.kind == 'battery':
             self.charge = fault.remaining
 
@@ -155,23 +139,8 @@ class FaultyAutopilot(EmbeddedAutopilot):
         for data in self._received.carry(datagrams, now - self._zero):
             if message_id(data) == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
                 self._first_setpoint = min(self._first_setpoint, now - self._zero)
-            refused = self._refused(data, now - self._zero)
-            answers += self._packed(refused) if refused else super().receive(data, now)
+            answers += super().receive(data, now)
         return answers
-
-    def _refused(self, data, now):
-        """Return the refusal of a command; none of what is obeyed."""
-        faults = [f for f in self.faults if f.kind == 'refuse' and f.active(now)]
-        if not faults or message_id(data) != mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
-            return []
-        message = mavlink.MAVLink(None).decode(bytearray(data))
-        return next(([
-            mavlink.MAVLink_statustext_message(
-                mavlink.MAV_SEVERITY_CRITICAL, fault.reason.encode()),
-            mavlink.MAVLink_command_ack_message(
-                message.command, mavlink.MAV_RESULT_DENIED, 0, 0, message.get_srcSystem(),
-                message.get_srcComponent())] for fault in faults
-            if message.command == getattr(mavlink, f'MAV_CMD_{fault.command}')), [])
 
 
 class TruthLink:
@@ -241,17 +210,16 @@ class TruthLink:
 
 
 def main():
-    parser = autopilot.parser()
-    parser.add_argument('--truth', default='')
-    parser.add_argument('--fault', action='append', default=[], type=json.loads)
-    options, start = parser.parse_args(), time.monotonic()
+    options, start = parsed(argparse.ArgumentParser(), None, {
+        **autopilot.OPTIONS, '--truth': {'default': ''},
+        '--fault': {'action': 'append', 'default': [], 'type': json.loads}}), time.monotonic()
     flown = FaultyAutopilot(now=start, faults=[Fault(**fault) for fault in options.fault],
                             **autopilot.settings(options))
     ends = [autopilot.Endpoint(autopilot.loopback_address(options.connect), flown)]
     if options.truth:
         ends.append(autopilot.Endpoint(autopilot.loopback_address(options.truth),
-                                       TruthLink(flown, start, options.system_id)))
-    autopilot.serve(options, start, flown, ends)
+                                       TruthLink(flown, start)))
+    autopilot.serve(options.log, flown, ends)
 
 
 if __name__ == '__main__':

@@ -76,15 +76,6 @@ class Sensor:
         return stamp + self.exposure * ((np.arange(self.sub_poses) + 0.5) / self.sub_poses - 0.5)
 
 
-@dataclass(frozen=True)
-class Light:
-    """What the weather does to an image: all light times ``gain``, and glare everywhere."""
-
-    gain: float = 1.0
-    veil: float = 0.0
-    """Share of the full well."""
-
-
 class Renderer:
     """
     Renders one leader before its surroundings.
@@ -110,8 +101,8 @@ class Renderer:
         self._exposed = (_SCALE * sensor.gain / fall ** 2).astype(np.float32)
         self._table = _noise_table(sensor)
 
-    def image(self, index: int, cameras: Sequence[Transform], leaders: Sequence[Transform],
-              light: Light | None = None) -> NDArray[np.uint8]:
+    def image(self, index: int, cameras: Sequence[Transform],
+              leaders: Sequence[Transform]) -> NDArray[np.uint8]:
         """
         Return the image of the sensor: mono8, (height, width).
 
@@ -120,7 +111,7 @@ class Renderer:
         :param leaders: poses of the leader's body in the world at the same times; none at all
             leave it out.
         """
-        return self.develop(index, self.radiance(cameras, leaders), light)
+        return self.develop(index, self.radiance(cameras, leaders))
 
     def radiance(self, cameras: Sequence[Transform], leaders: Sequence[Transform]) -> Image:
         """Return the light on the sensor (height, width) behind an ideal lens, without noise."""
@@ -135,14 +126,10 @@ class Renderer:
             total += image
         return total / np.float32(len(cameras))
 
-    def develop(self, index: int, radiance: Image,
-                light: Light | None = None) -> NDArray[np.uint8]:
+    def develop(self, index: int, radiance: Image) -> NDArray[np.uint8]:
         """Return the image (height, width), mono8: vignetting, lens blur, noise, gamma."""
-        light = light or Light()
-        exposed = radiance * self._exposed * np.float32(light.gain)
-        exposed += np.float32(_SCALE * light.veil)
-        blurred = cv2.GaussianBlur(np.minimum(exposed, np.float32(65535)).astype(np.uint16),
-                                   (3, 3), _SPREAD, borderType=cv2.BORDER_REPLICATE)
+        exposed = np.minimum(radiance * self._exposed, np.float32(65535)).astype(np.uint16)
+        blurred = cv2.GaussianBlur(exposed, (3, 3), _SPREAD, borderType=cv2.BORDER_REPLICATE)
         code = blurred.astype(np.int32) >> (16 - _LEVEL_BITS) << _DRAW_BITS
         noise = np.random.default_rng([self._seed, index]).bytes(code.size)
         code |= np.frombuffer(noise, np.uint8).reshape(code.shape)
@@ -208,7 +195,7 @@ def _part(image: Image, low: Any, high: Any, n: int = 1) -> Image:
 
 
 class _Drawing:
-    """Draws one body: polygons, farther ones first, and prints as cast rays show them."""
+    """Draws one body: faces, farther ones first, and prints as cast rays show them."""
 
     def __init__(self, camera: Camera, rays: Image, faces: Sequence[Face], n: int) -> None:
         self._camera, self._rays, self._faces, self._n = camera, rays, faces, n
@@ -219,7 +206,6 @@ class _Drawing:
         # Of the plane of each face above the middle of its box, m.
         self._heights = np.sum(
             self._normals * (self._points[self._starts] - self._middles), axis=1)
-        self._two_sided = np.array([face.opacity < 1.0 for face in faces])
         self._textures = [None if face.cells is None else _texture(face.cells) for face in faces]
 
     def draw(self, image: Image, camera: Transform, body: Transform) -> None:
@@ -241,29 +227,21 @@ class _Drawing:
         corners = np.rint((((pixels - low) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         eye = pose.inverse().translation
         shown = np.logical_and.reduceat(ahead, self._starts) & (
-            self._two_sided | (np.sum(self._normals * (eye - self._middles), axis=1)
-                               > self._heights))
+            np.sum(self._normals * (eye - self._middles), axis=1) > self._heights)
         for k in np.argsort(-np.linalg.norm(self._middles - eye, axis=1), kind='stable'):
             if not shown[k]:
                 continue
             face, texture = self._faces[k], self._textures[k]
             part = slice(self._starts[k], self._starts[k] + len(face.outline))
-            colour = light[k] * face.value, 1.0
-            if texture is None and face.opacity == 1.0:
-                cv2.fillConvexPoly(fine, corners[part], colour, shift=_SHIFT)
+            if texture is None:
+                cv2.fillConvexPoly(fine, corners[part], (light[k] * face.value, 1.0),
+                                   shift=_SHIFT)
                 continue
             first, end = _around(pixels[part], low, high)
-            if not (first < end).all():
-                continue
-            behind = _part(fine, first - low, end - low, n)
-            if texture is not None:
-                self._print(behind, _part(self._rays, first, end), points[part],
+            if (first < end).all():
+                self._print(_part(fine, first - low, end - low, n),
+                            _part(self._rays, first, end), points[part],
                             texture * np.array([light[k], 1.0], np.float32))
-                continue
-            painted = behind.copy()
-            offset = (n * 2 ** _SHIFT * (first - low)).astype(np.int32)
-            cv2.fillConvexPoly(painted, corners[part] - offset, colour, shift=_SHIFT)
-            behind += np.float32(face.opacity) * (painted - behind)
         drawn = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
         seen = _part(image, low, high)
         seen[:] = drawn[..., 0] + (1.0 - drawn[..., 1]) * seen
@@ -289,11 +267,6 @@ def _texture(cells: Array) -> Image:
     return np.dstack([fine, np.ones_like(fine)]).astype(np.float32)
 
 
-def render_in_one_thread() -> None:
-    """Keep OpenCV from sharing an image's work out: its threads take twice the time, waiting."""
-    cv2.setNumThreads(1)
-
-
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
 #: The marker on the leader's body (FLU): on the tail, facing backwards.
@@ -314,8 +287,6 @@ class Face(NamedTuple):
     middle: Array
     """(3,), m, of the box that it is part of: farther boxes are painted first."""
     value: float = 0.0
-    opacity: float = 1.0
-    """Below 1 it is seen from both sides."""
     cells: Array | None = None
     """(rows, columns), of a print."""
 
@@ -362,16 +333,12 @@ def leader(marker: Face | None = None) -> list[Face]:
     """Return a quadrotor with a marker on its tail, by default marker 0 of DICT_4X4_50."""
     marker = marker or second_print()
     faces = [*box(Transform(), [0.30, 0.11, 0.07], 0.025), *board(marker), marker]
-    angle = np.arange(24) * 2 * np.pi / 24
-    disc = 0.11 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     for x in (-0.16, 0.16):
         for y in (-0.25, 0.25):
-            arm = Transform(rotation_vector_to_matrix([0.0, 0.0, np.arctan2(y, x)]),
-                            np.array([0.6 * x, 0.6 * y, 0.0]))
-            motor, leg, rotor = (np.array([s * x, s * y, z]) for s, z in (
-                (1.0, 0.018), (0.8, -0.05), (1.0, 0.045)))
-            faces += [*box(arm, [0.24, 0.018, 0.014], 0.025),
-                      *box(Transform(translation=motor), [0.026, 0.026, 0.034], 0.07),
-                      *box(Transform(translation=leg), [0.01, 0.01, 0.1], 0.025),
-                      Face(disc + rotor, np.array([0.0, 0.0, 1.0]), rotor, 0.06, 0.21)]
+            arm = rotation_vector_to_matrix([0.0, 0.0, np.arctan2(y, x)])
+            for place, size, turn in (
+                    ((0.6, 0.6, 0.0), [0.24, 0.018, 0.014], arm),
+                    ((1.0, 1.0, 0.018), [0.026, 0.026, 0.034], np.eye(3)),  # a motor
+                    ((0.8, 0.8, -0.05), [0.01, 0.01, 0.1], np.eye(3))):  # a leg
+                faces += box(Transform(turn, np.array([x, y, 1.0]) * place), size, 0.025)
     return faces

@@ -34,7 +34,7 @@ control       20        the vehicle obeys ``delay`` later, with its lags
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 
@@ -54,19 +54,17 @@ PLANNER_STEPS = 12
 
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
-        cpu_time: Callable[[], float] = lambda: 0.0,
         law: type[FlockingParams] = FlockingParams) -> Flights:
     """
     Fly some runs of a scenario and return their results.
 
     :param runs: their numbers, which seed everything random in them.
     :param guard: whether the planner's guard is on.
-    :param cpu_time: a clock of CPU time, s; only the figures of CPU time depend on it.
     :param law: the law, or a controller in its place: see ``controllers``.
     """
     world, noise = World(scenario, runs), _noise(scenario)
     lookout = Lookout(world, noise)
-    followers = _followers(world, guard, noise, cpu_time, law)
+    followers = _followers(world, guard, noise, law)
     flock = scenario.company
     radio: Radio[OdometryState] = Radio(
         flock.followers, flock.delay, flock.loss, world.random('radio'))
@@ -117,7 +115,6 @@ def _noise(scenario: Scenario) -> PerceptionNoise:
 
 
 def _followers(world: World, guard: bool, noise: PerceptionNoise,
-               cpu_time: Callable[[], float],
                law: type[FlockingParams]) -> list[SimulatedFollower]:
     """Return the follower of every row."""
     scenario, flock = world.scenario, world.scenario.company
@@ -126,11 +123,11 @@ def _followers(world: World, guard: bool, noise: PerceptionNoise,
     ahead = 'front' in flock.cameras and not flock.all_round
     view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []
-    for (run, number), start, yaw in zip(world.rows, world.starts, world.yaws.tolist()):
+    for (_, number), start, yaw in zip(world.rows, world.starts, world.yaws.tolist()):
         name = flock.names[number]
         frame, T_world_odom = ('odom', Transform()) if scenario.flock is None else (
             f'{name}/odom', Transform.from_quaternion(
                 start * [1.0, 1.0, 0.0], quaternion_from_yaw(yaw)))
         followers.append(SimulatedFollower(
-            scenario, guard, run, frame, T_world_odom.inverse(), start, view, name, cpu_time, law))
+            scenario, guard, frame, T_world_odom.inverse(), start, view, name, law))
     return followers

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The vehicles of a real-time flight: embedded or external follower, scenario or external leader.
+The vehicles of a real-time flight that report their motion: the follower, an external leader.
 
 Times are integer nanoseconds since the flight's start, and s of the scenario (``scenario_run``).
 """
@@ -34,10 +34,7 @@ from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
-    quaternion_from_yaw,
-    quaternion_multiply,
     quaternion_to_matrix,
-    Transform,
     yaw_from_quaternion,
 )
 
@@ -131,45 +128,6 @@ class ExternalVehicle(_Reported):
 FlownVehicle = EmbeddedVehicle | ExternalVehicle
 
 
-class ScenarioLeader:
-    """
-    A leader on the scenario's course; its motion is None before it appears.
-
-    :param in_place: whether the follower starts at the scenario's place; else the scenario is
-        moved to its place, height and heading once it is in offboard mode.
-    """
-
-    def __init__(self, scenario: ScenarioRun, in_place: bool) -> None:
-        self._scenario, self._in_place = scenario, in_place
-        #: The scenario's frame in the vehicle's.
-        self._frame: Transform | None = Transform() if in_place else None
-
-    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Come to a follower that has just come into offboard mode; face away from it."""
-        if not self._in_place and time < 0.0 and not offboard:
-            self._frame = None
-        elif self._frame is None and offboard:
-            height = np.array([0.0, 0.0, self._scenario.scenario.start.altitude])
-            self._frame = Transform.from_quaternion(
-                follower.position - height,
-                quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
-        if self._frame is not None:
-            self._scenario.turn(time, self._frame.inverse().apply(follower.position))
-
-    def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return the motion on its course."""
-        if self._frame is None:
-            return None
-        leader = self._scenario.leader_odometry(time)
-        return leader._replace(
-            position=self._frame.apply(leader.position),
-            quaternion=quaternion_multiply(self._frame.quaternion, leader.quaternion))
-
-    def knows(self, time_ns: int) -> bool:
-        """Return True."""
-        return True
-
-
 class ExternalLeader(_Reported):
     """A leader that an external autopilot flies; its motion has the follower's ``origin``."""
 
@@ -184,4 +142,4 @@ class ExternalLeader(_Reported):
         return self.at(time_ns)._replace(time=time)
 
 
-FlownLeader = ScenarioLeader | ExternalLeader
+FlownLeader = ScenarioRun | ExternalLeader

@@ -19,15 +19,13 @@ A lone follower's odom frame is the world's. In a flock each has one of its own,
 where it stands and along where it faces, as visual-inertial odometry does.
 
 The operator arms, takes off, calls offboard and engage; the pilot takes over and gives back by
-the mode switch; the bridge may die and start again. An autopilot of few modes obeys them: it
-flies take-off, hold and the pilot's climb by itself, and setpoints in its offboard mode, with the
-waits and timeouts measured on PX4 1.16 and ArduCopter 4.7. MAVLink itself is the embedded
-autopilots' (``vehicles``).
+the mode switch; the bridge may die and start again. An autopilot of few modes obeys them, like
+PX4: it flies take-off, hold and the pilot's climb by itself, and setpoints in its offboard mode,
+with the waits and timeouts measured. MAVLink itself is the embedded autopilots' (``vehicles``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 import math
 from typing import Final
@@ -48,7 +46,7 @@ from flock_follower.geometry import (
     Transform,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
+from flock_follower.mavlink.dialects import PX4, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
@@ -71,11 +69,9 @@ _AFTER = 1  # ns by which ticks come after what arrives at their moment
 _ZERO, _LEVEL = np.zeros(3), np.eye(3)
 _UNKNOWN = np.zeros((6, 6))
 _ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is known
-#: The pilot's mode, by the autopilot.
-MANUAL: Final = {'px4': 'POSCTL', 'ardupilot': 'ALT_HOLD'}
-#: s between HEARTBEATs: PX4 refuses to send more than one per second.
-HEARTBEAT_PERIOD: Final = {'px4': 1.0, 'ardupilot': 0.2}
-SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T and GUID_TIMEOUT as recommended
+MANUAL, TAKEOFF = 'POSCTL', PX4.takeoff_modes[0]  # the pilot's mode, and that of the take-off
+HEARTBEAT_PERIOD: Final = 1.0  # s
+SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T as recommended
 CLIMB_SPEED: Final = 1.0  # m/s, of the take-off and of the pilot
 UP: Final = np.array([0.0, 0.0, 1.0])
 STIFFNESS, DAMPING = 1.5, 2.2  # 1/s^2 and 1/s, of the autopilot's own position control
@@ -88,30 +84,24 @@ class SimulatedFollower(Listener):
     :param frame: name of the odom frame; :param T_odom_world: its place in the world.
     :param start: where its vehicle begins (3,), m.
     :param view: field of view of its camera; () if cameras look to all sides.
-    :param name: of its vehicle.
-    :param cpu_time: see ``Follower``; :param law: see ``controllers``.
+    :param name: of its vehicle; :param law: see ``controllers``.
     """
 
-    def __init__(self, scenario: Scenario, guard: bool, run: int, frame: str,
-                 T_odom_world: Transform, start: Array, view: View, name: str,
-                 cpu_time: Callable[[], float], law: type[FlockingParams]) -> None:
+    def __init__(self, scenario: Scenario, guard: bool, frame: str, T_odom_world: Transform,
+                 start: Array, view: View, name: str, law: type[FlockingParams]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         self._limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
                                   height_max=1000.0, radius_max=10000.0,
                                   relative_flight=scenario.flight.relative_flight)
-        self._autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
-        self._dialect = DIALECTS[self._autopilot]
         planner = PlannerLoop()
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self._follower = Follower(
             planner, _params(scenario, guard, law, name), self._new_control(), self,
-            cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
+            cycle_phase=GATE_STEPS // 2 * STEP,
             sharing=Sharing(name) if scenario.company.words else None)
         self._follower.advance(_AFTER)
         self.decision = Decision(State.IDLE)
-        self.cpu = 0.0
-        """CPU time of the last tick, s."""
         self.failed = False
         self.outbox: list[OdometryState] = []
         """Messages to the others; the owner empties it."""
@@ -123,11 +113,10 @@ class SimulatedFollower(Listener):
         usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_STEPS * STEP)
         self._waiting = sorted(scenario.operations or usual, key=lambda o: o.at)
         self._armed = not scenario.takes_off
-        self._mode = self._dialect.offboard if self._armed else self._dialect.hold
+        self._mode = PX4.offboard if self._armed else PX4.hold
         self._status: VehicleStatus | None = None
         self._goal = start
         self._yaw: float | None = None
-        self._taking_off = False
         self._mode_asked = self._restart = math.inf  # s, when they come
         self._beat = self._setpoint_time = -math.inf
         self._setpoint: Setpoint | None = None
@@ -141,7 +130,7 @@ class SimulatedFollower(Listener):
     def _new_control(self) -> Gate:
         """Return the control of a bridge that starts."""
         gate = Gate(self._limits)
-        gate.compensates_wind = not self._dialect.compensates_wind
+        gate.compensates_wind = not PX4.compensates_wind
         return gate
 
     def sense(self, now: float, own: OwnState | None) -> None:
@@ -208,11 +197,10 @@ class SimulatedFollower(Listener):
             self._follower.bridge_started(time, self._new_control())
         if now >= self._mode_asked:
             self._mode_asked = math.inf
-            self._mode, self._goal = self._dialect.offboard, position
-        on_ground = self._taking_off or bool(position[2] < 0.05)
-        if self._taking_off and position[2] > self._goal[2] - 0.2:
-            self._taking_off = False
-            self._mode = self._dialect.takeoff_modes[-1]
+            self._mode, self._goal = PX4.offboard, position
+        on_ground = self._mode == TAKEOFF or bool(position[2] < 0.05)
+        if self._mode == TAKEOFF and position[2] > self._goal[2] - 0.2:
+            self._mode = PX4.hold
             self._goal = np.array([*position[:2], self._goal[2]])
         self._report_status(now, on_ground)
         return self._fly(now, position, velocity)
@@ -224,29 +212,28 @@ class SimulatedFollower(Listener):
             case 'arm':
                 self._armed = True
             case 'takeoff':
-                self._taking_off = True
-                self._mode, self._goal = self._dialect.takeoff_modes[0], above
+                self._mode, self._goal = TAKEOFF, above
             case 'offboard':
                 self._asked = True
                 self._follower.permit(time, now - 1e-3)
                 # The bridge has to stream first, and to receive the mode by HEARTBEAT.
-                self._mode_asked = now + self._dialect.stream_before_offboard
+                self._mode_asked = now + PX4.stream_before_offboard
             case 'engage':
                 self._follower.engage(time, True)
             case 'pilot':
-                self._mode, self._goal = MANUAL[self._autopilot], above
+                self._mode, self._goal = MANUAL, above
             case 'restart':
                 self._asked = False
                 self._follower.bridge_died(time)
                 self._restart = now + operation.duration
 
     def _report_status(self, now: float, on_ground: bool) -> None:
-        if now - self._beat < HEARTBEAT_PERIOD[self._autopilot] - 1e-9:
+        if now - self._beat < HEARTBEAT_PERIOD - 1e-9:
             return
         self._beat = now
         obeyed = self._status is not None and self._status.offboard
         self._status = VehicleStatus(self._armed, self._mode, 'active',
-                                     self._mode == self._dialect.offboard)
+                                     self._mode == PX4.offboard)
         if obeyed and not self._status.offboard:
             self._asked = False
         self._follower.vehicle(to_nanoseconds(now), self._status, not on_ground)
@@ -254,13 +241,13 @@ class SimulatedFollower(Listener):
     def _fly(self, now: float, position: Array,
              velocity: Array) -> tuple[Array, float | None]:
         silent = now - self._setpoint_time > SETPOINT_TIMEOUT
-        offboard = self._mode == self._dialect.offboard and not self._taking_off
+        offboard = self._mode == PX4.offboard
         if offboard and not silent and self._setpoint is not None:
             self.obeying = True
             self._goal = position.copy()
             return self._setpoint.acceleration, self._setpoint.yaw
-        if offboard and self.obeying and self._autopilot == 'px4':
-            self._mode = self._dialect.hold  # COM_OBL_RC_ACT 5
+        if offboard and self.obeying:
+            self._mode = PX4.hold  # COM_OBL_RC_ACT 5
         self.obeying = False
         if not self._armed:
             return np.zeros(3), None
@@ -279,7 +266,7 @@ class SimulatedFollower(Listener):
 
     def tick(self, tick: Tick) -> None:
         if not self.failed:
-            self.decision, self.cpu = tick.decision, tick.cpu
+            self.decision = tick.decision
 
     def cycle(self, cycle: ControlCycle) -> None:
         setpoint = cycle.setpoint

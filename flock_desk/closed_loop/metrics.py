@@ -39,7 +39,6 @@ from flock_desk.scenarios.flock import places
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
 from flock_follower.planner.modes import State
-from flock_follower.planner.step import Decision
 
 STATES = tuple(State)
 
@@ -87,8 +86,6 @@ class Flights:
     """(n, k), how many of the others images since the last tick showed."""
     edges: Any = None
     """(n, k), how many it follows."""
-    cpu: Any = None
-    """(n, k), CPU time of the tick, s."""
     positions: Any = None
     """(n / m, k, m + 1, 3), of all vehicles, the leader first, m."""
 
@@ -98,30 +95,30 @@ class FlightsLog:
 
     def __init__(self, world: World, lookout: Lookout) -> None:
         self._world, self._lookout = world, lookout
-        self._rows: dict[str, list[Any]] = {}
         self._times: list[float] = []
+        self._ticks: list[dict[str, Any]] = []
+        """The arrays of ``Flights`` at each tick, one value or vector per row."""
         rows, m = len(world.starts), len(world.others)
         flock = world.scenario.flock
         self._names = world.scenario.company.names
         self._others = np.tile(world.others, (rows // m, 1))
         ahead = [0] if flock is None else [place.ahead for place in places(flock)]
         self._edges: Any = self._others == np.tile(ahead, rows // m)[:, None]
-        self._nearest: Array = np.zeros(rows)
-        self._farthest: Array = np.zeros(rows)
-        self._outside: Array = np.zeros(rows)
 
     def distances(self) -> None:
-        """Take the distances after a step."""
-        distance = self._world.distances
+        """Take the distances after a step; those before the first tick do not count."""
+        if not self._ticks:
+            return
+        distance, last = self._world.distances, self._ticks[-1]
         band = self._world.scenario.flight
         farthest, edges = self._along(distance)
-        self._nearest = np.minimum(self._nearest, distance.min(axis=1))
-        self._farthest = np.maximum(self._farthest, farthest)
+        last['nearest'] = np.minimum(last['nearest'], distance.min(axis=1))
+        last['farthest'] = np.maximum(last['farthest'], farthest)
         out = edges & ((distance ** 2 <= band.d0) | (distance ** 2 >= band.d1))
         many = edges.sum(axis=1)
         # A follower without a vehicle to follow is out of the band.
         share = np.where(many > 0, out.sum(axis=1) / np.maximum(many, 1), 1.0)
-        self._outside = self._outside + STEP * share
+        last['outside'] = last['outside'] + STEP * share
 
     def _along(self, distance: Array) -> tuple[Array, Any]:
         """Return the greatest distance (n,), and the edges (n, m), to those present."""
@@ -130,22 +127,22 @@ class FlightsLog:
 
     def tick(self, now: float, followers: Sequence[SimulatedFollower]) -> None:
         """Take the outcome of a tick of the planners."""
-        self._close()
-        world, rows = self._world, np.arange(len(followers))
+        world, rows, lookout = self._world, np.arange(len(followers)), self._lookout
         decisions = [follower.decision for follower in followers]
-        if world.scenario.flock is not None:
-            self._take_edges(decisions)
+        for row, decision in enumerate(decisions):
+            if world.scenario.flock is not None and decision.edges:
+                self._edges[row] = [self._names[v] in decision.edges for v in self._others[row]]
         distance = world.distances
         farthest, edges = self._along(distance)
         # The nearest that it follows.
         met = self._others[rows, np.where(edges, distance, np.inf).argmin(axis=1)]
-        runs, lookout = rows // len(world.others), self._lookout
+        runs = rows // len(world.others)
         self._times.append(now)
-        add = {
-            'leader': world.positions[runs, met],
-            'follower': world.vehicle.position,
-            'leader_velocity': world.velocities[runs, met],
-            'velocity': world.vehicle.velocity,
+        self._ticks.append({
+            'leader': world.positions[runs, met], 'follower': world.vehicle.position,
+            'leader_velocity': world.velocities[runs, met], 'velocity': world.vehicle.velocity,
+            'nearest': distance.min(axis=1), 'farthest': farthest,
+            'outside': np.zeros(len(followers)),
             'command': np.array([np.full(3, np.nan) if d.acceleration is None else d.acceleration
                                  for d in decisions]),
             'state': np.array([STATES.index(d.state) for d in decisions]),
@@ -155,30 +152,14 @@ class FlightsLog:
             'obeying': np.array([f.obeying for f in followers]),
             'unasked': np.array([f.unasked for f in followers]),
             'shown': lookout.seen.sum(axis=1), 'edges': edges.sum(axis=1),
-            'cpu': np.array([f.cpu for f in followers]), 'positions': world.positions}
-        for name, value in add.items():
-            self._rows.setdefault(name, []).append(value)
+            'positions': world.positions})
         lookout.seen = np.zeros_like(lookout.seen)
-        self._nearest, self._farthest = distance.min(axis=1), farthest
-        self._outside = np.zeros(len(followers))
-
-    def _take_edges(self, decisions: Sequence[Decision]) -> None:
-        for row, decision in enumerate(decisions):
-            if decision.edges:
-                self._edges[row] = [self._names[v] in decision.edges for v in self._others[row]]
-
-    def _close(self) -> None:
-        """End the interval since the last tick; time before the first tick does not count."""
-        if self._times:
-            for name, value in (('nearest', self._nearest), ('farthest', self._farthest),
-                                ('outside', self._outside)):
-                self._rows.setdefault(name, []).append(value)
 
     def flights(self) -> Flights:
         """Return the collected figures."""
-        self._close()
         return Flights(self._world.scenario, np.array(self._times), **{
-            name: np.stack(rows, axis=1) for name, rows in self._rows.items()})
+            name: np.stack([tick[name] for tick in self._ticks], axis=1)
+            for name in self._ticks[0]})
 
 
 FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
@@ -307,41 +288,17 @@ def summary(runs: Measures) -> dict[str, float]:
         for key, figure in FIGURES.items() if figure.measure in runs}}
 
 
-class BandExit(NamedTuple):
-    """The first time that a follower left the band."""
-
-    row: int
-    time: float
-    """s."""
-    distance: float
-    """m: the least or the greatest of the 0.1 s."""
-    near: bool
-    """Whether it came too near; else it fell back too far."""
-    state: str
-    """Of its planner."""
-    unseen: float
-    """Time since the last image that showed the leader, in whole ticks, s."""
-
-    def __str__(self) -> str:
-        """Return when, and why as far as the flight shows it."""
-        sight = f'leader not seen for {self.unseen:.1f} s' if self.unseen else 'leader seen'
-        return (f'at {self.time:.1f} s too {"near" if self.near else "far"}, '
-                f'{self.distance:.2f} m; {self.state}, {sight}')
-
-
-def band_exits(flights: Flights) -> list[BandExit]:
-    """Return the first exit of each row that left the band, in the order of the rows."""
-    band, exits = flights.scenario.flight, []
-    period = float(flights.times[1] - flights.times[0])
+def band_exits(flights: Flights) -> list[tuple[int, str]]:
+    """Return each row that left the band, with time and circumstances of its first exit."""
+    exits, period = [], float(flights.times[1] - flights.times[0])
     for row in np.flatnonzero(flights.outside.sum(axis=1) > 0.0).tolist():
         k = int(np.flatnonzero(flights.outside[row] > 0.0)[0])
-        near = bool(flights.nearest[row, k] ** 2 <= band.d0)
-        seen = np.flatnonzero(flights.seen[row, :k + 1])
-        exits.append(BandExit(
-            row, float(flights.times[k]), float((
-                flights.nearest if near else flights.farthest)[row, k]), near,
-            STATES[int(flights.state[row, k])].value,
-            period * (k - int(seen[-1]) if len(seen) else k + 1)))
+        near = flights.nearest[row, k] ** 2 <= flights.scenario.flight.d0
+        distance = (flights.nearest if near else flights.farthest)[row, k]
+        unseen = period * _longest(~flights.seen[row, :k + 1], at_the_end=True)
+        exits.append((row, f'at {flights.times[k]:.1f} s too {"near" if near else "far"}, '
+                           f'{distance:.2f} m; {STATES[int(flights.state[row, k])].value}, leader '
+                           + (f'not seen for {unseen:.1f} s' if unseen else 'seen')))
     return exits
 
 
@@ -352,20 +309,27 @@ def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float,
     The values are the change of height in the first second, the vertical speed after it, and the
     change of height until the vehicle no longer flies setpoints.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
     early = late = change = 0.0
-    for begin, end in edges.reshape(-1, 2).tolist():
-        first, changes = min(begin + FIRST_TICKS, end), np.abs(height[begin:end] - height[begin])
+    for begin, end in _stretches(obeying):
+        changes = np.abs(height[begin:end] - height[begin])
         early = max(early, float(changes[:FIRST_TICKS].max()))
-        late = max(late, float(np.abs(climb[first:end]).max(initial=0.0)))
+        late = max(late, float(np.abs(climb[begin + FIRST_TICKS:end]).max(initial=0.0)))
         change = max(change, float(changes.max()))
     return early, late, change
 
 
-def _longest(missing: Array) -> int:
-    """Return the greatest number of True in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int)))
-    return int(np.max(edges[1::2] - edges[::2], initial=0))
+def _stretches(values: Any) -> Any:
+    """Return the first and the last + 1 index (m, 2) of each stretch of True."""
+    edges = np.diff(np.concatenate([[False], values, [False]]).astype(int))
+    return np.flatnonzero(edges).reshape(-1, 2)
+
+
+def _longest(missing: Array, at_the_end: bool = False) -> int:
+    """Return the greatest number of True in a row, or of those at the end."""
+    lengths = np.diff(_stretches(missing)).ravel()
+    if at_the_end:
+        return int(lengths[-1]) if missing[-1] else 0
+    return int(np.max(lengths, initial=0))
 
 
 def _kept(flights: Flights) -> Any:

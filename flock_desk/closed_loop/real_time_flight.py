@@ -32,12 +32,7 @@ from numpy.typing import NDArray
 
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
-from flock_desk.closed_loop.flown import (
-    EmbeddedVehicle,
-    FlownLeader,
-    FlownVehicle,
-    ScenarioLeader,
-)
+from flock_desk.closed_loop.flown import EmbeddedVehicle, FlownLeader, FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import Radios
@@ -84,7 +79,7 @@ class RealTimeFlight:
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
                  latest_ns: int = LATEST_NS, leader: FlownLeader | None = None) -> None:
-        self.scenario = ScenarioRun(scenario, run)
+        self.scenario = ScenarioRun(scenario, run, isinstance(vehicle, EmbeddedVehicle))
         self.time_ns = 0
         self.began_ns: int | None = None
         self.skipped_images = 0  # since the scenario began
@@ -92,8 +87,7 @@ class RealTimeFlight:
         self.camera = camera
         self._latest_ns = latest_ns
         self._images = 0
-        self._leader = leader or ScenarioLeader(
-            self.scenario, in_place=isinstance(vehicle, EmbeddedVehicle))
+        self._leader = leader or self.scenario
         self.follower = vehicle.step(0)
         """The follower's true motion at the last step."""
         self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
@@ -161,15 +155,13 @@ class RealTimeFlight:
     def _frame(self, stamp_ns: int) -> RenderedImage:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
-        hidden = self.scenario.scenario.fails('marker', time)
+        hidden = self.scenario.hides(time)
         leader = self._leader.motion(stamp_ns, time)
-        usable = not (hidden or leader is None or self.scenario.blinding(time)
-                      or self.scenario.scenario.fails('vio', time))
+        usable = not (hidden or leader is None or self.scenario.scenario.fails('vio', time))
         motions = [self._leader.motion(t, self._scenario_time(t)) for t in moments]
         leaders = [] if hidden else [_pose(motion) for motion in motions if motion is not None]
         pixels = self.camera.image(
-            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders,
-            self.scenario.light(time))
+            self._images, [_pose(self.vehicle.at(t)) @ T_BODY_OPTICAL for t in moments], leaders)
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
                              self.vehicle.at(stamp_ns), leader, usable)
 

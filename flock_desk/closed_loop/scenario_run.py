@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a scenario does at a moment of one flight: the leader, the air, the light, what fails."""
+"""The content of a scenario at a moment of one flight: the leader, the air, the light, delays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ import math
 
 import numpy as np
 
-from flock_desk.camera.renderer import Light
 from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.sensors.vio import Odometry
@@ -30,16 +29,14 @@ from flock_follower.geometry import (
     GRAVITY,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
-    quaternion_to_matrix,
+    quaternion_from_yaw,
     Transform,
+    yaw_from_quaternion,
 )
 
 WIND_PERIOD = 0.05  # s between changes of the wind
 PROCESSING = 0.02  # s from an image's exposure to the planner if nothing delays it
 BEFORE = -1.0  # s: any time before the scenario begins
-_CLOUDS = 9.0  # s from one cloud to the next, where the light changes at all
-_GLARE = Light(veil=1.2)
-_SHADOW = Light(gain=0.002)
 
 
 class ScenarioRun:
@@ -48,12 +45,17 @@ class ScenarioRun:
 
     Of ``sensing`` only latency and light changes are used: images are rendered and marked by the
     real perception, which has noise and recall of its own.
+
+    :param in_place: whether the follower starts at the scenario's place; else the scenario is
+        moved to its place, height and heading once it is in offboard mode.
     """
 
-    def __init__(self, scenario: Scenario, run: int) -> None:
-        self.scenario = scenario
+    def __init__(self, scenario: Scenario, run: int, in_place: bool = True) -> None:
+        self.scenario, self._in_place = scenario, in_place
         self._course = course(scenario, run)
         self._turning = BEFORE, 0.0, 0.0  # time, heading then, rate of it
+        #: The scenario's frame in the vehicle's; None before the leader appears.
+        self._frame: Transform | None = Transform() if in_place else None
         count = round(scenario.duration / WIND_PERIOD) + 1
         self._wind = wind_course(scenario.wind, count, WIND_PERIOD, scenario.random(run, 'wind'))
         self._latency_rng = scenario.random(run, 'images')
@@ -61,63 +63,66 @@ class ScenarioRun:
         rng, sensing = scenario.random(run, 'light'), scenario.sensing
         begins = rng.uniform(0.0, scenario.duration,
                              rng.poisson(sensing.light_changes * scenario.duration / 60.0))
-        self.light_changes = [
-            (begin, begin + float(rng.uniform(*sensing.light_change)), bool(rng.integers(2)))
-            for begin in np.sort(begins).tolist()]
-        """Begin and end, s, and whether it is glare, else shadow."""
+        self.light_changes = [(begin, begin + float(rng.uniform(*sensing.light_change)))
+                              for begin in np.sort(begins).tolist()]
+        """Begin and end of each, s."""
 
-    def turn(self, time: float, follower: Array) -> None:
-        """Let a leader that faces away from the follower, at a position (3,), go on turning."""
-        if self.scenario.leader.heading != 'away':
-            return
-        heading = self._heading(time)
-        self._turning = time, heading, float(
-            turn_rate(heading, self._course.at(time)[0] - follower))
+    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
+        """Bring the leader to a follower that has just come into offboard mode; turn it away."""
+        if not self._in_place and time < 0.0 and not offboard:
+            self._frame = None
+        elif self._frame is None and offboard:
+            height = np.array([0.0, 0.0, self.scenario.start.altitude])
+            self._frame = Transform.from_quaternion(
+                follower.position - height,
+                quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
+        if self._frame is not None and self.scenario.leader.heading == 'away':
+            offset = self._course.at(time)[0] - self._frame.inverse().apply(follower.position)
+            heading = self._heading(time)
+            self._turning = time, heading, float(turn_rate(heading, offset))
 
-    def _heading(self, time: float) -> float:
-        if self.scenario.leader.heading != 'away':
-            return self._course.at(time)[3]
-        since, heading, rate = self._turning
-        return heading + rate * (time - since)
+    def motion(self, _: int, time: float) -> Odometry | None:
+        """Return the leader's true motion; its covariances are zero. None before it appears."""
+        if self._frame is None:
+            return None
+        step = 0.5 * STEP
+        pose, before, after = (self._frame @ self._pose(t) for t in (
+            time, time - step, time + step))
+        rate = matrix_to_rotation_vector(before.rotation.T @ after.rotation) / (2.0 * step)
+        velocity = self._course.at(time)[1] if time > 0.0 else np.zeros(3)
+        return Odometry(time, pose.translation, matrix_to_quaternion(pose.rotation),
+                        pose.rotation.T @ self._frame.rotation @ velocity, rate)
 
-    def leader(self, time: float) -> Transform:
-        """Return the leader's pose: it leans into its acceleration."""
+    def knows(self, time_ns: int) -> bool:
+        """Return True: the course is known."""
+        return True
+
+    def _pose(self, time: float) -> Transform:
+        """Return the leader's pose on its course: it leans into its acceleration."""
         position, _, acceleration, _ = self._course.at(time)
         up = acceleration + np.array([0.0, 0.0, GRAVITY])
         return Transform(
             attitude(up / math.sqrt(up @ up), np.array(self._heading(time))), position)
 
-    def leader_odometry(self, time: float) -> Odometry:
-        """Return the leader's true motion; its covariances are zero."""
-        pose, step = self.leader(time), 0.5 * STEP
-        before, after = self.leader(time - step), self.leader(time + step)
-        rate = matrix_to_rotation_vector(before.rotation.T @ after.rotation) / (2.0 * step)
-        velocity = self._course.at(time)[1] if time > 0.0 else np.zeros(3)
-        quaternion = matrix_to_quaternion(pose.rotation)
-        return Odometry(time, pose.translation, quaternion,
-                        quaternion_to_matrix(quaternion).T @ velocity, rate)
+    def _heading(self, time: float) -> float:
+        since, heading, rate = self._turning
+        return (heading + rate * (time - since) if self.scenario.leader.heading == 'away'
+                else self._course.at(time)[3])
 
     def wind(self, time: float) -> Array:
         """Return the velocity (3,) of the air, m/s."""
         return self._wind[min(max(int(time / WIND_PERIOD), 0), len(self._wind) - 1)]
 
-    def blinding(self, time: float) -> Light | None:
-        """Return the glare or shadow that hides everything, if there is any."""
-        return next((_GLARE if glare else _SHADOW for begin, end, glare in self.light_changes
-                     if begin <= time < end), None)
-
-    def light(self, time: float) -> Light:
-        """Return the light: clouds, and glare or shadow that hides everything."""
-        if not self.scenario.sensing.light_changes:
-            return Light()
-        clouds = Light(gain=1.0 + 0.3 * math.sin(2.0 * math.pi * time / _CLOUDS))
-        return self.blinding(time) or clouds
+    def hides(self, time: float) -> bool:
+        """Return whether an outage or the light hides the marker."""
+        return self.scenario.fails('marker', time) or any(
+            begin <= time < end for begin, end in self.light_changes)
 
     def delay(self) -> float:
         """
-        Return how long the next image is under way, s.
+        Return the delay of the next image, s.
 
-        That is the latency of the scenario, which varies by a tenth, without what the nodes take.
+        That is the latency of the scenario, which varies by a tenth, without that of the nodes.
         """
         latency = self._latency * (1.0 + self._latency_rng.uniform(-0.1, 0.1))
         return float(max(latency - PROCESSING, 0.0))

@@ -13,12 +13,18 @@
 # limitations under the License.
 
 """
-Flocks of point agents under the law or its predecessors: one function from start to arrays.
+Flocks of point agents under the law or its predecessors: from a start to arrays.
 
     from flock_desk.flocks.agents import simulate
     from flock_desk.flocks.paper import LEADERLESS, PARAMS
-    run = simulate(LEADERLESS.positions, LEADERLESS.velocities, PARAMS, duration=20.0)
+    run = simulate(*LEADERLESS, PARAMS, duration=20.0)
     run.time, run.positions, run.velocities, run.metrics.min_r2
+
+``simulate`` has every agent see all others, as in the paper; ``simulate_graph`` is for larger
+flocks. Vicsek's rule (Vicsek et al. 1995) is in discrete time, without noise, in two readings: in
+the literal one each agent keeps its own speed and takes the mean heading of the agents within a
+radius, itself included. The paper's figure of three agents, whose speeds become equal, fits only
+the other: each takes their mean velocity.
 """
 
 from __future__ import annotations
@@ -27,30 +33,29 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import cast, Literal
+from typing import cast, get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_desk.flocks import laws
-from flock_desk.flocks.flock_metrics import Metrics, metrics
-from flock_desk.flocks.laws import Coupling, Graph, Method, Pairs
+from flock_desk.flocks.flock_metrics import Graph, Metrics, metrics
+from flock_desk.flocks.laws import (
+    graph_accelerations,
+    new_edges,
+    Pairs,
+    pairs_within,
+    step_is_small,
+)
 from flock_follower import flocking
-from flock_follower.flocking import FlockingParams
+from flock_follower.flocking import accelerations, FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.ranges import Range
 
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mean_velocity']
-Neighbors = Literal['all', 'graph', 'nearest']
-Integrator = Literal['adaptive', 'semi_implicit']
 Acceleration = Callable[[float, Array, Array], Array]
 State = tuple[Array, Array]
 
-NEAREST = 7  # neighbours that a starling follows (Ballerini et al. 2008)
-_LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
-_POSITIVE = Range(0.0, above=True)
-_ESCAPED = 1e6  # m/s: no flock flies so fast
-_NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
+VICSEK_STEP, VICSEK_RADIUS = 0.1, 1.0  # s, and m: how far an agent sees
+_LOOK_PERIOD = 0.05  # s between searches for new edges
 _SKIN = 0.05  # m that agents may move before near pairs are searched again
 
 
@@ -74,167 +79,147 @@ class Simulation:
     positions: Array
     velocities: Array
     params: FlockingParams
-    model: Model
     graph: Graph | None = field(default=None, repr=False)
-    """The neighbour graph at the end, where the model acts on one; its edges only ever join."""
-    joined: Array | None = field(default=None, repr=False)
-    """Time at which each edge of the graph was added (edges,), s."""
+    """The neighbour graph at the end, if there is one."""
 
     @cached_property
     def metrics(self) -> Metrics:
-        """Return the figures flocks are judged by, at every time."""
-        return metrics(self.time, self.positions, self.velocities, self.params,
-                       self.graph, self.joined)
+        """Return the figures that flocks are compared by, at every time."""
+        return metrics(self.time, self.positions, self.velocities, self.params, self.graph)
 
 
-def simulate(positions: ArrayLike, velocities: ArrayLike,
-             params: FlockingParams | None = None, *, duration: float = 20.0,
-             model: Model = 'flocking', neighbors: Neighbors = 'all',
-             coupling: Coupling = 'flock', leader: Leader | None = None,
-             integrator: Integrator = 'adaptive', sample_period: float = 0.02,
-             dt: float | None = None, radius: float = 1.0, method: Method = 'auto',
+def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
+             duration: float = 20.0, model: Model = 'flocking', leader: Leader | None = None,
+             sample_period: float = 0.02,
              progress: Callable[[float], None] | None = None) -> Simulation:
     """
     Return how a flock moves from its positions and velocities, both (k, n) with n = 2 or 3.
 
-    :param params: of the law, those of the paper's simulations by default.
-    :param duration: s to simulate.
-    :param model: 'flocking', 'cucker_dong', 'cucker_smale'; 'vicsek', each at its own speed, or
-        'vicsek_mean_velocity', both in steps of dt.
-    :param neighbors: the neighbours of an agent: 'all' as in the paper; 'graph', the neighbour
-        graph of :mod:`.laws`; 'nearest', the seven nearest. The latter two are for model
-        'flocking'.
-    :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.
-    :param leader: a prescribed acceleration of agent 0.
-    :param integrator: 'adaptive' or 'semi_implicit', in steps of dt at most.
-    :param sample_period: s between the times returned; for Vicsek's, rounded to whole steps.
-    :param dt: s, 0.01 by default, 0.1 for Vicsek's.
-    :param radius: how far an agent sees in Vicsek's model, m.
-    :param method: how the sum over all pairs is computed, see :func:`.laws.accelerations`.
+    :param duration: s to simulate; :param sample_period: s between the times returned, at least
+        0.1 s for Vicsek's rule.
     :param progress: called with the share done, 0 to 1.
-    :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
-        where the law has no value, saying which agents, and what to change.
+    :raises ValueError: for an unknown model, bad shapes or values, or a start outside the band.
     :raises RuntimeError: if no finite solution goes on.
     """
-    params = FlockingParams() if params is None else params
-    _check_choices(model, neighbors, coupling, integrator)
-    discrete = model in ('vicsek', 'vicsek_mean_velocity')
-    dt = (0.1 if discrete else 0.01) if dt is None else dt
-    for name, value in (('duration', duration), ('sample_period', sample_period), ('dt', dt),
-                        ('radius', radius)):
-        _POSITIVE.check(name, value)
-    x, v = _checked_start(positions, velocities, leader)
-    growing = None
-    if discrete:
-        every = max(1, round(sample_period / dt))
-        time = dt * every * np.arange(round(duration / (dt * every)) + 1)
-        states = _vicsek(x, v, len(time) - 1, every, dt, radius, model, leader)
+    if model not in get_args(Model):
+        raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')
+    x, v = flocking.checked(positions, velocities)
+    if model.startswith('vicsek'):
+        time = VICSEK_STEP * np.arange(round(duration / VICSEK_STEP) + 1)
+        states = _vicsek(x, v, len(time) - 1, model, leader)
     else:
         time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
-        growing = _GrowingGraph(x, params, coupling) if neighbors == 'graph' else None
-        _check_band(x, params, model, neighbors, growing)
-        acceleration = _acceleration(params, model, growing or neighbors, coupling, method, leader)
-        solve = partial(adaptive, acceleration, breaks=leader.breaks if leader else ())
-        if integrator == 'semi_implicit':
-            solve = partial(semi_implicit, acceleration, dt=dt,
-                            acceptable=growing.step_is_small if growing else None)
-        states = growing.followed(solve, (x, v), time) if growing else solve((x, v), time)
+        _check_band(x, params, model)
+        states = adaptive(partial(_acceleration, params, cast(flocking.Model, model), leader),
+                          (x, v), time, leader.breaks if leader else ())
+    return Simulation(time, *_collected(states, len(time), progress), params)
+
+
+def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
+                   duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
+                   progress: Callable[[float], None] | None = None) -> Simulation:
+    """
+    Return how a flock moves on its neighbour graph; see ``simulate``.
+
+    :param dt: s, the longest step.
+    :raises RuntimeError: if the flock ends at a singularity of the law.
+    """
+    x, v = flocking.checked(positions, velocities)
+    time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
+    growing = _GrowingGraph(x, params)
+    x, v = _collected(growing.states((x, v), time, dt), len(time), progress)
+    return Simulation(time, x, v, params, Graph(growing.edges, np.array(growing.joined)))
+
+
+def _collected(states: Iterator[State], count: int,
+               progress: Callable[[float], None] | None) -> State:
     run: list[State] = []
     for state in states:
         run.append(state)
         if progress is not None:
-            progress((len(run) - 1) / (len(time) - 1))
+            progress((len(run) - 1) / (count - 1))
     x, v = map(np.array, zip(*run))
-    return Simulation(time, x, v, params, model, *(
-        () if growing is None else (growing.graph, np.array(growing.joined))))
-
-
-def _check_choices(model: Model, neighbors: Neighbors, coupling: Coupling,
-                   integrator: Integrator) -> None:
-    for name, choice, known in (('model', model, Model), ('neighbors', neighbors, Neighbors),
-                                ('coupling', coupling, Coupling),
-                                ('integrator', integrator, Integrator)):
-        laws.check_choice(name, choice, known)
-    if neighbors != 'all' and model != 'flocking':
-        raise ValueError(f"neighbors = {neighbors!r}: must be 'all' where model = {model!r}")
+    return x, v
 
 
 class _GrowingGraph:
     """The neighbour graph of a flock, which grows with its motion, and the law on it."""
 
-    def __init__(self, positions: Array, params: FlockingParams, coupling: Coupling) -> None:
-        self.graph = laws.initial_graph(positions, params)
-        self.joined = [0.0] * len(self.graph.edges)
-        self._params, self._coupling = params, coupling
+    def __init__(self, positions: Array, params: FlockingParams) -> None:
+        self.edges = pairs_within(positions, np.sqrt(params.d1))
+        self.joined = [0.0] * len(self.edges)
+        self._params = params
         self._near: tuple[Array, Pairs] | None = None
 
-    def accelerations(self, x: Array, v: Array) -> Array:
-        return laws.graph_accelerations(x, v, self._params, self.graph, self._coupling,
-                                        self._nearby(x))
-
-    def step_is_small(self, before: Array, after: Array) -> bool:
-        return laws.step_is_small(before, after, self._params, self.graph, self._nearby(before))
-
-    def followed(self, solve: Callable[[State, Array], Iterator[State]], start: State,
-                 time: Array) -> Iterator[State]:
+    def states(self, start: State, time: Array, dt: float) -> Iterator[State]:
         """Yield the states at each time, letting the graph grow at each, and between."""
         yield start
         state = start
         for begin, end in pairwise(time):
             looks = np.linspace(begin, end, 1 + int(np.ceil((end - begin) / _LOOK_PERIOD)))
             for since, t in pairwise(looks):
-                *_, state = solve(state, np.array([since, t]))
-                x = state[0]
-                self.graph = laws.grown(self.graph, x, self._params, self._nearby(x))
-                self.joined += [t] * (len(self.graph.edges) - len(self.joined))
+                *_, state = semi_implicit(self._accelerations, state, np.array([since, t]), dt,
+                                          self._step_is_small)
+                new = new_edges(self.edges, state[0], self._params, self._nearby(state[0]))
+                self.edges = np.concatenate([self.edges, new])
+                self.joined += [t] * len(new)
             yield state
 
+    def _accelerations(self, _: float, x: Array, v: Array) -> Array:
+        return graph_accelerations(x, v, self._params, self.edges, self._nearby(x))
+
+    def _step_is_small(self, before: Array, after: Array) -> bool:
+        return step_is_small(before, after, self._params, self.edges, self._nearby(before))
+
     def _nearby(self, x: Array) -> Pairs:
-        """Return at least the pairs with r^2 < d1; all, if they are few."""
-        few = len(x) <= _NEAR_BY_ALL
-        if self._near is None or not (few or np.abs(x - self._near[0]).max() <= _SKIN):
+        """Return at least the pairs with r^2 < d1."""
+        if self._near is None or np.abs(x - self._near[0]).max() > _SKIN:
             # Each of two agents may move by _SKIN along each of at most 3 axes.
             distance = np.sqrt(self._params.d1) + 2.0 * np.sqrt(3.0) * _SKIN
-            self._near = (x, laws.complete_graph(len(x)).edges if few
-                          else laws.pairs_within(x, distance))
+            self._near = x, pairs_within(x, distance)
         return self._near[1]
 
 
-def _acceleration(params: FlockingParams, model: Model, neighbors: Neighbors | _GrowingGraph,
-                  coupling: Coupling, method: Method, leader: Leader | None) -> Acceleration:
-    """Return the function that gives the accelerations of a flock."""
-    def acceleration(t: float, x: Array, v: Array) -> Array:
-        if not np.abs(v).max() < _ESCAPED:  # written so that NaN fails
-            raise RuntimeError(f'the solution diverges near t = {t:.6g} s: take a smaller dt, or '
-                               "integrator = 'adaptive', or begin further from the band's edges")
-        if isinstance(neighbors, _GrowingGraph):
-            u = neighbors.accelerations(x, v)
-        elif neighbors == 'nearest':
-            u = laws.nearest_accelerations(x, v, params, laws.nearest(x, NEAREST), coupling)
-        else:
-            u = laws.accelerations(x, v, params, cast(flocking.Model, model), method)
-        if leader is not None:
-            u[0] = leader.acceleration(t)
-        return u
-    return acceleration
+def _acceleration(params: FlockingParams, model: flocking.Model, leader: Leader | None, t: float,
+                  x: Array, v: Array) -> Array:
+    u = accelerations(x, v, params, model)
+    if leader is not None:
+        u[0] = leader.acceleration(t)
+    return u
 
 
-def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: float, model: Model,
+def _vicsek(x: Array, v: Array, steps: int, model: Model,
             leader: Leader | None) -> Iterator[State]:
-    """Yield the first state, and one after every ``every`` steps of dt."""
+    """Yield the first state, and that after every step."""
     yield x, v
-    for n in range(samples * every):
-        after = laws.velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
+    for n in range(steps):
+        after = velocities_after(x, v, model == 'vicsek_mean_velocity')
         if leader is not None:
-            after[0] = v[0] + dt * np.asarray(leader.acceleration(n * dt))
-        x, v = x + dt * v, after  # in this order: the velocity of now takes one to the next place
-        if (n + 1) % every == 0:
-            yield x, v
+            after[0] = v[0] + VICSEK_STEP * np.asarray(leader.acceleration(n * VICSEK_STEP))
+        # In this order: the present velocity leads to the next place.
+        x, v = x + VICSEK_STEP * v, after
+        yield x, v
+
+
+def velocities_after(positions: Array, velocities: Array, mean_velocity: bool = False) -> Array:
+    """
+    Return the velocities (k, n), m/s, that agents take next by Vicsek's rule.
+
+    :param positions: (k, n), m, now; :param velocities: (k, n), m/s, now.
+    :param mean_velocity: take the mean velocity, not the mean heading at the agent's own speed.
+    """
+    offsets = positions[:, None] - positions
+    seen = (np.sum(offsets ** 2, axis=2) <= VICSEK_RADIUS ** 2).astype(float)
+    if mean_velocity:
+        mean: Array = seen @ velocities / seen.sum(axis=1, keepdims=True)
+        return mean
+    speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+    total = seen @ (velocities / np.maximum(speed, 1e-12))
+    return speed * total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def adaptive(acceleration: Acceleration, start: State, times: Array,
-             breaks: Sequence[float] = (), rtol: float = 1e-11,
-             atol: float = 1e-12) -> Iterator[State]:
+             breaks: Sequence[float] = ()) -> Iterator[State]:
     """
     Yield positions and velocities, both (k, n), at each time, by Dormand and Prince's 8(5,3).
 
@@ -255,7 +240,7 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
             x, v = y.reshape(shape)
             return np.concatenate([v.ravel(), acceleration(min(t, last), x, v).ravel()])
 
-        solver = DOP853(rate, t, y, end, rtol=rtol, atol=atol)
+        solver = DOP853(rate, t, y, end, rtol=1e-11, atol=1e-12)
         while solver.status == 'running':
             message = solver.step()
             if solver.status == 'failed':
@@ -304,42 +289,13 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
         yield x, v
 
 
-def _checked_start(positions: ArrayLike, velocities: ArrayLike,
-                   leader: Leader | None) -> State:
-    x, v = flocking.checked(positions, velocities)
-    if not len(x):
-        raise ValueError('positions has no agents: give at least one')
-    if len(same := laws.pairs_within(x, 0.0)):
-        i, j = same[0]
-        raise ValueError(f'positions[{i}] and positions[{j}] are both {x[i].tolist()}: '
-                         'agents must start apart')
-    if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
-        raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '
-                         f'must be {x[0].shape}, as the positions are')
-    return x, v
-
-
-def _check_band(x: Array, params: FlockingParams, model: Model, neighbors: Neighbors,
-                growing: _GrowingGraph | None) -> None:
-    """Raise ValueError if the law is undefined, or cannot keep its guarantees."""
-    if model == 'cucker_smale' or len(x) < 2:
-        return
-    close = laws.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
-    if len(close):
-        i, j = close[0]
-        raise ValueError(
-            f'agents {i} and {j} start {np.linalg.norm(x[i] - x[j]):.6g} m apart: must be more '
-            f'than sqrt(d0) = {np.sqrt(params.d0):.6g} m (move them apart, or lower d0)')
-    if growing is not None and not growing.graph.connected:
-        raise ValueError(
-            'the agents start in groups that are not connected: each must be nearer than '
-            f'sqrt(d1) = {np.sqrt(params.d1):.6g} m to another (move them closer, or raise d1)')
-    if model == 'flocking' and neighbors == 'all':
-        for i, own in enumerate(x):
-            r2 = np.sum((x - own) ** 2, axis=1)
-            j = int(np.argmax(r2))
-            if r2[j] >= params.d1:
-                raise ValueError(
-                    f'agents {i} and {j} start {np.sqrt(r2[j]):.6g} m apart: must be less than '
-                    f'sqrt(d1) = {np.sqrt(params.d1):.6g} m for every two (move them closer, '
-                    "raise d1, or choose neighbors = 'graph')")
+def _check_band(x: Array, params: FlockingParams, model: Model) -> None:
+    """Raise ValueError if the law has no value at a start (k, n), m."""
+    r2 = np.sum((x[:, None] - x) ** 2, axis=2)[np.triu_indices(len(x), k=1)]
+    least, greatest = np.sqrt([r2.min(initial=np.inf), r2.max(initial=0.0)])
+    if model != 'cucker_smale' and least ** 2 <= params.d0 * (1.0 + 1e-12):
+        raise ValueError(f'two agents start {least:.6g} m apart: must be more than sqrt(d0) = '
+                         f'{np.sqrt(params.d0):.6g} m')
+    if model == 'flocking' and greatest ** 2 >= params.d1:
+        raise ValueError(f'two agents start {greatest:.6g} m apart: must be less than sqrt(d1) = '
+                         f'{np.sqrt(params.d1):.6g} m; for larger flocks: simulate_graph')

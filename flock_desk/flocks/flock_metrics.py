@@ -17,12 +17,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from flock_desk.flocks.laws import Graph
+from flock_desk.flocks.laws import Pairs, squared_distances
 from flock_follower.flocking import FlockingParams, lyapunov
 from flock_follower.geometry import Array
+
+
+class Graph(NamedTuple):
+    """A neighbour graph at the end of a simulation; its edges only ever join."""
+
+    edges: Pairs
+    joined: Array
+    """When each edge joined (m,), s; 0: from the start."""
 
 
 @dataclass(frozen=True)
@@ -79,43 +88,21 @@ def extremum(time: Array, values: Array, *, least: bool) -> tuple[float, float]:
 
 
 def metrics(time: Array, positions: Array, velocities: Array, params: FlockingParams,
-            graph: Graph | None = None, joined: Array | None = None) -> Metrics:
-    """
-    Return the metrics of positions, m, and velocities, m/s, both (m, k, n).
-
-    :param graph: the neighbour graph at the end, if any.
-    :param joined: when each of its edges joined (edges,), s.
-    """
-    least, greatest, mean = _distances(positions)
-    w: Array
-    if graph is not None and joined is not None:
-        greatest = np.array([_longest_edge(x, graph, joined <= t)
-                             for t, x in zip(time, positions)])
-        w = np.full(len(time), np.nan)
-    else:
-        w = np.where((least > params.d0) & (greatest < params.d1), 0.0, np.inf)
-        for n in np.flatnonzero(w == 0.0):
-            w[n] = lyapunov(positions[n], velocities[n], params)
+            graph: Graph | None = None) -> Metrics:
+    """Return the metrics of positions, m, and velocities, m/s, both (m, k, n)."""
+    from scipy.spatial.distance import pdist
+    count, w = len(time), np.full(len(time), np.nan)
+    least, greatest, mean = np.full(count, np.inf), np.zeros(count), np.zeros(count)
+    for n, (t, x) in enumerate(zip(time, positions)):
+        r2 = pdist(x, 'sqeuclidean')
+        longest = r2 if graph is None else squared_distances(x, graph.edges[graph.joined <= t])
+        least[n], greatest[n] = r2.min(initial=np.inf), longest.max(initial=0.0)
+        mean[n] = np.sqrt(r2).sum() / max(1, len(r2))
+        if graph is None:
+            w[n] = lyapunov(x, velocities[n], params)
     speeds = np.linalg.norm(velocities, axis=2, keepdims=True)
     headings = velocities / np.where(speeds > 0.0, speeds, 1.0)
     deviations = velocities - velocities.mean(axis=1, keepdims=True)
     return Metrics(time, least, greatest, mean, speeds.mean(axis=(1, 2)),
                    np.linalg.norm(deviations, axis=(1, 2)),
                    np.linalg.norm(headings.mean(axis=1), axis=1), w)
-
-
-def _distances(positions: Array) -> tuple[Array, Array, Array]:
-    """Return the least and greatest r^2 and the mean distance (m,)."""
-    from scipy.spatial.distance import pdist
-    figures = []
-    for x in positions:
-        r2 = pdist(x, 'sqeuclidean')
-        figures.append((r2.min(initial=np.inf), r2.max(initial=0.0),
-                        np.sqrt(r2).sum() / max(1, len(r2))))
-    least, greatest, mean = np.array(figures).T
-    return least, greatest, mean
-
-
-def _longest_edge(positions: Array, graph: Graph, present: Array) -> float:
-    i, j = graph.edges[present].T
-    return float(np.max(np.sum((positions[j] - positions[i]) ** 2, axis=1), initial=0.0))

@@ -74,13 +74,9 @@ def random_start(count: int, dimension: int, params: FlockingParams,
     No pair's r^2 is within a tenth of the band's width of d0 or d1, at which the law is singular.
 
     :param dimension: 2 or 3.
-    :param seed: of the random numbers; the same gives the same flock.
-    :raises ValueError: for a count below 1, another dimension, or a band too narrow to
-        find room in.
+    :raises ValueError: for a count below 1, or a band too narrow to find room in.
     """
     _COUNTS.check('count', count)
-    if dimension not in (2, 3):
-        raise ValueError(f'dimension = {dimension!r}: must be 2 or 3')
     rng = np.random.default_rng(seed)
     margin = _MARGIN * (params.d1 - params.d0)
     positions = np.zeros((count, dimension))

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Scenarios as YAML files; an error names file, line, key and the valid values.
+Scenarios as YAML files; an error names the file, the key, its value and the valid values.
 
 A file holds the fields of :class:`flock_desk.scenarios.scenario.Scenario`; its
 name is the scenario's. A missing key keeps its default::
@@ -33,8 +33,7 @@ A variant is a scenario of its own name, which differs in the keys that it has.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import Field, fields, is_dataclass, MISSING, replace
-import difflib
+from dataclasses import fields, is_dataclass, MISSING, replace
 from functools import cache
 import inspect
 import math
@@ -45,10 +44,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import yaml
 
 from flock_desk.scenarios.courses import course
-from flock_desk.scenarios.flock import Flock
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.files import resource
-from flock_follower.ranges import Range
 
 FOLDER = 'config/scenarios'
 _VARIANTS = 'variants'
@@ -68,7 +65,7 @@ def names() -> list[str]:
 def _files() -> dict[str, Path]:
     """Return the file of each scenario of the package, by its name."""
     return {name: path for path in resource(FOLDER).glob('*.yaml')
-            for name in (path.stem, *_variants(_composed(path.read_text('utf-8'), str(path))))}
+            for name in (path.stem, *yaml.safe_load(path.read_text('utf-8')).get(_VARIANTS, {}))}
 
 
 def load(name: str) -> Scenario:
@@ -96,16 +93,13 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also if it has operations or a flock, which flights in lock step
-        alone know.
+    :raises ScenarioError: also if it has operations or a flock: only in lock step.
     """
     scenario = load(name)
-    if scenario.operations:
-        raise ScenarioError(f'scenario = {name!r}: its operations are obeyed in lock step only: '
-                            f'flights --scenario {name}')
-    if scenario.flock is not None:
-        raise ScenarioError(f'scenario = {name!r}: its flock flies in lock step only: flights '
-                            f'--scenario {name}; fly --followers flies a column')
+    for part in ('operations', 'flock'):
+        if getattr(scenario, part):
+            raise ScenarioError(f'scenario = {name!r}: its {part} can be flown in lock step only: '
+                                f'flights --scenario {name}')
     return scenario
 
 
@@ -113,189 +107,91 @@ def parse(text: str, path: str, variant: str = '') -> Scenario:
     """
     Return the scenario in the text of a file, or a variant of it.
 
-    :raises ScenarioError: naming file, line, key, value and the allowed values.
+    :raises ScenarioError: naming file, key, value and the valid values.
     """
-    root, reader, stem = _composed(text, path), _ScenarioReader(path), Path(path).stem
-    if root is None:
-        raise ScenarioError(f'{path}:1: is empty: must hold summary, leader and so on')
-    variants = _variants(root)
-    if isinstance(root, yaml.MappingNode):
-        root.value = [(key, value) for key, value in root.value if key.value != _VARIANTS]
-    scenario: Scenario = reader.dataclass(Scenario, root, '', name=stem)
-    if variant not in ('', stem, *variants):
-        raise ScenarioError(f'{path}: has no variant {variant}, only {", ".join(variants)}')
-    if variant in variants:
-        root = variants[variant]
-        scenario = reader.dataclass(Scenario, root, f'{_VARIANTS}.{variant}.', scenario,
-                                    name=variant)
+    stem = Path(path).stem
     try:
+        root = yaml.safe_load(text)
+        variants = root.pop(_VARIANTS, {}) if isinstance(root, dict) else {}
+        scenario: Scenario = _part(Scenario, root, '', name=stem)
+        if variant in variants:
+            scenario = _part(Scenario, variants[variant], f'{_VARIANTS}.{variant}', scenario,
+                             name=variant)
+        elif variant not in ('', stem):
+            raise ValueError(f'has no variant {variant}, only {", ".join(variants)}')
         course(scenario, 0)
-    except ValueError as error:
-        lines = [key.start_mark.line + 1 for key, _ in root.value if key.value == 'leader']
-        raise ScenarioError(
-            f'{path}:{lines[0] if lines else root.start_mark.line + 1}: {error}') from None
+    except (ValueError, yaml.YAMLError) as error:
+        raise ScenarioError(f'{path}: {" ".join(str(error).split())}') from None
     return scenario
 
 
-def _variants(root: Any) -> dict[str, Any]:
-    """Return the nodes of the variants in a file, by name."""
-    if not isinstance(root, yaml.MappingNode):
-        return {}
-    return {key.value: value for part, node in root.value if part.value == _VARIANTS
-            for key, value in node.value}
-
-
-def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
-    """
-    Return a scenario with some keys of its flock changed, to those of a YAML mapping.
-
-    :param path: what to call it in an error.
-    :raises ScenarioError: also if the scenario has no flock.
-    """
-    if scenario.flock is None:
-        raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')
-    node = _composed(text, path)
-    flock = _ScenarioReader(path).dataclass(Flock, node, 'flock.', scenario.flock)
-    return replace(scenario, flock=flock)
-
-
-def _composed(text: str, path: str) -> Any:
+def _part(kind: Any, given: Any, where: str, before: Any = None, **more: Any) -> Any:
+    """Return one of a kind of dataclass; a missing key is as in ``before``, or the default."""
+    hints, prefix = get_type_hints(kind), f'{where}.'.lstrip('.')
+    allowed = [f.name for f in fields(kind) if f.name != 'name']
+    if not isinstance(given, dict):
+        raise ValueError(f'{where or "the file"}: must be a mapping of {", ".join(allowed)}')
+    if unknown := [key for key in given if key not in allowed]:
+        raise ValueError(f'{prefix}{unknown[0]}: unknown key: must be one of '
+                         f'{", ".join(allowed)}')
+    values = {**more, **{key: _value(hints[key], value, prefix + key, getattr(before, key, None))
+                         for key, value in given.items()}}
+    for f in fields(kind):
+        if before is None and f.name not in values and (
+                f.default is MISSING and f.default_factory is MISSING):
+            raise ValueError(f'{prefix}{f.name}: is missing')
     try:
-        return yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        line = f':{mark.line + 1}' if mark else ''
-        problem = getattr(error, 'problem', None) or str(error)
-        raise ScenarioError(f'{path}{line}: not valid YAML: {problem}') from None
+        return kind(**values) if before is None else replace(before, **values)
+    except ValueError as error:
+        raise ValueError(f'{prefix}{error}') from None
 
 
-class _ScenarioReader:
-    """Turns nodes of YAML into values of declared types."""
-
-    def __init__(self, path: str) -> None:
-        self._path = path
-
-    def dataclass(self, kind: Any, node: Any, where: str, before: Any = None,
-                  name: str = '') -> Any:
-        """Return one of a kind; a missing key is as in ``before``, or the default."""
-        allowed = [f.name for f in fields(kind) if f.name != 'name']  # that of the file
-        if not isinstance(node, yaml.MappingNode):
-            raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
-                                    f'{", ".join(allowed)}')
-        hints = get_type_hints(kind)
-        values: dict[str, Any] = {'name': name} if name else {}
-        lines: dict[str, Any] = {}
-        for key, value in node.value:
-            if key.value not in allowed:
-                like = difflib.get_close_matches(str(key.value), allowed, 1)
-                hint = f' (did you mean {like[0]}?)' if like else ''
-                raise self._error(key, f'{where}{key.value}: unknown key{hint}: must be one of '
-                                       f'{", ".join(allowed)}')
-            if key.value in lines:
-                raise self._error(key, f'{where}{key.value}: given twice, first in line '
-                                       f'{lines[key.value].start_mark.line + 1}')
-            lines[key.value] = value
-            values[key.value] = self._value(hints[key.value], value, f'{where}{key.value}',
-                                            getattr(before, key.value, None))
-        for f in fields(kind):
-            if before is None and f.name not in values and f.default is MISSING and (
-                    f.default_factory is MISSING):
-                raise self._error(node, f'{where}{f.name}: is missing')
-        try:
-            return kind(**values) if before is None else replace(before, **values)
-        except ValueError as error:
-            named = str(error).split(' = ')[0]
-            raise self._error(lines.get(named, node), f'{where}{error}') from None
-
-    def _value(self, kind: Any, node: Any, where: str, before: Any = None) -> Any:
-        if get_origin(kind) is UnionType:  # a part that may be missing
-            kind = get_args(kind)[0]
-        if is_dataclass(kind):
-            return self.dataclass(kind, node, f'{where}.', before)
-        if get_origin(kind) is tuple:
-            return self._tuple(get_args(kind), node, where)
-        value = None
-        if isinstance(node, yaml.ScalarNode):
-            value = yaml.SafeLoader('').construct_object(node)
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, kind) or (kind is float and not math.isfinite(value)):
-            raise self._error(node, f'{where} = {self._shown(node)}: must be {_KINDS[kind]}')
-        return value
-
-    def _tuple(self, kinds: tuple[Any, ...], node: Any, where: str) -> tuple[Any, ...]:
+def _value(kind: Any, given: Any, where: str, before: Any = None) -> Any:
+    """Return a value of a declared type."""
+    if get_origin(kind) is UnionType:  # a part that may be missing
+        kind = get_args(kind)[0]
+    if is_dataclass(kind):
+        return _part(kind, given, where, before)
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
         endless = kinds[-1] is Ellipsis
-        if len(kinds) == 2 and not endless and isinstance(node, yaml.ScalarNode):
-            return (self._value(kinds[0], node, where),) * 2  # an interval of one value
-        if not isinstance(node, yaml.SequenceNode) or (
-                not endless and len(node.value) != len(kinds)):
-            size = '' if endless else f' of {len(kinds)} numbers'
-            raise self._error(node, f'{where} = {self._shown(node)}: must be a list{size}')
-        return tuple(self._value(kinds[0], item, f'{where}[{i}]')
-                     for i, item in enumerate(node.value))
-
-    def _shown(self, node: Any) -> str:
-        return repr(node.value) if isinstance(node, yaml.ScalarNode) else f'a {node.id}'
-
-    def _error(self, node: Any, problem: str) -> ScenarioError:
-        return ScenarioError(f'{self._path}:{node.start_mark.line + 1}: {problem}')
+        if len(kinds) == 2 and not endless and not isinstance(given, list):
+            given = [given, given]  # an interval of one value
+        if not isinstance(given, list) or not (endless or len(given) == len(kinds)):
+            raise ValueError(f'{where} = {given!r}: must be a list'
+                             + ('' if endless else f' of {len(kinds)} numbers'))
+        return tuple(_value(kinds[0], each, f'{where}[{i}]') for i, each in enumerate(given))
+    if kind is float and type(given) is int:
+        given = float(given)
+    if type(given) is not kind or (kind is float and not math.isfinite(given)):
+        raise ValueError(f'{where} = {given!r}: must be {_KINDS[kind]}')
+    return given
 
 
 def key_tables() -> str:
     """Return one table for each part of the file."""
-    return ''.join(_table(where, part) for where, part in _parts('', Scenario))
+    return '\n'.join(_table(where, part) for where, part in _parts('', Scenario))
 
 
-def _parts(where: str, part: type) -> Iterator[tuple[str, type]]:
-    """Yield a part and all that it holds, each with the key where it stands."""
+def _parts(where: str, part: Any) -> Iterator[tuple[str, Any]]:
+    """Yield a part and all that it holds, each with its key."""
     yield where, part
     hints = get_type_hints(part)
-    for field in fields(part):  # type: ignore[arg-type]
+    for field in fields(part):
         for kind in (hints[field.name], *get_args(hints[field.name])):
             if is_dataclass(kind):
-                below = f'{where}.{field.name}'.lstrip('.')
-                yield from _parts(below, kind)  # type: ignore[arg-type]
+                yield from _parts(f'{where}.{field.name}'.lstrip('.'), kind)
 
 
-def _table(where: str, part: type) -> str:
-    hints = get_type_hints(part)
-    title = f'`{where}`' if where else 'The file'
-    rows = [f'\n## {title}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
-            '| key | default | valid | meaning |', '|---|---|---|---|',
-            *(f'| `{field.name}` | {_default(field)} | {_valid(field, hints)} | '
-              f'{field.metadata.get("meaning", "")} |'
-              for field in fields(part) if field.name != 'name')]  # type: ignore[arg-type]
-    return '\n'.join(rows) + '\n'
-
-
-def _default(field: Field[Any]) -> str:
-    if field.default is MISSING and field.default_factory is MISSING:
-        return 'needed'
-    if field.default is MISSING or is_dataclass(field.default):
-        return 'see below'
-    return _shown(field.default)
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, tuple):
-        same = len(value) == 2 and value[0] == value[1]
-        return _shown(value[0]) if same else f'[{", ".join(map(_shown, value))}]' if value else (
-            'none')
-    if value is None:
-        return 'none'
-    return str(value).lower() if isinstance(value, bool) else (
-        f'{value:g}' if isinstance(value, float) else str(value))
-
-
-def _valid(field: Field[Any], hints: dict[str, Any]) -> str:
-    valid = field.metadata.get('valid')
-    if isinstance(valid, Range):
-        return f'[{valid.low:g}, {valid.high:g}] {valid.unit}'.strip()
-    if valid:
-        return ', '.join(valid)
-    kind = hints[field.name]
-    if is_dataclass(kind) or get_origin(kind) is UnionType:
-        return f'`{field.name}:` of keys'
-    if any(is_dataclass(each) for each in get_args(kind)):
-        return f'a list of `{field.name}`'
-    return {bool: 'true, false', str: 'a text'}.get(kind, '')
+def _table(where: str, part: Any) -> str:
+    rows = [f'\n## {where or "The file"}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
+            '| key | default | valid | meaning |', '|---|---|---|---|']
+    for field in fields(part):
+        default, valid = field.default, field.metadata.get('valid') or ''
+        if default is MISSING or is_dataclass(default):
+            default = 'needed' if field.default_factory is MISSING else 'see below'
+        if isinstance(valid, tuple):
+            valid = ', '.join(valid)
+        rows.append(f'| `{field.name}` | {default} | {valid} | '
+                    f'{field.metadata.get("meaning", "")} |')
+    return '\n'.join(rows)

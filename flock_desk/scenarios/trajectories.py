@@ -46,7 +46,6 @@ from flock_follower.geometry import (
     wrap_angle,
 )
 from flock_follower.planner.limits import limit_command
-from flock_follower.ranges import Range
 
 #: Time between samples of a track, s.
 STEP = 0.005
@@ -97,18 +96,8 @@ class Track:
         return (1.0 - f) * values[i] + f * values[i + 1]
 
     def _locate(self, time: float) -> tuple[int, float]:
-        last = len(self.positions) - 1
-        Range(0.0, last * STEP, 's').check('time', time)
-        i = min(int(time / STEP), last - 1)
+        i = min(int(time / STEP), len(self.positions) - 2)
         return i, time / STEP - i
-
-
-@dataclass(frozen=True)
-class LeaderAndFollower:
-    """A leader and the follower that flew behind it, over the same time."""
-
-    leader: Track
-    follower: Track
 
 
 @dataclass(frozen=True)
@@ -132,20 +121,17 @@ class Swing:
         return self.nearest + half * (1.0 - c), half * rate * s, half * rate**2 * c
 
 
-def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> LeaderAndFollower:
+def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> tuple[Track, Track]:
     """
-    Fly leader and follower for a duration, s; the seed moves the buffeting of their attitudes.
+    Return the tracks of leader and follower for a duration, s.
 
+    :param seed: of the buffeting of their attitudes.
     :param swing: the distance that the follower keeps, instead of obeying the flocking law.
-    :raises ValueError: if the duration is not in [0.1, 600] s.
     """
-    Range(0.1, 600.0, 's').check('duration', duration)
-    count = round(duration / STEP) + 1
-    rng = np.random.default_rng(seed)
-    p, v, a, heading = leader_course(_times(count))
-    leader = _track(p, v, a, heading, _buffeting(count, rng))
-    follower = _track(*_follow(p, v, heading, swing), _buffeting(count, rng))
-    return LeaderAndFollower(leader, follower)
+    times, rng = np.arange(round(duration / STEP) + 1) * STEP, np.random.default_rng(seed)
+    p, v, a, heading = leader_course(times)
+    return (_track(p, v, a, heading, _buffeting(times, rng)),
+            _track(*_follow(p, v, heading, swing), _buffeting(times, rng)))
 
 
 def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:
@@ -234,13 +220,12 @@ def attitude(specific_force: ArrayLike, yaw: float) -> Array:
     return matrix_to_quaternion(np.stack([np.cross(y, z), y, z], axis=1))
 
 
-def _buffeting(count: int, rng: np.random.Generator) -> Array:
-    """Return small rotation vectors (count, 3), rad: gusts and the attitude loops' response."""
-    times = _times(count)[:, None]
-    total = np.zeros((count, 3))
+def _buffeting(times: Array, rng: np.random.Generator) -> Array:
+    """Return small rotation vectors (N, 3), rad: gusts and the attitude loops' response."""
+    total = np.zeros((len(times), 3))
     for frequency in (1.3, 2.9, 5.3, 9.7):  # Hz
         amplitude = np.deg2rad(0.30) / frequency**0.5
-        total += amplitude * np.sin(2.0 * np.pi * (frequency * times + rng.random(3)))
+        total += amplitude * np.sin(2.0 * np.pi * (frequency * times[:, None] + rng.random(3)))
     return total
 
 
@@ -252,10 +237,6 @@ def _angular_velocities(quaternions: Array) -> Array:
     return np.array([quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before), after)) / step
         for before, after, step in zip(padded[:-2], padded[2:], steps)])
-
-
-def _times(count: int) -> Array:
-    return np.arange(count, dtype=float) * STEP
 
 
 def _rounded(values: Array) -> Array:

@@ -45,19 +45,14 @@ from flock_follower.geometry import (
     flu_to_frd,
     quaternion_enu_flu_to_ned_frd,
 )
-from flock_follower.ranges import Range
 
 STEP: Final[float] = 0.01  # s
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')
-SYSTEM_IDS: Final[Range] = Range(1, 255, whole=True)
-#: PX4 sends CURRENT_MODE at the most every so many seconds where the mode stays.
+#: PX4 sends CURRENT_MODE at the most every so many seconds while the mode stays.
 CURRENT_MODE_PERIOD: Final[float] = 0.5
-FORCE: Final[int] = 21196  # param2 that forces arming and disarming
-CAPACITY: Final[float] = 5.2  # Ah
-CURRENT: Final[float] = 18.0  # A in flight
+CURRENT, CAPACITY = 18.0, 5.2  # A, Ah
 _LONGEST_WAY: Final[int] = 1_000_000_000  # ns from a TIMESYNC question to its answer
-_CELLS: Final[int] = 4
-_UNKNOWN_VOLTAGE: Final[int] = 65535
+_CELLS, _UNKNOWN_VOLTAGE = 4, 65535
 LATITUDE, LONGITUDE = 47.397742, 8.545594  # degrees, of the local origin
 DEGREE: Final[float] = 111_320.0  # m along a meridian
 _NO_PARAMETERS: Final[Mapping[str, float]] = MappingProxyType({})
@@ -74,10 +69,10 @@ class EmbeddedAutopilot:
     :param altitude: m, of an airborne start.
     :param yaw: rad, ENU, at the start.
     :param parameters: values that differ from the autopilot's defaults.
-    :param arming_denial: where given, arming is refused with this reason.
+    :param arming_denial: if given, arming is refused with this reason.
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
-    :param signing: a pymavlink MAVLinkSigning, where the link is signed.
+    :param signing: a pymavlink MAVLinkSigning, if the link is signed.
     :raises ValueError: for an unknown personality, start or parameter.
     """
 
@@ -89,7 +84,6 @@ class EmbeddedAutopilot:
                                    ('start', start, STARTS)):
             if value not in valid:
                 raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
-        SYSTEM_IDS.check('system_id', system_id)
         self._profile = PROFILES[personality]
         self._parameters = Parameters(self._profile)
         for name, number in parameters.items():
@@ -101,8 +95,8 @@ class EmbeddedAutopilot:
         self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
                                  self._profile.tilt_max)
         self.barometer = Barometer([np.random.default_rng([seed, 1])])
-        self.charge: float | None = 1.0
-        """Remaining charge of the battery, a share; None: unknown. A reboot keeps it."""
+        self.charge = 1.0
+        """Remaining charge of the battery, a share; it does not change by itself."""
         self._codec = mavlink.MAVLink(
             None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._codec.robust_parsing = True
@@ -134,8 +128,6 @@ class EmbeddedAutopilot:
         else:
             controller.step(now)
             messages = self._due_messages(now)
-        if controller.armed and self.charge is not None:
-            self.charge = max(0.0, self.charge - CURRENT / CAPACITY * STEP / 3600.0)
         self.log.moved(now, vehicle.position, vehicle.velocity, vehicle.acceleration, vehicle.yaw,
                        controller.armed, controller.mode)
         return self._packed(messages)
@@ -157,7 +149,7 @@ class EmbeddedAutopilot:
                            for message, rate in profile.rates.items()}
         self._due = {message: now if math.isfinite(interval) else math.inf
                      for message, interval in self._intervals.items()}
-        self._mode_sent = self.controller.mode, now
+        self._shown_mode = self.controller.mode
         self._clock_offset: float | None = None
         self._codec.seq = 0
 
@@ -181,7 +173,7 @@ class EmbeddedAutopilot:
                 controller.estimator.on_odometry(
                     message, now, 0.0 if self._clock_offset is None else
                     now - self._booted - message.time_usec * 1e-6 - self._clock_offset)
-            case 'PARAM_REQUEST_READ' | 'PARAM_SET':
+            case 'PARAM_REQUEST_READ':
                 return self._parameters.answer(message)
             case 'TIMESYNC':
                 return self._answer_timesync(message, now)
@@ -206,78 +198,58 @@ class EmbeddedAutopilot:
 
     def _due_messages(self, now: float) -> list[Any]:
         messages = self._status_texts()
-        self._note_mode(now)
+        if self.controller.mode != self._shown_mode:  # each change is shown at once
+            self._shown_mode = self.controller.mode
+            self._due[self._profile.mode_message] = now
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
-                messages += self._message(message_id, now)
+                name = _NAMES[message_id]
+                if fields := self._status(name, now) or self._motion(name, now):
+                    messages.append(mavlink.mavlink_map[message_id](*fields))
                 # From the time it was due: the mean rate is exact.
                 interval = self._intervals[message_id]
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
         return messages
 
-    def _note_mode(self, now: float) -> None:
-        """Send the message with the mode at each change, as PX4 1.16 and ArduCopter 4.7 do."""
-        mode, time = self._mode_sent
-        news = mode != self.controller.mode
-        if not self._profile.px4:
-            self._mode_sent = self.controller.mode, now
-            if news:
-                self._due[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = now
-            return
-        interval = self._intervals[mavlink.MAVLINK_MSG_ID_CURRENT_MODE]
-        due = time + (interval if news else max(interval, CURRENT_MODE_PERIOD))
-        if now >= due - 0.5 * STEP:
-            self._mode_sent = self.controller.mode, now
-        self._due[mavlink.MAVLINK_MSG_ID_CURRENT_MODE] = due
-
     def _status_texts(self) -> list[Any]:
-        texts, self.controller.outbox = self.controller.outbox, []
-        return texts
+        texts, self.controller.texts = self.controller.texts, []
+        return [mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode())
+                for text in texts]
 
     def _command(self, message: Any, now: float) -> list[Any]:
-        results = self._obey(message, now)
-        reply = message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and results == [ACCEPTED]
+        controller = self.controller
+        match message.command:
+            case mavlink.MAV_CMD_DO_SET_MODE:
+                results = controller.command_mode(
+                    (message.param1, message.param2, message.param3), now)
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+                results = [controller.arm(message.param1 > 0.5, now)]
+            case mavlink.MAV_CMD_NAV_TAKEOFF:
+                results = [controller.take_off(message.param7, now)]
+            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                results = [self._set_interval(message.param1, message.param2, now)]
+            case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
+                controller.check_arming(now)
+                results = [ACCEPTED]
+            case _:
+                results = [int(mavlink.MAV_RESULT_UNSUPPORTED)]
         return [*self._status_texts(), *(mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
-            for result in results), *(self._message(int(message.param1), now) if reply else [])]
-
-    def _obey(self, message: Any, now: float) -> list[int]:
-        controller, command = self.controller, message.command
-        if command == mavlink.MAV_CMD_DO_SET_MODE:
-            return controller.command_mode((message.param1, message.param2, message.param3), now)
-        if command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
-            return [controller.arm(message.param1 > 0.5, message.param2 == FORCE, now)]
-        if command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            return [controller.take_off(message.param7, now)]
-        if command in self._profile.commands:
-            return [controller.change_mode(self._profile.commands[command], now)]
-        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            return [self._set_interval(message.param1, message.param2, now)]
-        if command == mavlink.MAV_CMD_REQUEST_MESSAGE and message.param1 in self._intervals:
-            return [ACCEPTED]
-        if command == mavlink.MAV_CMD_RUN_PREARM_CHECKS:
-            return [controller.run_checks(now)]
-        return [int(mavlink.MAV_RESULT_UNSUPPORTED)]
+            for result in results)]
 
     def _set_interval(self, message_id: float, microseconds: float, now: float) -> int:
         # The HEARTBEAT of PX4 stays at 1 Hz.
         fixed = self._profile.px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
-        if message_id not in self._intervals or math.isnan(microseconds) or fixed:
+        if message_id not in self._intervals or not microseconds > 0.0 or fixed:
             return self._profile.unknown_message
-        number, rate = int(message_id), self._profile.rates[int(message_id)]
-        interval = (1.0 / rate if rate else math.inf) if microseconds == 0 else (
-            max(microseconds * 1e-6, STEP) if microseconds > 0 else math.inf)
-        self._intervals[number] = interval
-        self._due[number] = now if math.isfinite(interval) else math.inf
+        slowest = (CURRENT_MODE_PERIOD if message_id == mavlink.MAVLINK_MSG_ID_CURRENT_MODE
+                   else STEP)
+        self._intervals[int(message_id)] = max(microseconds * 1e-6, slowest)
+        self._due[int(message_id)] = now
         return ACCEPTED
 
     def _boot_ms(self, now: float) -> int:
         return round((now - self._booted) * 1e3)
-
-    def _message(self, message_id: int, now: float) -> list[Any]:
-        """Return the message with an id; an empty list if it has no content."""
-        fields = self._status(_NAMES[message_id], now) or self._motion(_NAMES[message_id], now)
-        return [mavlink.mavlink_map[message_id](*fields)] if fields else []
 
     def _motion(self, name: str, now: float) -> tuple[Any, ...]:
         """Return the fields of a message about the motion; () if it is not known."""
@@ -306,7 +278,6 @@ class EmbeddedAutopilot:
     def _status(self, name: str, now: float) -> tuple[Any, ...]:
         """Return the fields of a message about the vehicle's state; () for others."""
         controller, profile = self.controller, self._profile
-        estimator = controller.estimator
         match name:
             case 'HEARTBEAT':
                 armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if controller.armed else 0
@@ -320,52 +291,29 @@ class EmbeddedAutopilot:
             case 'SCALED_PRESSURE':
                 height = self.barometer.heights(self.vehicle.position[2:] + GROUND_AMSL, now)[0]
                 return self._boot_ms(now), pressure(height), 0.0, 1181
-            case 'AUTOPILOT_VERSION':
-                major, minor = profile.version
-                return (profile.encoding | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-                        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED,
-                        major << 24 | minor << 16 | 255, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8,
-                        0, 0, 0)
             case 'EKF_STATUS_REPORT':
                 return self.estimator_flags(now), 0.0, 0.0, 0.0, 0.0, 0.0
             case 'ESTIMATOR_STATUS':
-                # Measured: nothing is compared any more, and the accuracy grows from centimetres.
-                started, age = estimator.started(now), estimator.vision_age(now)
-                ratio, accuracy = (0.02, 0.03) if controller.conditions(now)['aided'] else (
-                    math.nan, min(0.022 * age**2, 100.0) if started else 100.0)
+                # Without aiding nothing is compared any more, and the accuracy grows.
+                ratio, accuracy = ((0.02, 0.03) if controller.conditions(now)['aided']
+                                   else (math.nan, 100.0))
                 return (self._boot_ms(now) * 1000, self.estimator_flags(now), ratio, ratio,
                         0.01, 0.02, 0.01, math.nan, accuracy, 0.1)
             case 'CURRENT_MODE':
                 return 0, *(profile.modes[each].number
                             for each in (controller.mode, controller.chosen))
-            case 'SYS_STATUS' | 'BATTERY_STATUS':
-                return self._power(name, now)
+            case 'BATTERY_STATUS':
+                cell, used = round(1e3 * (3.5 + 0.7 * self.charge)), 1.0 - self.charge
+                return (0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767,
+                        [cell] * _CELLS + [_UNKNOWN_VOLTAGE] * (10 - _CELLS),
+                        round(1e2 * CURRENT), round(1e3 * used * CAPACITY), -1,
+                        round(1e2 * self.charge))
         return ()
 
     def estimator_flags(self, now: float) -> int:
         """Return the flags of ESTIMATOR_STATUS, or of ArduPilot's EKF_STATUS_REPORT."""
         met = self.controller.conditions(now)
         return sum(bits for name, bits in self._profile.estimator_flags.items() if met[name])
-
-    def _power(self, name: str, now: float) -> tuple[Any, ...]:
-        """Return the fields of SYS_STATUS or BATTERY_STATUS."""
-        charge, controller = self.charge, self.controller
-        current = round(1e2 * (CURRENT if controller.armed else 0.5))  # cA
-        cell, percent = (_UNKNOWN_VOLTAGE, -1) if charge is None else (
-            round(1e3 * (3.5 + 0.7 * charge)), round(1e2 * charge))  # mV
-        if name == 'BATTERY_STATUS':
-            voltages = [cell] * _CELLS + [_UNKNOWN_VOLTAGE] * (10 - _CELLS)
-            return (0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767,
-                    voltages, current, round(1e3 * (1.0 - max(percent, 0) / 1e2) * CAPACITY), -1,
-                    percent)
-        checks, place = (mavlink.MAV_SYS_STATUS_PREARM_CHECK,
-                         mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL)
-        # PX4 neither has nor enables the check: only its health counts.
-        there = place | (0 if self._profile.px4 else checks)
-        well = ((place if controller.position_known(now) else 0)
-                | (0 if controller.unfit(now) else checks))
-        return (there, there, well, 250, cell if percent < 0 else _CELLS * cell, current, percent,
-                0, 0, 0, 0, 0, 0)
 
 
 def global_position(position: Array) -> tuple[int, int, int]:

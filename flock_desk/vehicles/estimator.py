@@ -66,7 +66,8 @@ class Estimator:
                  ready_at: float) -> None:
         self._vehicle, self._profile = vehicle, profile
         self.uses_vision = uses_vision
-        self._ready_at = ready_at
+        self.ready_at = ready_at
+        """Since when it runs, s, with or without aiding."""
         self._position_error: Array = np.zeros(3)
         self._velocity_error: Array = np.zeros(3)
         self.yaw_error = 0.0
@@ -97,37 +98,26 @@ class Estimator:
         """Return the time since the last valid vision, s; 0 if it does not use vision."""
         return now - self._vision_time if self.uses_vision else 0.0
 
-    def started(self, now: float) -> bool:
-        """Return whether it runs, be it without anything to rest on."""
-        return now >= self._ready_at
-
-    def to_true_frame(self, acceleration: Array) -> Array:
-        """Return a vector of the estimate's frame as it acts in the world."""
-        return quaternion_to_matrix(quaternion_from_yaw(-self.yaw_error)) @ acceleration
-
     def on_odometry(self, message: Any, now: float, age: float) -> None:
         """Take an ODOMETRY of an age, s, if it is one that the autopilot uses."""
-        profile = self._profile
-        w, x, y, z = message.q
-        numbers = [message.x, message.y, message.z, message.vx, message.vy, message.vz]
+        profile, (w, x, y, z) = self._profile, message.q
         # PX4 wants the six variances on the diagonals.
         filled = not profile.px4 or all(
             math.isfinite(matrix[i]) and matrix[i] > 0.0 for i in (0, 6, 11, 15, 18, 20)
             for matrix in (message.pose_covariance, message.velocity_covariance))
         if (not self.uses_vision or not -_FUTURE <= age <= profile.oldest_vision or not filled
                 or message.frame_id not in profile.frames
-                or message.child_frame_id != mavlink.MAV_FRAME_BODY_FRD
-                or not np.all(np.isfinite([*numbers, *message.q]))
-                or math.hypot(w, x, y, z) < 0.5):
+                or message.child_frame_id != mavlink.MAV_FRAME_BODY_FRD):
             return
         attitude = quaternion_ned_frd_to_enu_flu(normalize_quaternion([x, y, z, w]))
-        innovation = ned_to_enu(numbers[:3]) - self.position
+        innovation = ned_to_enu([message.x, message.y, message.z]) - self.position
         starts = message.reset_counter != self._reset_counter
         if not starts and np.linalg.norm(innovation) > INNOVATION_GATE:
             return
         gain = 1.0 if starts else -math.expm1(
             -min(now - self._vision_time, VISION_TIMEOUT) / _TIME_CONSTANT)
-        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(numbers[3:])
+        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(
+            [message.vx, message.vy, message.vz])
         self._position_error = self._position_error + gain * innovation
         self._velocity_error = self._velocity_error + gain * (velocity - self.velocity)
         self.yaw_error = wrap_angle(
@@ -161,8 +151,6 @@ class Barometer:
     """
 
     def __init__(self, generators: Sequence[np.random.Generator]) -> None:
-        self.offset = 0.0
-        """Added to every height, m: a step of the pressure, for tests."""
         self._generators = generators
         self._drift: Array = np.zeros(len(generators))
         self._time: float | None = None
@@ -173,7 +161,7 @@ class Barometer:
         keep = 1.0 if self._time is None else math.exp(-(now - self._time) / DRIFT_TIME)
         self._time = now
         self._drift = keep * self._drift + DRIFT * math.sqrt(1.0 - keep ** 2) * drawn[:, 0]
-        measured: Array = true + self.offset + self._drift + NOISE * drawn[:, 1]
+        measured: Array = true + self._drift + NOISE * drawn[:, 1]
         return measured
 
 

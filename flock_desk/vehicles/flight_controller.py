@@ -1,8 +1,22 @@
-"""
-Modes, arming and control of an embedded autopilot; PX4 and ArduCopter differ by their profiles.
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
 
-What no table can say is in ``px4`` and ``arducopter``: setpoints, take-off, landing, failsafes.
-ENU throughout; the time is given.
+"""
+One flight controller, as a companion computer meets it: modes, arming, and how its modes fly.
+
+The measured reactions are in docs/autopilots.md. ``px4`` and ``arducopter`` add their rules for
+setpoints, take-off, landing and failsafes. ENU; the time is given.
 """
 
 from __future__ import annotations
@@ -17,7 +31,15 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_desk.vehicles.estimator import Estimator
 from flock_desk.vehicles.profiles import HOLD, LAND, Parameters, Profile, SETPOINTS
 from flock_desk.vehicles.quadrotor import Quadrotor
-from flock_follower.geometry import Array, GRAVITY, ned_to_enu, wrap_angle, yaw_ned_to_enu
+from flock_follower.geometry import (
+    Array,
+    GRAVITY,
+    ned_to_enu,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    wrap_angle,
+    yaw_ned_to_enu,
+)
 
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
 VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])
@@ -29,35 +51,34 @@ _AIDED: Final[float] = 0.55  # s without vision until PX4 compares its estimate 
 ARRIVED: Final[float] = 0.1  # m below the take-off altitude
 #: The acceleration, m/s^2, for which motors idle.
 IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
-_NOWHERE: Final[Array] = np.full(3, math.nan)
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
+#: Of a type mask: the bits of position, velocity, acceleration and force, and those that ignore
+#: all but the acceleration.
+_WHICH, _ACCELERATION = 0x3FF, 0x03F
+#: ArduCopter's words for a condition that is not met.
+_REASONS: Final = {'permission': '{denial}', 'vision': 'VisOdom: not healthy',
+                   'armable': '{mode} mode not armable', 'position': 'Need Position Estimate'}
 
 
-class TrackedSetpoint(NamedTuple):
-    """A setpoint, ENU; NaN if an axis is not given."""
+class FlownSetpoint(NamedTuple):
+    """An acceleration (3,), m/s^2, ENU, and a yaw, rad, NaN if none is given."""
 
-    position: Array = _NOWHERE
-    velocity: Array = _NOWHERE
-    acceleration: Array = _NOWHERE
-    yaw: float = math.nan
-    yaw_rate: float = math.nan
+    acceleration: Array
+    yaw: float
 
 
-def decode_setpoint(message: Any) -> TrackedSetpoint | None:
-    """Return a SET_POSITION_TARGET_LOCAL_NED; None for other frames, and acceleration as force."""
+def decode_setpoint(message: Any) -> FlownSetpoint | None:
+    """
+    Return the acceleration in a SET_POSITION_TARGET_LOCAL_NED; None for whatever else it holds.
+
+    Setpoints of position, velocity and yaw rate, which the bridge never sends, are not simulated.
+    """
     mask = message.type_mask
-    if (message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED
-            or mask & mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET):
+    if message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED or mask & _WHICH != _ACCELERATION:
         return None
-    values = [message.x, message.y, message.z, message.vx, message.vy, message.vz,
-              message.afx, message.afy, message.afz]
-    ned = np.array([math.nan if mask >> i & 1 else v for i, v in enumerate(values)])
     yaw = not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE and math.isfinite(message.yaw)
-    rate = not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
-    position, velocity, acceleration = ned_to_enu(ned.reshape(3, 3))
-    return TrackedSetpoint(position, velocity, acceleration,
-                           yaw_ned_to_enu(message.yaw) if yaw else math.nan,
-                           -message.yaw_rate if rate else math.nan)
+    return FlownSetpoint(ned_to_enu([message.afx, message.afy, message.afz]),
+                         yaw_ned_to_enu(message.yaw) if yaw else math.nan)
 
 
 class FlightController(ABC):
@@ -65,7 +86,7 @@ class FlightController(ABC):
     One vehicle's flight controller.
 
     :param armed: whether it starts armed; airborne vehicles must.
-    :param arming_denial: where given, arming is refused with this reason.
+    :param arming_denial: if given, arming is refused with this reason.
     :param ready_at: time, s, before which there is no estimate.
     """
 
@@ -74,13 +95,14 @@ class FlightController(ABC):
     def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool, parameters: Parameters,
                  arming_denial: str = '', ready_at: float = 0.0) -> None:
         self.vehicle, self.parameters, self.armed = vehicle, parameters, armed
-        self.arming_denial = arming_denial
+        self._arming_denial = arming_denial
         airborne = not bool(vehicle.landed)
         self.mode = self.chosen = self.PROFILE.starts[airborne]
         """The mode that is flown, and the one last requested: a failsafe may fly another."""
-        self.in_failsafe = False
-        self.outbox: list[Any] = []
-        """Messages that it sends by itself."""
+        self.in_failsafe, self.on_ground = False, not airborne
+        """Whether a failsafe flies it; whether it counts itself as landed."""
+        self.texts: list[str] = []
+        """Texts for STATUSTEXT; the owner empties it."""
         self.wind: Array = np.zeros(3)
         """Velocity of the air (3,), m/s, ENU."""
         self.estimator = Estimator(vehicle, self.PROFILE, all(
@@ -88,26 +110,21 @@ class FlightController(ABC):
             now, ready_at)
         self.has_origin = not self.estimator.uses_vision
         """Whether it has a global origin: by GPS, or by SET_GPS_GLOBAL_ORIGIN."""
-        self._time = now
-        self._yaw = vehicle.yaw
-        self._place: Array | None = vehicle.position.copy()
         self.home: Array = vehicle.position * [1.0, 1.0, 0.0]
         """Where it was armed (3,), m, in the frame of the estimate."""
+        self._time = self._landed_since = now
+        self._yaw: float = vehicle.yaw
+        self._place: Array | None = vehicle.position.copy()
         self._flown = airborne
-        self._landed_since = now
-        self._climb_limit = math.inf  # m/s, for position and velocity setpoints
-        self._setpoint, self._setpoint_time = TrackedSetpoint(), -math.inf
+        self._climb_limit = math.inf  # m/s
+        self._setpoint, self._setpoint_time = FlownSetpoint(np.zeros(3), math.nan), -math.inf
 
     @property
     def system_status(self) -> int:
         """Return the MAV_STATE of HEARTBEAT."""
         if self.in_failsafe:
             return int(mavlink.MAV_STATE_CRITICAL)
-        # PX4 is active from arming on, ArduCopter in the air.
-        if self.armed if self.PROFILE.px4 else self._flown:
-            return int(mavlink.MAV_STATE_ACTIVE)
-        unfit = self.PROFILE.px4 and self.unfit(self._time)
-        return int(mavlink.MAV_STATE_UNINIT if unfit else mavlink.MAV_STATE_STANDBY)
+        return int(mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY)
 
     @property
     def landed_state(self) -> int:
@@ -120,14 +137,10 @@ class FlightController(ABC):
                    else mavlink.MAV_LANDED_STATE_IN_AIR)
 
     @property
-    @abstractmethod
-    def on_ground(self) -> bool:
-        """Return whether it counts itself as landed."""
-
-    @property
-    @abstractmethod
     def taking_off(self) -> bool:
         """Return whether it climbs to the altitude of its take-off."""
+        return bool(self.mode == self.PROFILE.takeoff and self._place is not None
+                    and self.estimator.position[2] < self._place[2] - ARRIVED)
 
     @abstractmethod
     def on_setpoint(self, message: Any, now: float) -> None:
@@ -141,30 +154,30 @@ class FlightController(ABC):
     def _supervise(self, now: float) -> None:
         """Change the mode where a failsafe does."""
 
-    @abstractmethod
     def _fly_setpoints(self, now: float, dt: float) -> Array:
         """Return the acceleration (3,), m/s^2, of the mode that obeys setpoints."""
+        return self._setpoint.acceleration
+
+    @abstractmethod
+    def _detect_ground(self, wanted: Array, dt: float) -> None:
+        """Update ``on_ground`` after a step with a wanted acceleration (3,), m/s^2."""
 
     @property
     @abstractmethod
     def _disarms_after(self) -> float:
         """Return after how long on the ground it disarms, s."""
 
-    def run_checks(self, now: float) -> int:
-        """Obey MAV_CMD_RUN_PREARM_CHECKS; return the MAV_RESULT."""
-        return ACCEPTED
-
     def position_known(self, now: float) -> bool:
         """Return whether there is an estimate, and vision, where it needs it, not long gone."""
         timeout = self.PROFILE.position_timeout + 1e-6 * self.parameters.get('EKF2_NOAID_TOUT', 0)
-        return self.estimator.started(now) and self.estimator.vision_age(now) <= timeout
+        return now >= self.estimator.ready_at and self.estimator.vision_age(now) <= timeout
 
     def conditions(self, now: float) -> dict[str, bool]:
         """Return which conditions of modes, arming and reports are met."""
         known, age = self.position_known(now), self.estimator.vision_age(now)
-        started = self.estimator.started(now)
-        reported, aided = (started and age <= t for t in (self.PROFILE.reports_for, _AIDED))
-        return {'permission': self.armed or not self.arming_denial,
+        reported, aided = (now >= self.estimator.ready_at and age <= t
+                           for t in (self.PROFILE.reports_for, _AIDED))
+        return {'permission': self.armed or not self._arming_denial,
                 'vision': age <= _VISION_HEALTHY,
                 'armable': self.armed or self.PROFILE.modes[self.mode].arms,
                 'position': known, 'global': known and self.has_origin,
@@ -177,9 +190,13 @@ class FlightController(ABC):
         met = self.conditions(now)
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 
-    def unfit(self, now: float) -> list[str]:
-        """Return the conditions that prevent arming."""
-        return self.missing(self.mode, now, self.PROFILE.arming)
+    def check_arming(self, now: float, title: str = 'PreArm') -> list[str]:
+        """Return the conditions that prevent arming; ArduCopter says the first."""
+        missing = self.missing(self.mode, now, self.PROFILE.arming)
+        if missing and not self.PROFILE.px4:
+            reason = _REASONS[missing[0]].format(denial=self._arming_denial, mode=self.mode)
+            self.texts.append(f'{title}: {reason}')
+        return missing
 
     def command_mode(self, params: tuple[float, ...], now: float) -> list[int]:
         """Obey MAV_CMD_DO_SET_MODE; return the MAV_RESULT of each COMMAND_ACK."""
@@ -191,23 +208,23 @@ class FlightController(ABC):
             result = int(mavlink.MAV_RESULT_UNSUPPORTED if px4 else mavlink.MAV_RESULT_DENIED)
         else:
             result = self.change_mode(name, now) if name else self.PROFILE.refused
-        # The first of PX4 says accepted, whatever becomes of it.
+        # The first of PX4 is always ACCEPTED.
         return [ACCEPTED, result] if px4 else [result]
 
     def change_mode(self, name: str, now: float) -> int:
         """Change the mode, disarmed to any, armed to one that can be flown; return MAV_RESULT."""
         if self.armed and self.missing(name, now):
+            if not self.PROFILE.px4:
+                self.texts.append(f'Mode change to {name} failed: requires position')
             return self.PROFILE.refused
         self._choose(name, now)
         return ACCEPTED
 
-    def arm(self, value: bool, force: bool, now: float) -> int:
-        """Arm where the checks pass; disarm on the ground, or forced; return the MAV_RESULT."""
+    def arm(self, value: bool, now: float) -> int:
+        """Arm if the checks pass; disarm on the ground; return the MAV_RESULT."""
         if value == self.armed:
             return ACCEPTED
-        # PX4 checks a companion computer's forced arming all the same.
-        if (self.unfit(now) and (self.PROFILE.px4 or not force) if value
-                else not self.on_ground and not force):
+        if self.check_arming(now, 'Arm') if value else not self.on_ground:
             return self.PROFILE.refused
         self._landed_since = now
         if value:
@@ -216,16 +233,10 @@ class FlightController(ABC):
             self._disarm(now)
         return ACCEPTED
 
-    def pilot_switches(self, name: str, climb: float = 0.0) -> None:
-        """
-        Change the mode by remote control, which no check holds up.
-
-        :param climb: how far the pilot then climbs, m, from where the vehicle is.
-        """
+    def pilot_switches(self, name: str) -> None:
+        """Change the mode by remote control, which no check prevents."""
         self._enter(name)
         self.in_failsafe = False
-        if climb:
-            self._place = self.estimator.position + np.array([0.0, 0.0, climb])
 
     def step(self, now: float) -> None:
         """Fly on to ``now``, s, not before the time of the last step."""
@@ -237,9 +248,12 @@ class FlightController(ABC):
         if not self.armed and self.position_known(now):
             self.home = self.estimator.position
         self._supervise(now)
-        acceleration = self.estimator.to_true_frame(self._control(now, dt))
-        self.vehicle.step(acceleration, wrap_angle(self._yaw - self.estimator.yaw_error), dt,
-                          powered=self.armed, wind=self.wind)
+        wanted = self._control(now, dt)
+        self._detect_ground(wanted, dt)
+        # From the frame of the estimate to the true one.
+        error = self.estimator.yaw_error
+        self.vehicle.step(quaternion_to_matrix(quaternion_from_yaw(-error)) @ wanted,
+                          wrap_angle(self._yaw - error), dt, powered=self.armed, wind=self.wind)
         self._flown = self.armed and (self._flown or not self.vehicle.landed)
         if not (self.armed and self.vehicle.landed and self._rests):
             self._landed_since = now
@@ -265,47 +279,36 @@ class FlightController(ABC):
         self._place = None
         self._yaw = self.estimator.yaw
 
+    @property
+    def _flies(self) -> str:
+        return self.PROFILE.modes[self.mode].flies
+
     def _control(self, now: float, dt: float) -> Array:
         """Return the wanted acceleration (3,), m/s^2, in the frame of the estimate."""
         flies, (parameter, unit) = self._flies, self.PROFILE.landing_speed
         if flies == SETPOINTS:
+            if math.isfinite(self._setpoint.yaw):
+                self._yaw = self._setpoint.yaw
             return self._fly_setpoints(now, dt)
         if flies == HOLD:
             return self._hold()
         descent = -self.parameters[parameter] * unit if flies == LAND else 0.0
-        if flies == LAND and self.position_known(now):
-            return self._track(TrackedSetpoint(velocity=np.array([0.0, 0.0, descent])))
-        # Level; without a position it lands so, too.
-        return self._track(TrackedSetpoint(velocity=np.array([math.nan, math.nan, descent]),
-                                           acceleration=np.array([0.0, 0.0, math.nan])))
-
-    @property
-    def _flies(self) -> str:
-        return self.PROFILE.modes[self.mode].flies
+        wanted = self._track(np.array([0.0, 0.0, descent]))
+        if flies != LAND or not self.position_known(now):
+            wanted[:2] = 0.0  # level; without a position it lands so, too
+        return wanted
 
     def _hold(self) -> Array:
         """Return the acceleration that stops, and keeps the place."""
         estimate = self.estimator
         if self._place is None and np.linalg.norm(estimate.velocity) < _CAPTURE_SPEED:
             self._place = estimate.position.copy()
-        return self._track(TrackedSetpoint(velocity=np.zeros(3)) if self._place is None
-                           else TrackedSetpoint(position=self._place))
+        towards = np.zeros(3) if self._place is None else (
+            POSITION_GAIN * (self._place - estimate.position))
+        return self._track(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX))
 
-    def _track(self, setpoint: TrackedSetpoint) -> Array:
-        """Return the acceleration of PX4's cascade: position, velocity and acceleration add."""
-        estimate = self.estimator
-        towards = POSITION_GAIN * (setpoint.position - estimate.position)
-        velocity = _sum(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX), setpoint.velocity)
-        velocity[2] = np.minimum(velocity[2], self._climb_limit)  # NaN stays
-        return _sum(VELOCITY_GAIN * (velocity - estimate.velocity), setpoint.acceleration)
-
-    def _follow_yaw(self, dt: float) -> None:
-        if math.isfinite(self._setpoint.yaw):
-            self._yaw = self._setpoint.yaw
-        elif math.isfinite(self._setpoint.yaw_rate):
-            self._yaw = wrap_angle(self._yaw + self._setpoint.yaw_rate * dt)
-
-
-def _sum(a: Array, b: Array) -> Array:
-    """Return a + b, where NaN counts as absent and both absent as NaN."""
-    return np.where(np.isnan(a), b, np.where(np.isnan(b), a, a + b))
+    def _track(self, velocity: Array) -> Array:
+        """Return the acceleration that leads to a velocity (3,), m/s."""
+        velocity[2] = min(velocity[2], self._climb_limit)
+        wanted: Array = VELOCITY_GAIN * (velocity - self.estimator.velocity)
+        return wanted

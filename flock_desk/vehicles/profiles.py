@@ -17,15 +17,13 @@ What distinguishes the embedded autopilots, as tables: measured, see docs/autopi
 
 Written out here, not taken from the bridge: a mistake there must not hide itself.
 
-PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE), ArduPilot the number itself. A decoder that uses
-the wrong encoding reads 1 as 1.4e-45.
+PARAM_VALUE carries every parameter in a float. PX4 puts the four bytes of an integer there,
+ArduPilot the number itself. A decoder that uses the wrong encoding reads 1 as 1.4e-45.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-import contextlib
 from dataclasses import dataclass
 import math
 import struct
@@ -45,11 +43,10 @@ INT16: Final[int] = mavlink.MAV_PARAM_TYPE_INT16
 INT32: Final[int] = mavlink.MAV_PARAM_TYPE_INT32
 #: Rates, Hz, of the messages of both; SET_MESSAGE_INTERVAL changes them. 0: only on request.
 _RATES: Final[Mapping[int, float]] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0, mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0, mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 50.0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: 0.0, mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 0.0,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 0.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 0.0, mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.0,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 0.0}
 
@@ -71,20 +68,19 @@ class Profile:
 
     autopilot: int
     """MAV_AUTOPILOT."""
-    version: tuple[int, int]
     modes: Mapping[str, Mode]
-    commands: Mapping[int, str]
-    """The mode that a MAV_CMD chooses."""
     starts: tuple[str, str]
     """The modes in which it begins on the ground, and in the air."""
+    takeoff: str
+    """The mode in which it takes off."""
     parameters: Mapping[str, tuple[int, float]]
     """Type and default by name."""
-    encoding: int
-    """MAV_PROTOCOL_CAPABILITY of integer parameters."""
     landing_speed: tuple[str, float]
     """Its parameter, and the unit of that, m/s."""
     rates: Mapping[int, float]
     """Hz, by message id; 0: once it is asked for."""
+    mode_message: int
+    """Message id that shows a change of the mode at once."""
     arming: tuple[str, ...]
     """The conditions of arming, besides those of the mode."""
     refused: int
@@ -120,7 +116,7 @@ def _px4(main: int, sub: int = 0) -> int:
 
 
 PX4: Final = Profile(
-    autopilot=mavlink.MAV_AUTOPILOT_PX4, version=(1, 16),
+    autopilot=mavlink.MAV_AUTOPILOT_PX4,
     modes={
         'MANUAL': Mode(_px4(1), LEVEL, ('sticks',)), 'ALTCTL': Mode(_px4(2), LEVEL, ('sticks',)),
         'POSCTL': Mode(_px4(3), HOLD, ('position', 'sticks')),
@@ -129,9 +125,7 @@ PX4: Final = Profile(
         'AUTO.LAND': Mode(_px4(4, 6), LAND, arms=False),
         'OFFBOARD': Mode(_px4(6), SETPOINTS, ('stream',)),
         'STABILIZED': Mode(_px4(7), LEVEL, ('sticks',))},
-    commands={mavlink.MAV_CMD_NAV_LAND: 'AUTO.LAND',
-              mavlink.MAV_CMD_NAV_LOITER_UNLIM: 'AUTO.LOITER'},
-    starts=('AUTO.LOITER', 'AUTO.LOITER'),
+    starts=('AUTO.LOITER', 'AUTO.LOITER'), takeoff='AUTO.TAKEOFF',
     # Some are here to be read only: the failsafes of transmitter, ground station and battery, and
     # the geofence, are not simulated.
     parameters={
@@ -164,13 +158,12 @@ PX4: Final = Profile(
         'NAV_DLL_ACT': (INT32, 0),            # without a ground station; 0: nothing
         'NAV_RCL_ACT': (INT32, 2),            # without a transmitter; 1: Hold, 2: Return, 3: Land
     },
-    encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
     landing_speed=('MPC_LAND_SPEED', 1.0),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0,
            mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5, mavlink.MAVLINK_MSG_ID_CURRENT_MODE: 0.5},
-    arming=('permission', 'armable'),
+    mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, arming=('permission', 'armable'),
     refused=mavlink.MAV_RESULT_TEMPORARILY_REJECTED, unknown_message=mavlink.MAV_RESULT_FAILED,
     vision={'EKF2_GPS_CTRL': 0},
     frames=(mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD),
@@ -181,14 +174,13 @@ PX4: Final = Profile(
     tilt_max=math.radians(45.0))  # MPC_TILTMAX_AIR
 
 ARDUCOPTER: Final = Profile(
-    autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, version=(4, 7),
+    autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     modes={
         'STABILIZE': Mode(0, LEVEL), 'ALT_HOLD': Mode(2, LEVEL),
         'GUIDED': Mode(4, SETPOINTS, ('position',)), 'LOITER': Mode(5, HOLD, ('position',)),
         'LAND': Mode(9, LAND, arms=False), 'POSHOLD': Mode(16, HOLD, ('position',)),
         'BRAKE': Mode(17, HOLD, ('position',), arms=False)},
-    commands={mavlink.MAV_CMD_NAV_LAND: 'LAND', mavlink.MAV_CMD_NAV_LOITER_UNLIM: 'LOITER'},
-    starts=('STABILIZE', 'LOITER'),
+    starts=('STABILIZE', 'LOITER'), takeoff='GUIDED',
     parameters={
         'AHRS_EKF_TYPE': (INT8, 3),
         'BATT_CRT_MAH': (FLOAT, 0.0),         # mAh; 0: no limit
@@ -219,11 +211,10 @@ ARDUCOPTER: Final = Profile(
         'VISO_TYPE': (INT8, 0),               # 1: vision by MAVLink
         'WPNAV_SPEED': (FLOAT, 1000.0),       # cm/s, not applied to acceleration setpoints
     },
-    encoding=mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
     landing_speed=('LAND_SPEED', 1e-2),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
            mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.0},
-    arming=('permission', 'vision', 'armable'),
+    mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, arming=('permission', 'vision', 'armable'),
     refused=mavlink.MAV_RESULT_FAILED, unknown_message=mavlink.MAV_RESULT_DENIED,
     vision={'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6},
     frames=(mavlink.MAV_FRAME_LOCAL_FRD,),
@@ -232,7 +223,7 @@ ARDUCOPTER: Final = Profile(
     drift=np.array([0.012, -0.01, 0.0]),
     tilt_max=math.radians(30.0))  # ANGLE_MAX
 PROFILES: Final[Mapping[str, Profile]] = {'px4': PX4, 'arducopter': ARDUCOPTER}
-_LIMITS: Final[Mapping[int, int]] = {INT8: 2**7, INT16: 2**15, INT32: 2**31}
+_WHOLE: Final = Range(-2**31, 2**31 - 1, whole=True)
 _UNKNOWN_INDEX: Final[int] = 65535
 
 
@@ -252,29 +243,19 @@ class Parameters(dict[str, float]):
         """
         if name not in self:
             raise ValueError(f'{name}: must be one of {", ".join(self)}')
-        limit = _LIMITS.get(self._types[name])
-        if limit is None:
+        if self._types[name] == FLOAT:
             Range().check(name, value)
         else:
-            Range(-limit, limit - 1, whole=True).check(
-                name, int(value) if float(value).is_integer() else value)
+            _WHOLE.check(name, int(value) if float(value).is_integer() else value)
         self[name] = float(value)
 
     def answer(self, message: Any) -> list[Any]:
-        """Answer PARAM_REQUEST_READ by name and PARAM_SET; unknown names silently."""
+        """Answer PARAM_REQUEST_READ by name; an unknown one is not answered."""
         name = str(message.param_id)
         if name not in self:
             return []
-        bytewise = self._bytewise and self._types[name] != FLOAT
-        if message.get_type() == 'PARAM_SET':
-            sent = message.param_value
-            with contextlib.suppress(ValueError):  # the answer then has the old value
-                self.set(name, struct.unpack('<i', struct.pack('<f', sent))[0] if bytewise
-                         else sent)
-        value = self[name]
+        value, bytewise = self[name], self._bytewise and self._types[name] != FLOAT
         return [mavlink.MAVLink_param_value_message(
             name.encode(),
             struct.unpack('<f', struct.pack('<i', int(value)))[0] if bytewise else value,
-            self._types[name], len(self),
-            # ArduPilot does not look up the index of a parameter asked for by its name.
-            list(self).index(name) if self._bytewise else _UNKNOWN_INDEX)]
+            self._types[name], len(self), _UNKNOWN_INDEX)]

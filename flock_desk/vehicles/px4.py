@@ -17,21 +17,20 @@ PX4, as far as a companion computer meets it: setpoints, take-off, landing, fail
 
 Measured on PX4 1.16, see docs/autopilots.md. Somebody chooses a mode, and PX4 flies it as long as
 it can: OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s), Hold a global position, that is GPS
-or an origin. Where it cannot, a failsafe flies another and ends by itself when the chosen mode can
+or an origin. Otherwise a failsafe flies another and ends by itself when the chosen mode can
 be flown again: setpoints alone bring OFFBOARD back. After landing the mode from before is back.
 No speed limit applies to acceleration setpoints; vertical acceleration 0 leaves the height open.
 When external vision stops OFFBOARD stays, and drifts.
 
 After arming the motors spin up, then idle until a setpoint asks upwards; that may be any upward
-acceleration, however small. A ramp then limits the climb rate of position and velocity setpoints,
-and leaves acceleration setpoints alone. The land detector looks at the thrust: it reports the
+acceleration, however small. A ramp then limits the climb rate of the own modes, and leaves
+acceleration setpoints alone. The land detector looks at the thrust: it reports the
 take-off at once, and a landing only while a downward velocity is commanded. Acceleration setpoints
 command none, so that a vehicle that they push onto the ground stays in the air for PX4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import math
 from typing import Any, Final
 
@@ -40,11 +39,9 @@ import numpy as np
 from flock_desk.vehicles.estimator import GROUND_AMSL
 from flock_desk.vehicles.flight_controller import (
     ACCEPTED,
-    ARRIVED,
     decode_setpoint,
     FlightController,
     IDLE,
-    TrackedSetpoint,
 )
 from flock_desk.vehicles.profiles import LAND, PX4
 from flock_follower.geometry import Array, GRAVITY
@@ -52,11 +49,9 @@ from flock_follower.geometry import Array, GRAVITY
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
 _SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
 #: Modes after the loss of the stream, by COM_OBL_RC_ACT: the first possible one.
-_LOST_STREAM: Final[Mapping[int, tuple[str, ...]]] = {
-    4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
+_LOST_STREAM: Final = {4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
 _CLIMB_MAX: Final[float] = 3.0  # m/s, MPC_Z_VEL_MAX_UP
 _RAMP_START: Final[float] = -GRAVITY / 4.0
-_DESCENT: Final[float] = 0.275  # m/s; a faster commanded descent counts as a landing
 _FLYING_THRUST: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
 _LANDING_TIME: Final[float] = 1.0  # s, LNDMC_TRIG_TIME
 
@@ -72,21 +67,9 @@ class Px4(FlightController):
             self.mode = TAKEOFF  # without an origin there is no Hold
         self.chosen = self._after_disarming = self.mode
         self._sticks = False
-        self._landed = bool(self.vehicle.landed)
         self._resting_for = self._armed_for = 0.0
         # Of the take-off ramp: below 0 the motors idle, at 1 it is over.
-        self._ramp = -1.0 if self._landed else 1.0
-        self._descends = False
-
-    @property
-    def on_ground(self) -> bool:
-        """Return whether the land detector says so."""
-        return self._landed
-
-    @property
-    def taking_off(self) -> bool:
-        """Return whether the mode is that of the take-off."""
-        return self.mode == TAKEOFF
+        self._ramp = -1.0 if self.on_ground else 1.0
 
     def conditions(self, now: float) -> dict[str, bool]:
         """Return those of all autopilots, a setpoint that is not too old, and a transmitter."""
@@ -94,14 +77,9 @@ class Px4(FlightController):
                 'stream': now - self._setpoint_time <= self.parameters['COM_OF_LOSS_T']}
 
     def on_setpoint(self, message: Any, now: float) -> None:
-        """Take a setpoint in any mode; one that lacks an axis or is not finite is dropped."""
+        """Take a setpoint in any mode; one that is not finite is dropped."""
         setpoint = decode_setpoint(message)
-        if setpoint is None:
-            return
-        given = np.array(setpoint[:3])
-        ignored = np.array([message.type_mask >> i & 1 for i in range(9)]).sum()
-        if (np.all(np.any(np.isfinite(given), axis=0))
-                and np.count_nonzero(np.isfinite(given)) == 9 - ignored):
+        if setpoint is not None and np.all(np.isfinite(setpoint.acceleration)):
             self._setpoint, self._setpoint_time = setpoint, now
 
     def change_mode(self, name: str, now: float) -> int:
@@ -110,7 +88,7 @@ class Px4(FlightController):
 
     def take_off(self, altitude: float, now: float) -> int:
         """
-        Climb to an altitude, m above sea level, then hold; once armed, where it is not.
+        Climb to an altitude, m above sea level, then hold; once armed, if it is not.
 
         NaN, or a lower altitude, becomes MIS_TAKEOFF_ALT above the ground.
         """
@@ -122,9 +100,9 @@ class Px4(FlightController):
         self._place = np.array([east, north, np.fmax(altitude - GROUND_AMSL, lowest)])
         return ACCEPTED
 
-    def pilot_switches(self, name: str, climb: float = 0.0) -> None:
+    def pilot_switches(self, name: str) -> None:
         """Change the mode by remote control; from then on there is one."""
-        super().pilot_switches(name, climb)
+        super().pilot_switches(name)
         self._sticks = True
         self._remember(name)
 
@@ -146,21 +124,21 @@ class Px4(FlightController):
         self._supervise(now)
 
     def _supervise(self, now: float) -> None:
-        """Fly the chosen mode where that is possible, else another."""
+        """Fly the chosen mode if that is possible, else another."""
         met = self.conditions(now)
         names: tuple[str, ...] = (self.chosen,)
         if self.armed and self.chosen == OFFBOARD and not met['stream']:
             names = _LOST_STREAM.get(int(self.parameters['COM_OBL_RC_ACT']), ('POSCTL', 'ALTCTL'))
         elif self.armed:
             names = (self.chosen, 'ALTCTL' if self.chosen == 'POSCTL' else LAND_MODE)
-        # Sticks are not looked for: a pilot's mode without them descends.
+        # Sticks do not count here: a pilot's mode without them descends.
         mode = next((name for name in names if not {'position', 'global'}.intersection(
             self.missing(name, now))), names[-1])
         self.in_failsafe = mode != self.chosen
         if mode != self.mode:
             self._enter(mode)
         if mode == TAKEOFF and self.armed and self._place is not None and (
-                self.estimator.position[2] >= self._place[2] - ARRIVED and met['global']):
+                not self.taking_off and met['global']):
             place = self._place
             self._choose(HOLD_MODE, now)
             self._place = place
@@ -170,21 +148,14 @@ class Px4(FlightController):
         descends = self.in_failsafe and 'sticks' in PX4.modes[self.mode].needs
         return LAND if descends and not self._sticks else super()._flies
 
-    def _fly_setpoints(self, now: float, dt: float) -> Array:
-        self._follow_yaw(dt)
-        return self._track(self._setpoint)
-
     def _control(self, now: float, dt: float) -> Array:
         self._step_takeoff(now, dt)
         self._climb_limit = _RAMP_START + max(self._ramp, 0.0) * (_CLIMB_MAX - _RAMP_START)
-        self._descends = False
-        wanted = super()._control(now, dt) if self._ramp >= 0.0 else IDLE
-        self._detect_landing(float(wanted[2]) + GRAVITY, dt)
-        return wanted
+        return super()._control(now, dt) if self._ramp >= 0.0 else IDLE
 
     def _step_takeoff(self, now: float, dt: float) -> None:
         self._armed_for = self._armed_for + dt if self.armed else 0.0
-        if not self.armed or (self._ramp >= 1.0 and self._landed):
+        if not self.armed or (self._ramp >= 1.0 and self.on_ground):
             self._ramp = -1.0
         elif 0.0 <= self._ramp < 1.0:
             self._ramp = min(1.0, self._ramp + dt / max(self.parameters['MPC_TKO_RAMP_T'], dt))
@@ -193,28 +164,22 @@ class Px4(FlightController):
             self._ramp = 0.0
 
     def _asks_upwards(self, now: float) -> bool:
-        height = float(self.estimator.position[2])
-        if self.mode in (TAKEOFF, 'POSCTL'):
-            return self._place is not None and float(self._place[2]) > height
-        setpoint = self._setpoint
-        return (self.mode == OFFBOARD and now - self._setpoint_time < _SETPOINT_MAX_AGE
-                and bool(setpoint.position[2] > height or setpoint.velocity[2] > 0.0
-                         or setpoint.acceleration[2] > 0.0))
+        if self.mode == OFFBOARD:
+            recent = now - self._setpoint_time < _SETPOINT_MAX_AGE
+            return recent and bool(self._setpoint.acceleration[2] > 0.0)
+        return self.taking_off
 
-    def _track(self, setpoint: TrackedSetpoint) -> Array:
-        self._descends = bool(setpoint.velocity[2] <= -_DESCENT)
-        return super()._track(setpoint)
-
-    def _detect_landing(self, thrust: float, dt: float) -> None:
-        """Follow the land detector; ``thrust``, m/s^2, is the commanded one."""
-        rests = self.vehicle.landed and self._descends and not self._landed
+    def _detect_ground(self, wanted: Array, dt: float) -> None:
+        thrust = float(wanted[2]) + GRAVITY
+        descends = self._ramp >= 0.0 and self._flies == LAND
+        rests = self.vehicle.landed and descends and not self.on_ground
         self._resting_for = self._resting_for + dt if rests else 0.0
-        self._landed = (not self.armed or (self._landed and thrust <= _FLYING_THRUST)
-                        or self._resting_for >= _LANDING_TIME)
+        self.on_ground = (not self.armed or (self.on_ground and thrust <= _FLYING_THRUST)
+                          or self._resting_for >= _LANDING_TIME)
 
     @property
     def _rests(self) -> bool:
-        return self._landed
+        return self.on_ground
 
     @property
     def _disarms_after(self) -> float:

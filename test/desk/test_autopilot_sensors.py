@@ -12,9 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Barometer, battery and home of the embedded autopilots."""
+"""External vision, barometer, battery and home of the embedded autopilots."""
 
-from embedded_flight import Flight, odometry, setpoint
+import math
+
+from embedded_flight import BLIND, Flight, odometry, seen, setpoint
 from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -22,92 +24,119 @@ import pytest
 
 from flock_desk.vehicles.estimator import Barometer, GROUND_AMSL
 
-PERSONALITIES = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
-PRESSURE = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
-HOME = mavlink.MAVLINK_MSG_ID_HOME_POSITION
-
-
-def ask(flight, message_id, rate=20.0):
-    """Ask for a message at a rate, Hz, and return the results."""
-    return flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate)
-
-
-def all_of(flight, kind):
-    return [m for m in flight.messages if m.get_type() == kind]
+pytestmark = pytest.mark.slow
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 
 def height(message):
-    """Return the height above the mean sea level, m, that a SCALED_PRESSURE says."""
-    return (1.0 - (message.press_abs / 1013.25) ** 0.190263) * 288.15 / 0.0065
+    """Return the height above the ground, m, that a SCALED_PRESSURE means."""
+    return (1.0 - (message.press_abs / 1013.25) ** 0.190263) * 288.15 / 0.0065 - GROUND_AMSL
 
 
-@PERSONALITIES
-def test_the_barometer_is_streamed_once_it_is_asked_for(personality):
-    flight = Flight(personality, altitude=3.0)
-    assert ask(flight, PRESSURE) == [0]
-    flight.messages.clear()
-    flight.fly(20.0)
-    reported = all_of(flight, 'SCALED_PRESSURE')
-    assert len(reported) == 400
-    heights = np.array([height(m) for m in reported]) - GROUND_AMSL
-    assert np.mean(heights) == pytest.approx(3.0, abs=0.1)
-    assert np.std(np.diff(heights)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.15)
-    assert reported[0].temperature == 1181
-    assert np.diff([m.time_boot_ms for m in reported]).tolist() == [50] * 399
+@pytest.mark.parametrize(('personality', 'options', 'used'), [
+    ('px4', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, True), ('px4', {}, True),
+    ('px4', {'variance': math.nan}, False), ('px4', {'variance': 0.0}, False),
+    ('px4', {'child': mavlink.MAV_FRAME_LOCAL_FRD}, False),
+    ('px4', {'frame': mavlink.MAV_FRAME_BODY_FRD}, False),
+    ('arducopter', {}, True), ('arducopter', {'variance': math.nan}, True),
+    ('arducopter', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, False),
+    ('arducopter', {'child': mavlink.MAV_FRAME_BODY_NED}, False)])
+def test_odometry_counts_only_in_the_frames_the_autopilot_wants(personality, options, used):
+    flight = Flight(personality, start='landed', parameters=BLIND[personality])
+    flight.fly(1.0, seen(flight, **options))
+    # PX4 sends it without a position, too.
+    assert bool(flight.all('LOCAL_POSITION_NED')) == (used or personality == 'px4')
+    if personality == 'arducopter':
+        flight.mode('GUIDED')
+    else:
+        flight.take_off(math.nan)
+    assert (flight.arm() == [0]) == used
 
 
-def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
+@BOTH
+def test_the_estimate_follows_the_vision_even_if_it_is_wrong(personality):
+    flight = Flight(personality, parameters=BLIND[personality])
+    flight.fly(3.0, seen(flight, error=np.array([3.0, 0.0, 0.5]), yaw_error=0.5), rate=30.0)
+    position, truth = flight.last('LOCAL_POSITION_NED'), flight.vehicle.position
+    assert position.y == pytest.approx(truth[0] + 3.0, abs=0.1)
+    assert -position.z == pytest.approx(truth[2] + 0.5, abs=0.1)
+    attitude = flight.last('ATTITUDE_QUATERNION')
+    assert 2 * math.atan2(attitude.q4, attitude.q1) == pytest.approx(
+        math.pi / 2 - flight.vehicle.yaw - 0.5, abs=0.05)
+
+
+def test_a_jump_is_an_outlier_unless_the_reset_counter_announces_it():
+    flight, away = Flight(parameters=BLIND['px4']), np.array([5.0, 0.0, 0.0])
+    flight.fly(1.0, seen(flight), rate=30.0)
+    flight.fly(0.5, seen(flight, error=away), rate=30.0)
+    assert abs(flight.last('LOCAL_POSITION_NED').y) < 0.5
+    flight.fly(0.2, seen(flight, error=away, reset_counter=1), rate=30.0)
+    assert flight.last('LOCAL_POSITION_NED').y == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize(('personality', 'synchronised', 'age', 'used'), [
+    ('px4', True, 0.05, True), ('px4', True, 0.5, False), ('px4', True, -1.0, False),
+    ('px4', False, 0.5, True), ('arducopter', True, 0.5, True)])
+def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learnt(
+        personality, synchronised, age, used):
+    flight = Flight(personality, start='landed', parameters=BLIND[personality])
+    flight.fly(0.01)
+    if synchronised:  # our clock is 1000 s ahead of the autopilot's
+        flight.send(mavlink.MAVLink_timesync_message(
+            round((1000.0 + flight.now) * 1e9), flight.last('TIMESYNC').ts1))
+    flight.fly(0.5, lambda: odometry((0.0, 0.0, 0.0), time=1000.0 + flight.now - age))
+    assert flight.controller.position_known(flight.now) == used
+
+
+def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():
+    flight = Flight('arducopter', altitude=20.0, parameters=BLIND['arducopter'])
+    flight.fly(1.0, seen(flight))
+    flight.mode('GUIDED')
+    flight.fly(7.0, setpoint())
+    assert flight.controller.mode == 'GUIDED'
+    flight.fly(2.0, setpoint())
+    assert flight.controller.mode == 'LAND' and flight.controller.in_failsafe
+    assert flight.texts()[-1] == 'EKF Failsafe: changed to LAND Mode'
+    assert flight.last('HEARTBEAT').system_status == mavlink.MAV_STATE_CRITICAL
+    flight.fly(0.5, seen(flight, reset_counter=1))
+    assert flight.controller.mode == 'LAND' and not flight.controller.in_failsafe
+
+
+def test_the_barometer_measures_the_true_height_with_noise_and_drift():
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3})
-    ask(flight, PRESSURE)
+    assert flight.ask('SCALED_PRESSURE') == [0]
     flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
-    reported = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
-    assert reported == pytest.approx(flight.vehicle.position[2], abs=0.3)
-    assert reported < 2.0 - 0.5  # it holds the height of the odometry, and sinks
-
-
-def test_the_drift_is_slow_and_bounded():
+    reported = [height(m) for m in flight.all('SCALED_PRESSURE')]
+    assert len(reported) == pytest.approx(80, abs=1)
+    assert np.std(np.diff(reported)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.3)
+    assert reported[-1] == pytest.approx(flight.vehicle.position[2], abs=0.3)
+    assert reported[-1] < 2.0 - 0.5  # it holds the height of the odometry, and sinks
     barometer = Barometer([np.random.default_rng(i) for i in range(500)])
     deviations = [np.std(barometer.heights(np.zeros(500), time)) for time in (10.0, 11.0, 2000.0)]
     assert deviations == pytest.approx([0.05, 0.05, np.hypot(0.05, 0.1)], rel=0.15)
 
 
-@PERSONALITIES
+@BOTH
 def test_home_is_where_it_was_armed(personality):
     flight = Flight(personality, start='landed')
     flight.mode('GUIDED' if personality == 'arducopter' else 'AUTO.LOITER')
     flight.fly(0.1)
-    assert flight.arm() == [0] and ask(flight, HOME, 1.0) == [0]
+    assert flight.arm() == [0]
+    assert flight.ask('HOME_POSITION', 1.0) == flight.ask('GLOBAL_POSITION_INT') == [0]
     flight.take_off(2.5 if personality == 'arducopter' else GROUND_AMSL + 2.5)
     flight.fly(8.0)
-    assert flight.vehicle.position[2] > 2.0
-    home = flight.last('HOME_POSITION')
+    home, position = flight.last('HOME_POSITION'), flight.last('GLOBAL_POSITION_INT')
     assert (home.altitude, home.z, home.latitude) == (round(GROUND_AMSL * 1e3), 0.0, 473977420)
-    flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT))
-    position = flight.last('GLOBAL_POSITION_INT')
+    assert flight.vehicle.position[2] > 2.0
     assert position.alt - home.altitude == pytest.approx(
-        flight.vehicle.position[2] * 1e3, abs=2)
+        flight.vehicle.position[2] * 1e3, abs=20)
 
 
-def test_px4_has_no_home_without_an_origin():
-    flight = Flight(start='landed', parameters={'EKF2_GPS_CTRL': 0})
-    still = odometry((0.0, 0.0, 0.0))
-    flight.fly(4.0, still, rate=30.0)
-    assert not all_of(flight, 'HOME_POSITION')
-    flight.send(mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488000))
-    flight.fly(4.0, still, rate=30.0)
-    assert all_of(flight, 'HOME_POSITION')
-
-
-@PERSONALITIES
-def test_the_battery_can_be_drained_and_become_unknown(personality):
-    flight = Flight(personality, faults=[Fault('battery', 1.5, remaining=0.15),
-                                         Fault('battery', 3.5, remaining=None)])
+def test_the_battery_shows_its_charge():
+    flight = Flight(faults=[Fault('battery', 1.5, remaining=0.15)])
     shown = []
-    for seconds in (1.4, 2.0, 2.0):
-        flight.fly(seconds, setpoint())
-        status, battery = flight.last('SYS_STATUS'), flight.last('BATTERY_STATUS')
-        assert status.battery_remaining == battery.battery_remaining
-        shown.append((status.battery_remaining, status.voltage_battery))
-    assert [remaining for remaining, _ in shown] == [100, 15, -1]
-    assert shown[0][1] > 16500 and 14000 < shown[1][1] < 15000 and shown[2][1] == 65535
+    for seconds in (1.4, 2.0):
+        flight.fly(seconds)
+        battery = flight.last('BATTERY_STATUS')
+        shown.append((battery.battery_remaining, sum(battery.voltages[:4])))
+    assert shown == [(100, 16800), (15, pytest.approx(14420, abs=4))]

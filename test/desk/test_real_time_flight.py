@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A live flight without clock, socket or ROS: its sensors show what is true."""
+"""A flight in real time without clock, socket or ROS: its sensors show the truth."""
 
 import math
 
@@ -21,15 +21,18 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.camera.renderer import Light, T_BODY_MARKER, T_BODY_OPTICAL
-from flock_desk.closed_loop.flown import EmbeddedVehicle
+from flock_desk.camera.renderer import T_BODY_MARKER, T_BODY_OPTICAL
+from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
+    LATEST_NS,
     real_time_camera,
     RealTimeFlight,
+    SENSOR,
     STEP_NS,
 )
 from flock_desk.closed_loop.scenario_run import ScenarioRun
+from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
     Outage,
@@ -41,6 +44,7 @@ from flock_desk.scenarios.scenario import (
 from flock_follower.geometry import (
     enu_to_ned,
     matrix_to_rotation_vector,
+    quaternion_from_yaw,
     quaternion_to_matrix,
     Transform,
     yaw_enu_to_ned,
@@ -83,7 +87,6 @@ class Commanded:
             controller.on_setpoint(self._setpoint, now)
             if controller.mode != 'OFFBOARD':
                 controller.change_mode('OFFBOARD', now)
-                controller.outbox.clear()
             controller.wind = self.flight.scenario.wind(self.flight.time)
             self.flight.vehicle.autopilot.step(now)
             self.odometry += [(stamp, self.flight.time_ns, state)
@@ -95,29 +98,14 @@ class Commanded:
 
 
 def test_the_scenario_begins_once_engaged_in_offboard_mode(camera):
-    waiting = Commanded(camera).fly(1.5, engaged=False, look=False)
+    ranges = RangeErrors(20.0, noise=0.001, bias=0.0, bias_walk=0.0, outliers=0.0)
+    waiting = Commanded(camera, ranges=ranges).fly(1.5, engaged=False, look=False)
     assert waiting.flight.vehicle.autopilot.controller.mode == 'OFFBOARD'
     assert waiting.flight.began_ns is None
     assert waiting.flight.distance == pytest.approx(1.5, abs=0.05)
+    assert waiting.flight.measured() == pytest.approx(1.5, abs=0.06)
     waiting.fly(0.5, look=False)
     assert waiting.flight.time == pytest.approx(0.5, abs=0.011)
-
-
-def test_ranges_come_at_their_rate_and_are_of_the_distance(camera):
-    errors = RangeErrors(20.0, noise=0.01, bias=0.0, bias_walk=0.0, outliers=0.0)
-    measured = []
-    for ranges in (errors, RangeErrors()):
-        flight = RealTimeFlight(scenario(sensing=STILL, ranges=ranges), 0,
-                                EmbeddedVehicle(0.0, 1.5), camera)
-        measured.append([])
-        for _ in range(round(1e9) // STEP_NS):
-            flight.after_step(False)
-            if (distance := flight.measured()) is not None:
-                measured[-1].append(distance)
-    assert len(measured[0]) in (20, 21)
-    assert measured[0] == pytest.approx([flight.distance] * len(measured[0]), abs=0.06)
-    assert np.std(measured[0]) > 0.003
-    assert measured[1] == []
 
 
 def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(camera):
@@ -128,14 +116,11 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
     delays = np.array([f.due_ns - f.stamp_ns for f in frames]) * 1e-9
     assert delays.min() >= 0.09 - 0.02 and delays.max() <= 0.11 - 0.02
     assert np.ptp(delays) > 0.01
-
-
-def test_images_that_are_too_late_are_left_out(camera):
-    flight = RealTimeFlight(scenario(sensing=STILL), 0, EmbeddedVehicle(0.0, 1.5), camera)
+    late = RealTimeFlight(scenario(sensing=STILL), 0, EmbeddedVehicle(0.0, 1.5), camera)
     for _ in range(20):
-        flight.after_step(False)
-    assert flight.look(1_000_000_000) is None
-    assert flight.skipped_images == 6  # those of the first 0.2 s
+        late.after_step(False)
+    assert late.look(1_000_000_000) is None
+    assert late.skipped_images == 6  # those of the first 0.2 s
 
 
 def test_the_image_shows_the_marker_where_truth_camera_and_mounting_put_it(camera):
@@ -172,44 +157,133 @@ def test_outages_silence_odometry_and_hide_the_leader(camera):
         assert frame.usable == (not (1.2 <= time < 1.6 or 0.5 <= time < 0.9))
 
 
-def test_light_changes_blind_for_as_long_as_the_scenario_says():
+def test_light_changes_hide_the_marker_for_as_long_as_the_scenario_says():
     changing = ScenarioRun(scenario(sensing=Sensing(light_changes=30.0)), 3)
     assert len(changing.light_changes) > 3
-    for begin, end, _ in changing.light_changes:
-        assert 0.1 <= end - begin <= 0.4
-        light = changing.light(0.5 * (begin + end))
-        assert light.veil > 1.0 or light.gain < 0.01
-    assert {glare for *_, glare in changing.light_changes} == {True, False}
-    assert changing.light(0.5) != changing.light(2.5)  # clouds
-    assert ScenarioRun(scenario(), 3).light(7.0) == Light()
+    for begin, end in changing.light_changes:
+        assert 0.1 <= end - begin <= 0.4 and changing.hides(0.5 * (begin + end))
+    assert not any(ScenarioRun(scenario(), 3).hides(0.1 * k) for k in range(200))
 
 
 def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pose():
     motion = LeaderMotion(motion='circle', wait=0.0, speed=1.0, size=1.5, heading='course')
-    live = ScenarioRun(scenario(leader=motion), 1)
-    time, h = 9.0, 0.01
-    before, after = live.leader(time - h), live.leader(time + h)
-    state = live.leader_odometry(time)
+    live, time, h = ScenarioRun(scenario(leader=motion), 1), 9.0, 0.01
+    before, state, after, opposite = (live.motion(0, t) for t in (
+        time - h, time, time + h, time + math.pi * 1.5 / 1.0))
     rotation = quaternion_to_matrix(state.quaternion)
-    centripetal = live.leader(time + math.pi * 1.5 / 1.0).translation - state.position
-    assert rotation[:, 2] @ centripetal > 0.05  # towards the middle of the circle
+    # Towards the middle of the circle.
+    assert rotation[:, 2] @ (opposite.position - state.position) > 0.05
     assert rotation @ state.linear == pytest.approx(
-        (after.translation - before.translation) / (2 * h), abs=1e-3)
-    assert state.angular == pytest.approx(
-        matrix_to_rotation_vector(before.rotation.T @ after.rotation) / (2 * h), abs=0.02)
+        (after.position - before.position) / (2 * h), abs=1e-3)
+    turn = quaternion_to_matrix(before.quaternion).T @ quaternion_to_matrix(after.quaternion)
+    assert state.angular == pytest.approx(matrix_to_rotation_vector(turn) / (2 * h), abs=0.02)
     assert yaw_from_quaternion(state.quaternion) == pytest.approx(
         math.atan2(*(rotation @ state.linear)[1::-1]), abs=0.05)
 
 
-def test_a_leader_that_faces_away_turns_its_tail_to_the_follower_and_not_faster_than_it_may():
-    live = ScenarioRun(scenario(leader=LeaderMotion(heading='away')), 0)
-    follower = np.array([1.5, -1.5, 1.5])  # from behind it has come to the leader's right
-    headings = []
-    for k in range(1500):
-        live.turn(0.01 * k, follower)
-        headings.append(live.leader_odometry(0.01 * k + 0.005))
-    assert yaw_from_quaternion(headings[-1].quaternion) == pytest.approx(math.pi / 2, abs=0.01)
-    assert max(abs(h.angular[2]) for h in headings) <= 1.0 + 1e-6
-    fixed = ScenarioRun(scenario(), 0)
-    fixed.turn(5.0, follower)
-    assert yaw_from_quaternion(fixed.leader_odometry(9.0).quaternion) == pytest.approx(0.0)
+# Vehicles flown elsewhere.
+
+START = 5_000_000_000  # ns, of the flight
+PERIOD = 20_000_000  # ns between poses
+LATE = 13_000_000  # ns by which those of the leader come later
+EXACT = VioErrors(latency=(0.0, 0.0), **dict.fromkeys((
+    'position_walk', 'height_walk', 'yaw_walk', 'position', 'tilt', 'tilt_bias', 'attitude',
+    'velocity', 'velocity_white', 'gyro_bias', 'gyro'), 0.0))
+NEVER = math.inf, math.inf
+
+
+class Elsewhere:
+    """
+    A vehicle that climbs to 2 m, flies north at 0.2 m/s and faces north-east.
+
+    With ``led`` its leader, too, is flown elsewhere: 2 m ahead at 2 m height, north at 0.3 m/s.
+    """
+
+    def __init__(self, camera, led=False):
+        self.motion, self.ahead = ExternalMotion(), ExternalMotion()
+        self.sent_ns, self.led_ns = START - PERIOD, START - PERIOD
+        self.report(START)
+        self.vehicle = ExternalVehicle(self.motion, START, height=0.0)
+        self.flight = RealTimeFlight(
+            scenario(sensing=STILL, odometry=EXACT), 0, self.vehicle, camera,
+            LATEST_NS + 40_000_000 * led,
+            ExternalLeader(self.ahead, START, self.vehicle.origin) if led else None)
+        self.odometry, self.frames, self.distances = [], [], []
+
+    def report(self, now, silent=NEVER):
+        east_of_north = quaternion_from_yaw(math.pi / 4)
+        while self.sent_ns + PERIOD <= now:
+            self.sent_ns += PERIOD
+            time = (self.sent_ns - START) * 1e-9
+            if not silent[0] < time < silent[1]:
+                self.motion.add(Motion(
+                    self.sent_ns, np.array([0.0, 0.2 * time, 2.0 * min(time, 1.0)]),
+                    np.array([0.0, 0.2, 2.0 * (time < 1.0)]), east_of_north, np.zeros(3)))
+        while self.led_ns + PERIOD + LATE * (self.led_ns > START) <= now:
+            self.led_ns += PERIOD
+            time = (self.led_ns - START) * 1e-9
+            self.ahead.add(Motion(
+                self.led_ns, np.array([0.0, 2.0 + 0.3 * time, 2.0]),
+                np.array([0.0, 0.3, 0.0]), east_of_north, np.zeros(3)))
+
+    def fly(self, seconds, engaged=False, silent=NEVER):
+        """Fly on; no pose is reported from one moment of the flight to another, s."""
+        end = self.flight.time_ns + round(seconds * 1e9)
+        while self.flight.time_ns < end:
+            self.report(START + self.flight.time_ns + STEP_NS + PERIOD, silent)
+            self.odometry += self.flight.after_step(engaged)
+            self.distances.append(self.flight.distance)
+            frame = self.flight.look(self.flight.time_ns)
+            self.frames += [] if frame is None else [frame]
+        return self
+
+    def offboard(self, value, seconds=0.2, engaged=False):
+        self.vehicle.offboard = value
+        return self.fly(seconds, engaged).frames[-1]
+
+
+def test_the_leader_comes_to_the_follower_with_each_offboard_mode_until_the_scenario_begins(
+        camera):
+    flown = Elsewhere(camera).fly(1.5)
+    assert math.isnan(flown.flight.distance)
+    assert {(frame.leader, frame.usable) for frame in flown.frames} == {(None, False)}
+    frame = flown.offboard(True)
+    # 1.5 m ahead of where it faced then, at its height, facing away from it as it did.
+    offset = frame.leader.position - flown.vehicle.at(1_510_000_000).position
+    assert offset == pytest.approx([1.5 * math.sqrt(0.5), 1.5 * math.sqrt(0.5), 0.0], abs=0.05)
+    assert yaw_from_quaternion(frame.leader.quaternion) == pytest.approx(math.pi / 4, abs=1e-6)
+    assert flown.offboard(False, 0.5).leader is None and flown.flight.began_ns is None
+    again = flown.offboard(True)
+    assert again.leader.position - frame.leader.position == pytest.approx(
+        [0.0, 0.7 * 0.2, 0.0], abs=0.02)
+    flown.offboard(True, engaged=True)
+    assert flown.flight.time == pytest.approx(0.19, abs=0.011)
+    assert flown.offboard(False).leader is not None  # the pilot's switch, in the middle of it
+
+
+def test_without_poses_no_image_and_no_odometry_is_invented(camera):
+    flown = Elsewhere(camera).fly(3.0, silent=(1.0, 1.8))
+    stamps = np.array([stamp for stamp, _ in flown.odometry]) * 1e-9
+    images = np.array([frame.stamp_ns for frame in flown.frames]) * 1e-9
+    for times, spacing in ((stamps, 0.01), (images, 1 / 30)):
+        assert not np.any((times > 1.0) & (times < 1.8 - 1e-9))
+        others = times[(times < 1.0) | (times > 1.8)]
+        assert np.count_nonzero(np.diff(others) > 1.5 * spacing) == 1
+    assert flown.flight.skipped_images >= 23  # of 0.8 s
+    state = flown.odometry[-1][1]
+    assert state.position == pytest.approx([0.0, 0.6, 2.0], abs=0.03)
+    assert quaternion_to_matrix(state.quaternion) @ state.linear == pytest.approx(
+        [0.0, 0.2, 0.0], abs=0.01)
+
+
+def test_a_leader_elsewhere_is_where_it_reports_and_the_scenarios_does_not_fly(camera):
+    flown = Elsewhere(camera, led=True).fly(1.5)
+    assert flown.distances[-1] == pytest.approx(2.15, abs=0.02)
+    flown.offboard(True, 1.0, engaged=True)
+    for frame in flown.frames:
+        north = 2.0 + 0.3 * frame.stamp_ns * 1e-9
+        assert frame.usable
+        assert frame.leader.position == pytest.approx([0.0, north, 2.0], abs=1e-6)
+        # Every pose that the image shows had been reported.
+        assert START + frame.stamp_ns + round(0.5e9 * SENSOR.exposure) <= flown.ahead.newest
+    assert len(flown.frames) >= 73 and flown.flight.skipped_images == 0

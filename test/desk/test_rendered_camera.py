@@ -22,7 +22,6 @@ import pytest
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import (
     leader,
-    Light,
     marker_print,
     Renderer,
     second_print,
@@ -64,39 +63,6 @@ def project(camera, points):
     return pixels.reshape(-1, 2)
 
 
-def look(image, points):
-    """Return the image (N,), linearly interpolated at points (N, 2)."""
-    x, y = points.astype(np.float32).T
-    return cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR)[0]
-
-
-def located_edges(image, camera, T_optical_marker):
-    """
-    Return where the marker's four edges are seen, (4, n, 2), and where they project to.
-
-    Along a profile from black to white the edge is where the light missing equals a step's.
-    """
-    h = SIDE / 2
-    corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
-    steps = np.linspace(-3.0, 3.0, 121)
-    seen, true = [], []
-    for start, end in zip(corners, np.roll(corners, -1, axis=0)):
-        along = np.linspace(0.12, 0.88, 40)[:, None]
-        outwards = (start + end) / np.linalg.norm(start + end)
-        edge = start + along * (end - start)
-        at = project(camera, T_optical_marker.apply(edge))
-        normal = project(camera, T_optical_marker.apply(edge + 1e-4 * outwards)) - at
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        for pixel, n in zip(at, normal):
-            profile = look(image, pixel + steps[:, None] * n)
-            black, white = profile[:12].mean(), profile[-12:].mean()
-            missing = (white - profile) / (white - black)
-            offset = np.sum(missing[1:] + missing[:-1]) * (steps[1] - steps[0]) / 2 - 3.0
-            seen.append(pixel + offset * n)
-            true.append(pixel)
-    return np.reshape(seen, (4, 40, 2)), np.reshape(true, (4, 40, 2))
-
-
 def model_of(camera):
     return CameraModel(np.array([[camera.focal_x, 0, camera.centre_x],
                                  [0, camera.focal_y, camera.centre_y], [0, 0, 1]]),
@@ -116,17 +82,13 @@ def live():
     return Renderer(Camera(), Sensor(sub_poses=2), fineness=2)
 
 
-@pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])
-def test_rays_are_the_inverse_of_opencvs_projection(camera):
-    u, v = np.meshgrid(np.linspace(0, 639, 33), np.linspace(0, 479, 25))
-    x, y = camera.rays(u, v)
-    pixels = project(camera, np.stack([x, y, np.ones_like(x)], axis=-1))
-    np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-5)
-
-
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE, WIDE],
                          ids=['plumb_bob', 'equidistant', 'very wide'])
-def test_points_are_seen_where_opencv_projects_them(camera):
+def test_points_are_seen_where_opencv_projects_them_and_rays_are_the_inverse(camera):
+    u, v = np.meshgrid(np.linspace(50, 160, 33), np.linspace(50, 150, 25))
+    rays = camera.rays(u, v)
+    pixels = project(camera, np.stack([*rays, np.ones_like(u)], axis=-1))
+    np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-5)
     x, y, z = np.random.default_rng(2).uniform([-0.6, -0.45, 0.5], [0.6, 0.45, 3.0], (200, 3)).T
     points = np.stack([x * z, y * z, z], axis=1)
     np.testing.assert_allclose(camera.project(points), project(camera, points), atol=1e-9)
@@ -140,57 +102,14 @@ def test_a_point_far_beside_the_view_stays_beside_it_however_the_lens_folds():
 
 
 def test_rays_of_a_very_wide_lens_end_at_its_image_circle():
-    u, v = np.meshgrid(np.arange(212.0), np.arange(200.0))
-    x, y = WIDE.rays(u, v)
+    x, y = WIDE.rays(*np.meshgrid(np.arange(212.0), np.arange(200.0)))
     angle = np.arctan(np.hypot(x, y))
     assert angle.max() == pytest.approx(1.45, abs=1e-6)  # 83 degrees, in the corners
-    inside = angle < 1.44
-    pixels = project(WIDE, np.stack([x, y, np.ones_like(x)], axis=-1)[inside])
-    np.testing.assert_allclose(pixels, np.stack([u[inside], v[inside]], axis=1), atol=1e-5)
     image = Renderer(WIDE, Sensor(vignetting=0.15)).image(0, [T_WORLD_OPTICAL], [POSES['ahead']])
     assert image[:9, :9].mean() < 40 and image[70:130, 70:140].mean() > 90
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    ({'model': 'fov'}, "model = 'fov': must be plumb_bob or equidistant"),
-    ({'distortion': (0.1,)}, r'distortion = \(0.1,\): plumb_bob takes 5 values')])
-def test_an_impossible_camera_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Camera(**arguments)
-
-
-@pytest.mark.parametrize(('fineness', 'off', 'pose'), [
-    (4, 0.02, 'ahead'), (4, 0.02, 'turned'), (2, 0.04, 'turned'), (2, 0.04, 'in the corner')])
-@pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])
-def test_the_markers_edges_are_where_the_truth_projects(camera, pose, fineness, off):
-    renderer = Renderer(camera, Sensor(), leader(BLACK), fineness=fineness)
-    image = renderer.radiance([T_WORLD_OPTICAL], [POSES[pose]])
-    seen, true = located_edges(image, camera, T_WORLD_OPTICAL.inverse() @ POSES[pose]
-                               @ T_BODY_MARKER)
-    assert np.abs(np.linalg.norm(seen - true, axis=2)).mean() < off  # px
-
-
-def test_a_turn_during_the_exposure_smears_edges_by_its_angle_about_the_stamp():
-    count, length = 12, 5.0  # px
-    renderer = Renderer(STRAIGHT, Sensor(), leader(BLACK))
-    angles = length / STRAIGHT.focal_x * ((np.arange(count) + 0.5) / count - 0.5)
-    moments = []
-    for turns in (np.zeros(count), angles):
-        cameras = [Transform(rotation_vector_to_matrix([0.0, 0.0, a])) @ T_WORLD_OPTICAL
-                   for a in turns]
-        rows = renderer.radiance(cameras, [POSES['ahead']] * count)[210:264, 352:374]
-        profile = rows.mean(axis=0)  # across one vertical edge, from black to white
-        gradient = np.diff(profile) / (profile[-1] - profile[0])
-        at = np.arange(len(gradient)) + 0.5
-        mean = np.sum(gradient * at)
-        moments.append((mean, np.sum(gradient * (at - mean)**2)))
-    assert moments[1][0] == pytest.approx(moments[0][0], abs=0.03)
-    # The variance of a uniform smear, less what 12 poses leave out.
-    assert moments[1][1] - moments[0][1] == pytest.approx(
-        length**2 / 12 * (1 - count**-2), rel=0.03)
-
-
-def test_noise_is_shot_and_read_noise_and_repeats_with_the_index_of_the_image():
+def test_light_becomes_a_pixel_by_vignetting_gamma_and_noise_that_repeats_with_the_index():
     sensor = Sensor(gamma=1.0, vignetting=0.0, gain=1.0, full_well=2000.0, read_noise=20.0)
     renderer = Renderer(STRAIGHT, sensor)
     for radiance in (0.1, 0.5):
@@ -201,16 +120,11 @@ def test_noise_is_shot_and_read_noise_and_repeats_with_the_index_of_the_image():
         assert image.var() == pytest.approx(expected, rel=0.02)
     again = Renderer(STRAIGHT, sensor)
     np.testing.assert_array_equal(renderer.develop(7, grey), again.develop(7, grey))
-    difference = renderer.develop(7, grey).astype(float) - renderer.develop(8, grey)
-    assert difference.std() == pytest.approx(2**0.5 * renderer.develop(7, grey).std(), rel=0.1)
-
-
-def test_gamma_brightens_and_vignetting_darkens_the_corners():
-    renderer = Renderer(STRAIGHT, Sensor(gain=1.0, full_well=1e12, read_noise=0.0))
-    image = renderer.develop(0, np.full((480, 640), 0.5, dtype=np.float32))
-    assert image[237, 322] == round(255 * 0.5**(1 / 2.2))
+    assert (renderer.develop(7, grey) != renderer.develop(8, grey)).any()
+    image = Renderer(STRAIGHT, Sensor(gain=1.0, full_well=1e12, read_noise=0.0)).develop(0, grey)
     x, y = STRAIGHT.rays(np.array(0.0), np.array(0.0))
-    light = 0.5 / (1 + 0.35 * (x**2 + y**2))**2
+    light = 0.5 / (1 + 0.35 * (x**2 + y**2))**2  # vignetting in the corner
+    assert image[237, 322] == round(255 * 0.5**(1 / 2.2))
     assert image[0, 0] == pytest.approx(255 * light**(1 / 2.2), abs=1)
 
 
@@ -219,13 +133,10 @@ def test_the_surroundings_move_against_the_turn_of_the_camera_and_have_no_seam(l
         return live.radiance([Transform(rotation_vector_to_matrix([0.0, 0.0, heading]))
                               @ T_WORLD_OPTICAL], [])
     step = 20.0 / 611.3  # rad: 20 px in the middle of the image
-    for heading in (-2.0, 0.0, np.pi - 0.01, 7.0):
+    for heading in (0.0, np.pi - 0.01):
         before, after = (turned(h)[200:280, 200:440] for h in (heading, heading + step))
         assert np.corrcoef(before[:, :-20].ravel(), after[:, 20:].ravel())[0, 1] > 0.97
     np.testing.assert_allclose(turned(np.pi - 1e-7), turned(-np.pi + 1e-7), atol=1e-3)
-    nodding = live.radiance([Transform(rotation_vector_to_matrix([0.0, -0.3, 0.0]))
-                             @ T_WORLD_OPTICAL], [])
-    assert nodding.mean() > turned(0.0).mean() + 0.05  # it looks up, to the sky
 
 
 @pytest.mark.parametrize('pose', POSES.values(), ids=POSES)
@@ -234,16 +145,6 @@ def test_perception_finds_the_marker_where_it_is(live, pose):
     model = model_of(Camera())
     off = seen_corners(image, model, SIDE) - model.project(corners_at(pose))
     assert np.linalg.norm(off, axis=1).max() < 0.3
-
-
-def test_there_is_no_marker_without_the_leader_nor_in_glare_or_shadow(live):
-    body = [POSES['ahead']] * 2
-    for leaders, light in (([], None), (body, Light(veil=1.2)), (body, Light(gain=0.002))):
-        assert not len(detect(live.image(0, [T_WORLD_OPTICAL] * 2, leaders, light),
-                              'DICT_4X4_50').ids)
-    for gain in (0.6, 1.4):  # clouds
-        assert len(detect(live.image(0, [T_WORLD_OPTICAL] * 2, body, Light(gain)),
-                          'DICT_4X4_50').ids)
 
 
 def test_a_leader_is_seen_up_to_the_edge_of_the_view_and_not_from_behind_the_camera(live):
@@ -258,24 +159,23 @@ def test_a_leader_is_seen_up_to_the_edge_of_the_view_and_not_from_behind_the_cam
         assert any(edge.any() for edge in edges) == changed.any() == shown
 
 
-def test_only_the_tail_shows_the_marker_and_what_is_nearer_hides_it(live):
+def test_only_the_tail_shows_the_marker_and_a_nearer_body_hides_it(live):
     away = Transform(rotation_vector_to_matrix([0.0, 0.0, np.pi]), np.array([1.4, 0.0, 0.0]))
-    assert not len(detect(live.image(0, [T_WORLD_OPTICAL], [away]), 'DICT_4X4_50').ids)
     hiding = Renderer(Camera(), Sensor(), prints=[(leader(BLACK), Transform(
         translation=np.array([1.0, 0.0, 0.0])))])
-    image = hiding.image(0, [T_WORLD_OPTICAL], [POSES['ahead']])
-    assert not len(detect(image, 'DICT_4X4_50').ids)
+    for renderer, leaders in ((live, [away]), (hiding, [POSES['ahead']]), (live, [])):
+        image = renderer.image(0, [T_WORLD_OPTICAL], leaders)
+        assert not len(detect(image, 'DICT_4X4_50').ids)
 
 
 @pytest.mark.parametrize('beyond', [True, False])
 def test_a_second_print_is_shown_where_it_stands(beyond):
     place = np.array([3.0, 1.1, 0.1]) if beyond else np.array([1.2, 0.25, 0.0])
     leader_pose = POSES['ahead'] if beyond else POSES['far']
-    body = Transform(np.eye(3), place)
+    body = Transform(translation=place)
     renderer = Renderer(Camera(), Sensor(), fineness=2, prints=[([second_print()], body)])
-    for leaders in ([leader_pose], []):
-        found = detect(renderer.image(0, [T_WORLD_OPTICAL], leaders), 'DICT_4X4_50')
-        assert found.ids.tolist() == [0] * (2 if leaders else 1)
-        middle = Camera().project((T_WORLD_OPTICAL.inverse() @ body @ T_BODY_MARKER)
-                                  .translation[None])[0]
-        assert np.linalg.norm(found.corners.mean(axis=1) - middle, axis=1).min() < 1.0
+    found = detect(renderer.image(0, [T_WORLD_OPTICAL], [leader_pose]), 'DICT_4X4_50')
+    assert found.ids.tolist() == [0, 0]
+    middle = Camera().project((T_WORLD_OPTICAL.inverse() @ body @ T_BODY_MARKER)
+                              .translation[None])[0]
+    assert np.linalg.norm(found.corners.mean(axis=1) - middle, axis=1).min() < 1.0

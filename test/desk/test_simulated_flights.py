@@ -30,6 +30,7 @@ from flights_command import flown_by_the_command
 import numpy as np
 import pytest
 
+from flock_desk.closed_loop import campaign
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.metrics import band_exits, Flights, joined, measure, STATES, summary
@@ -39,6 +40,7 @@ from flock_desk.runs.processes import wait_until
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
+    Leg,
     Outage,
     Response,
     Scenario,
@@ -90,10 +92,8 @@ def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
 
 def test_behind_a_hovering_leader_noise_carries_it_to_the_middle_of_the_band() -> None:
     scenario = load('hover_noisy')
-    for distance in (2.6,):
-        flights = fly(replace(scenario, duration=60.0, start=Start((distance, distance))),
-                      range(1), False)
-        assert measure(flights)['final_distance'] == pytest.approx(np.sqrt(4.5), abs=0.1)
+    flights = fly(replace(scenario, duration=60.0, start=Start((2.6, 2.6))), range(1), False)
+    assert measure(flights)['final_distance'] == pytest.approx(np.sqrt(4.5), abs=0.1)
 
 
 def test_an_unseen_leader_is_coasted_after_then_waited_for_and_followed_again() -> None:
@@ -138,35 +138,97 @@ def test_lost_odometry_is_braked_on_within_300_ms() -> None:
         assert speed(flights)[:, during(flights, lost + 1.0, lost + 1.3)].max() < 0.25
 
 
-def test_metrics_are_what_they_say_they_are() -> None:
+@pytest.mark.parametrize(('descent', 'v_max'), [(0.3, 0.5), (1.0, 2.0)])
+def test_behind_a_leader_that_lands_it_stops_at_the_least_altitude(descent: float,
+                                                                   v_max: float) -> None:
+    indoor = load('indoor')
+    landing = replace(
+        indoor, duration=17.0, flight=replace(indoor.flight, altitude_min=1.0, v_max=v_max),
+        leader=LeaderMotion(wait=2.0, legs=(Leg(1.0, (0.1, 0.0, 0.0)),
+                                            Leg(1.6 / descent, (0.0, 0.0, -descent)),
+                                            Leg(60.0, (0.0, 0.0, 0.0)))),
+        # Above the ground by the odometry: its drift is not the planner's.
+        odometry=replace(indoor.odometry, height_walk=0.0))
+    flights = fly(landing, RUNS, True)
+    height = flights.follower[:, :, 2]
+    assert np.all(flights.leader[:, -1, 2] < 0.3) and height.min() > 0.9
+    assert height[:, -20:].mean() == pytest.approx(1.1, abs=0.08)
+
+
+def begins(flights: Flights, row: int) -> list[float]:
+    """Return the times, s, at which a vehicle begins to fly setpoints."""
+    return flights.times[np.diff(flights.obeying[row].astype(int), prepend=0) > 0].tolist()
+
+
+def test_a_handover_keeps_the_altitude_and_nothing_is_sent_unasked() -> None:
+    flights = fly(load('handover'), RUNS, True)
+    assert not flights.unasked[:, -1].any()
+    for row in range(len(RUNS)):
+        first, second = begins(flights, row)  # PX4 wants a stream of 1.5 s first
+        assert 10.0 < first < 12.0 and 42.0 < second < 44.0
+        for begin in (first, second):
+            height = flights.follower[row, during(flights, begin, begin + 1.0), 2]
+            assert np.ptp(height) < 0.1
+    taken_over = during(flights, 31.5, 44.0)  # until it is engaged again
+    assert in_state(flights, State.IDLE)[:, during(flights, 0.0, 9.9) | taken_over].all()
+    climbed = flights.follower[:, flights.times > 45.0, 2].mean(axis=1)
+    np.testing.assert_allclose(climbed, 3.5, atol=0.3)  # 2 m above the first altitude
+
+
+def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called() -> None:
+    flights = fly(load('restart'), RUNS, True)
+    dead, after = during(flights, 23.5, 35.0), during(flights, 40.0, 99.0)
+    assert not flights.unasked[:, -1].any() and not flights.obeying[:, dead].any()
+    assert in_state(flights, State.IDLE)[:, dead].all()
+    assert speed(flights)[:, during(flights, 33.0, 35.0)].max() < 0.1  # the autopilot holds
+    assert flights.obeying[:, after].all() and in_state(flights, State.TRACK)[:, after].all()
+
+
+def test_unseen_for_5_s_the_distance_stays_known_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors: list[float] = []
+
+    class Watched(Lookout):
+        def arrived(self, now: float) -> Any:
+            arrived = super().arrived(now)
+            if 16.0 < now < 20.0:
+                for row, (_, [reported]) in enumerate(arrived):
+                    estimate, world = reported.estimate, self._world
+                    assert reported.yaw is None and now - estimate.stamp < 0.2  # by its ranges
+                    away = np.linalg.norm(estimate.position - world.vio.position[row])
+                    errors.append(float(away - world.distances[row, 0]))
+            return arrived
+
+    monkeypatch.setattr(campaign, 'Lookout', Watched)
+    scenario = load('range_only_5s')
+    # The course of the leader depends on how long it is.
+    flights = fly(replace(scenario, outages=scenario.outages[:1]), range(100, 102), True)
+    assert len(errors) == 2 * 39 and np.abs(errors).max() < 0.4
+    assert measure(flights)['min_separation'].min() > 0.9
+
+
+def test_metrics_have_the_documented_meaning() -> None:
     n, k = 2, 11
-    leader = np.zeros((n, k, 3))
+    leader, follower, command = (np.zeros((n, k, 3)) for _ in range(3))
     leader[:, :, 0] = 2.0
-    follower = np.zeros((n, k, 3))
     follower[1, 5, 0] = 1.2
-    follower[1, 4, 2] = 0.2
     distance = np.linalg.norm(leader - follower, axis=2)
-    command = np.zeros((n, k, 3))
     command[0, 3, 0] = 0.5
-    seen = np.ones((n, k), dtype=bool)
-    seen[0, 2:5] = False
-    guarded = np.zeros((n, k), dtype=bool)
+    seen, guarded = np.ones((n, k), dtype=bool), np.zeros((n, k), dtype=bool)
+    seen[0, 2:5] = seen[1, 4:6] = False
     guarded[1, :2] = True
     flights = Flights(
         HOVER, 0.1 * np.arange(k), leader, follower, np.zeros((n, k, 3)), np.zeros((n, k, 3)),
         distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen,
         ~guarded, np.ones((n, k), dtype=bool), np.zeros((n, k)))
     m = measure(flights)
-    (left,) = band_exits(flights)
-    assert (left.row, left.near, left.unseen) == (1, True, 0.0)
-    assert str(left) == f'at 0.5 s too near, 0.80 m; {STATES[1].value}, leader seen'
+    assert band_exits(flights) == [
+        (1, f'at 0.5 s too near, 0.80 m; {STATES[1].value}, leader not seen for 0.2 s')]
     for name, values in {
             'in_band': [1.0, 0.0], 'min_separation': [2.0, 0.8], 'out_of_band': [0.0, 0.1],
             'guard_active': [0.0, 2 / 11], 'time_in_band': [1.0, 10 / 11],
-            'in_sight': [1.0, 9 / 11], 'out_of_sight': [0.0, 0.2], 'speed_share': [0.0, 0.0],
-            'detection_gap': [0.3, 0.0], 'jerk': [np.sqrt(2 * 5.0 ** 2 / 10), 0.0],
-            'tracking_error': [np.sqrt(4.5) - 2.0, m['tracking_error'][1]],
-            'handover_altitude': [0.0, 0.2]}.items():
+            'in_sight': [1.0, 9 / 11], 'speed_share': [0.0, 0.0],
+            'detection_gap': [0.3, 0.2], 'jerk': [np.sqrt(2 * 5.0 ** 2 / 10), 0.0],
+            'tracking_error': [np.sqrt(4.5) - 2.0, m['tracking_error'][1]]}.items():
         assert m[name].tolist() == pytest.approx(values), name
     whole = summary(joined([m, m]))
     assert (whole['runs'], whole['in_band'], whole['min_separation_m']) == (
@@ -192,13 +254,7 @@ def test_a_wrong_scenario_is_a_message_not_a_traceback(
     bad.write_text('summary: bad\nflight:\n  v_max: 99\n')
     assert main(['--scenario', str(bad), '--output', str(tmp_path)]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f'error: {bad}:3: flight.v_max = 99.0: must be a number in [0.05, 20] m/s')
-    twin = tmp_path / 'hover.yaml'
-    twin.write_text('summary: the same name\n')
-    assert main(['--scenario', 'hover', str(twin)]) == 1
-    assert 'another scenario has the name hover' in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(['--runs', '0'])
+        f'error: {bad}: flight.v_max = 99.0: must be a number in [0.05, 20] m/s')
 
 
 def children(parent: int) -> list[str]:
@@ -237,14 +293,9 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
     for k in range(1, 360):
         world.advance(k)
         lookout.look(k)
-        for own in world.odometry(k * STEP):
-            if k > 60:
-                assert own is not None
-                ages.append(k * STEP - own.stamp)
+        ages += [k * STEP - own.stamp for own in world.odometry(k * STEP) if own and k > 60]
         images += [k * STEP - seen[0].estimate.stamp for _, seen in lookout.arrived(k * STEP)
                    if seen]
-    assert min(ages) == pytest.approx(0.06, abs=STEP)
-    assert max(ages) == pytest.approx(0.16, abs=STEP)
+    assert [min(ages), max(ages)] == pytest.approx([0.06, 0.16], abs=STEP)
     # An image waits for the odometry after it.
-    assert min(images) >= 0.06 - 1e-9
-    assert max(images) < 0.1 + 0.06 + 2 / 30
+    assert min(images) + 1e-9 >= 0.06 and max(images) < 0.16 + 2 / 30

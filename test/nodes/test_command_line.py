@@ -78,9 +78,9 @@ def refused(capfd: pytest.CaptureFixture[str], node: str, *arguments: str) -> st
     ('simulator', '--ros-args -p scenari:=indoor', 'did you mean scenario?'),
     ('simulator', '--ros-args -p connection:=192.168.1.9:14540', 'must be a loopback address'),
     ('simulator', '--ros-args -p vehicle:=external -p leader_topic:=/ahead/truth/motion',
-     "only with vehicle = 'embedded'"),
+     "not with vehicle = 'external'"),
     ('simulator', '--ros-args -p leader_truth_connection:=udpin:127.0.0.1:19411',
-     "only with vehicle = 'external'"),
+     "not with vehicle = 'embedded'"),
     ('simulator', '--ros-args -p vehicle:=external -p truth_connection:=udpin:127.0.0.1:0 '
      '-p leader_truth_connection:=tcp:5772', "'tcp:5772': must be udpin:HOST:PORT"),
     ('replay', '', 'no bag given; usage: replay BAG'),

@@ -114,15 +114,11 @@ def test_only_the_law_keeps_the_band_in_both_scenarios(
     assert [f'{float(r["to 1 % [s]"]):.2f}' for r in rows[:2]] == ['5.64', '1.98']  # for good
 
 
-@pytest.mark.parametrize(('arguments', 'name', 'least_rows'), [
-    (['--agents', '8', '--neighbors', 'nearest'], 'flock_flocking_nearest_8_2d_seed1', 20),
-    (['--agents', '8', '--model', 'vicsek'], 'flock_vicsek_all_8_2d_seed1', 10)])
-def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path, arguments: list[str],
-                                                    name: str, least_rows: int) -> None:
-    assert figures.main(['--out', str(tmp_path), '--duration', '1', *arguments]) == 0
-    assert {p.name for p in tmp_path.iterdir()} == {f'{name}.{kind}'
-                                                    for kind in ('png', 'svg', 'pdf', 'csv')}
-    assert len(read(tmp_path / f'{name}.csv')) > least_rows
+def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path) -> None:
+    assert figures.main(['--out', str(tmp_path), '--duration', '1', '--agents', '8']) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {
+        f'flock_8_2d_seed1.{kind}' for kind in ('png', 'svg', 'pdf', 'csv')}
+    assert len(read(tmp_path / 'flock_8_2d_seed1.csv')) > 20
 
 
 def write_flight(folder: Path, scenario: str = 'indoor') -> None:
