@@ -339,7 +339,7 @@ def test_an_estimate_is_refused_as_truth_exactly_if_odometry_is_forwarded(tmp_pa
     (['--scenario', 'outdor'], "scenario = 'outdor': must be one of approach, "),
     (['--scenario', 'nowhere.yaml'], 'nowhere.yaml: cannot be read'),
     (['--scenario', 'handover'],
-     "scenario = 'handover': its operations are obeyed in lock step only: "
+     "scenario = 'handover': its operations can be flown in lock step only: "
      'flights --scenario handover\n'),
     (['--autopilot', '127.0.0.1:14540'], "connection = '127.0.0.1:14540': must be udpin:"),
     (['--autopilot', 'tcp:127.0.0.1:5760', '--truth', 'tcp:127.0.0.1'], 'must be udpin:'),
