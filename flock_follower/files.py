@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import os
 from pathlib import Path
 import sys
 from typing import BinaryIO
@@ -47,7 +48,7 @@ def resource(relative: str) -> Path:
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     """
-    Open a file for writing that gets its name only once everything is in it.
+    Open a file for writing that gets its name only once everything in it is on the disk.
 
     :raises OSError: naming the file, if it cannot be written; nothing is left of it then.
     """
@@ -56,6 +57,8 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
         with part.open('wb') as file:
             yield file
+            file.flush()
+            os.fsync(file.fileno())
         part.replace(path)
     except BaseException as error:
         with suppress(OSError):

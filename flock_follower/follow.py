@@ -52,11 +52,11 @@ def main(args: Sequence[str] | None = None) -> int:
               'package in package.xml', file=sys.stderr)
         return 2
     try:
-        seen = observe(SECONDS, options.namespace, {}, None, '')
+        seen = observe(SECONDS, options.namespace, {}, '')
     except KeyboardInterrupt:
         return 130
     findings = judge_all(seen)
-    print(table(seen, findings, colours=sys.stdout.isatty()))
+    print(table(seen, findings))
     return fly(options.namespace) if ready(findings) else 1
 
 

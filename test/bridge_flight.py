@@ -50,34 +50,6 @@ MODES = {'px4': Modes('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND', 'POSCTL', 'AUTO.LO
          'arducopter': Modes('GUIDED', 'BRAKE', 'LAND', 'STABILIZE', 'LOITER')}
 
 
-class SlowWire(MemoryLine):
-    """A serial line, as slow as its baud rate; what fills its buffer is refused."""
-
-    def __init__(self, baud=57600):
-        super().__init__()
-        self.capacity = baud / 10
-        self._queue = b''
-        self._carried = 0.0
-
-    def congested(self):
-        return len(self._queue) > 0.02 * self.capacity
-
-    def write(self, data):
-        if len(self._queue) + len(data) > 4096:
-            return False
-        self._queue += data
-        return True
-
-    def carry(self, seconds):
-        """Let time pass on the line."""
-        self._carried = min(self._carried + seconds * self.capacity, float(len(self._queue)))
-        count = int(self._carried)
-        self._carried -= count
-        if count:
-            self.written.append(self._queue[:count])
-            self._queue = self._queue[count:]
-
-
 class Flight(SteppedAutopilot):
     """A bridge and a vehicle, hovering or landed; ``planner`` is asked each 0.1 s."""
 
@@ -105,8 +77,6 @@ class Flight(SteppedAutopilot):
         for _ in range(round(seconds / STEP)):
             now = self.now
             answers = self.autopilot.step(now)
-            if isinstance(self.wire, SlowWire):
-                self.wire.carry(STEP)
             for data in self.wire.written:
                 self.received += [(now, m) for m in self.codec.parse_buffer(data) or []]
                 answers += self.autopilot.receive(data, now)

@@ -25,9 +25,12 @@ import math
 import random
 import re
 
-NASTY_FLOATS = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1.7e308, -1.7e308, 1e155, 5e-324, 1e-9,
-                1.0, -1.0)
-NASTY_FLOATS32 = (math.nan, math.inf, -math.inf, 0.0, 3e38, -3e38, 1e-45, 1.0)
+import numpy as np
+
+_FLOATS = {
+    'double': (math.nan, math.inf, -math.inf, 0.0, -0.0, 1.7e308, -1.7e308, 1e155, 5e-324, 1e-9,
+               1.0, -1.0),
+    'float': (math.nan, math.inf, -math.inf, 0.0, 3e38, -3e38, 1e-45, 1.0)}
 NASTY_STRINGS = (
     '', 'odom', 'map', 'base_link', 'leader', 'plumb_bob', 'fisheye', 'mono8', 'bgr8', 'mono16',
     'bayer_rggb8', 'yuv422_yuy2', 'jpeg', 'x' * 300, 'z\u00fc\u2028r\n', ' ', '../../etc',
@@ -35,8 +38,8 @@ NASTY_STRINGS = (
 _INTEGERS = {f'{sign}int{bits}': (0 if sign else -2**(bits - 1), 2**(bits - (not sign)) - 1)
              for sign in ('', 'u') for bits in (8, 16, 32, 64)}
 _INTEGERS |= {'octet': (0, 255), 'byte': (0, 255), 'char': (0, 255)}
-_ARRAY = re.compile(r'(.*)\[(\d+)\]')
-_SEQUENCE = re.compile(r'sequence<(.*?)(?:, *(\d+))?>')
+#: An array of fixed length, or a sequence.
+_SEVERAL = re.compile(r'(.*)\[(\d+)\]|sequence<(.*?)(?:, *\d+)?>')
 
 
 class MessageFuzzer:
@@ -46,7 +49,7 @@ class MessageFuzzer:
         self.random = random.Random(seed)
 
     def any_message(self, message_class):
-        """Return a message all of whose fields are by lot."""
+        """Return a message with a random value in every field."""
         message = message_class()
         for name, kind in message_class.get_fields_and_field_types().items():
             setattr(message, name, self.value(kind))
@@ -55,14 +58,14 @@ class MessageFuzzer:
     def value(self, kind):
         """Return a value of a type, as get_fields_and_field_types names it."""
         r = self.random
-        if match := _SEQUENCE.fullmatch(kind):
-            longest = min(int(match[2] or 4), 4)
-            return self._several(match[1], r.randint(0, longest))
-        if match := _ARRAY.fullmatch(kind):
-            return self._several(match[1], int(match[2]))
-        if kind in ('double', 'float'):
-            nasty = NASTY_FLOATS if kind == 'double' else NASTY_FLOATS32
-            return r.choice(nasty) if r.random() < 0.4 else r.gauss(0.0, 10.0 ** r.randint(-3, 3))
+        if match := _SEVERAL.fullmatch(kind):
+            element, count = match[1] or match[3], int(match[2] or 0) or r.randint(0, 4)
+            if element == 'uint8':
+                return r.randbytes(count * r.choice((1, 1, 50)) if not match[2] else count)
+            return [self.value(element) for _ in range(count)]
+        if kind in _FLOATS:
+            return r.choice(_FLOATS[kind]) if r.random() < 0.4 else (
+                r.gauss(0.0, 10.0 ** r.randint(-3, 3)))
         if kind in _INTEGERS:
             low, high = _INTEGERS[kind]
             value = r.choice((low, high, 0, 1, r.randint(low, high), r.randint(0, min(high, 99))))
@@ -71,35 +74,25 @@ class MessageFuzzer:
             return r.random() < 0.5
         if kind.startswith('string'):
             return r.choice(NASTY_STRINGS)
-        return self.any_message(class_of(kind))
+        package, name = kind.split('/')
+        return self.any_message(getattr(import_module(f'{package}.msg'), name))
 
     def spoil(self, message, count=1):
-        """Put a value by lot into ``count`` fields by lot, however deep."""
-        for _ in range(count):
-            self._spoil_one(message)
-        return message
-
-    def _spoil_one(self, message):
+        """Put a random value into ``count`` random fields, however deep."""
         r = self.random
-        name, kind = r.choice(list(message.get_fields_and_field_types().items()))
-        inner, array = getattr(message, name), _ARRAY.fullmatch(kind)
-        part = r.choice(inner) if isinstance(inner, list) and inner else inner
-        if hasattr(part, 'get_fields_and_field_types') and r.random() < 0.9:
-            self._spoil_one(part)
-            return
-        value = self.value(kind)
-        if array and r.random() < 0.7:
-            value = list(inner)
-            value[r.randrange(len(value))] = self.value(array[1])
-        setattr(message, name, value)
-
-    def _several(self, kind, count):
-        if kind == 'uint8':
-            return self.random.randbytes(count * self.random.choice((1, 1, 50)) if count else 0)
-        return [self.value(kind) for _ in range(count)]
-
-
-def class_of(kind):
-    """Return the class of a type named 'package/Name'."""
-    package, name = kind.split('/')
-    return getattr(import_module(f'{package}.msg'), name)
+        for _ in range(count):
+            part = message
+            while True:
+                name, kind = r.choice(list(part.get_fields_and_field_types().items()))
+                inner = getattr(part, name)
+                inner = r.choice(inner) if isinstance(inner, list) and inner else inner
+                if not hasattr(inner, 'get_fields_and_field_types') or r.random() < 0.1:
+                    break
+                part = inner
+            value = self.value(kind)
+            array = getattr(part, name)
+            if isinstance(array, np.ndarray) and array.size and r.random() < 0.7:
+                kept = np.arange(array.size) != r.randrange(array.size)
+                value = np.where(kept, array, value).tolist()
+            setattr(part, name, value)
+        return message

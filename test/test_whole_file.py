@@ -32,20 +32,12 @@ def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize('old', [b'', b'old'])
-def test_what_a_full_disk_cuts_short_is_not_left(tmp_path: Path, old: bytes) -> None:
+@pytest.mark.parametrize(('size', 'error'), [(100_000, OSError), (10, KeyboardInterrupt)])
+def test_a_part_is_not_left_by_a_full_disk_or_an_interrupt(
+        tmp_path: Path, size: int, error: type[BaseException]) -> None:
     path = tmp_path / 'x'
-    if old:
-        path.write_bytes(old)
-    with disk_of(1000), pytest.raises(OSError, match='File too large') as error, \
-            whole_file(path) as file:
-        file.write(bytes(100_000))
-    assert error.value.filename == str(path)
-    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([old] if old else [])
-
-
-def test_an_interrupted_one_is_not_left_either(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), whole_file(tmp_path / 'x') as file:
-        file.write(b'half')
+    with disk_of(1000), pytest.raises(error) as caught, whole_file(path) as file:
+        file.write(bytes(size))
         raise KeyboardInterrupt
+    assert getattr(caught.value, 'filename', str(path)) == str(path)
     assert not list(tmp_path.iterdir())

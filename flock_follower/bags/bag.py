@@ -25,22 +25,20 @@ chunks compressed with bz2.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-import struct
 from typing import Any, NamedTuple
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from flock_follower.bags.description import incomplete, is_latched, mcap_files, METADATA
-from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
-from flock_follower.bags.unfinished import missing_end, UnfinishedReader
+from flock_follower.bags.description import incomplete, mcap_files, METADATA
+from flock_follower.bags.message_types import migration_obstacle, typestore
+from flock_follower.bags.unfinished import has_end, UnfinishedReader
 
-_CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
 _UNREADABLE = 'corrupt, truncated or unsupported'
 
 
@@ -109,9 +107,8 @@ class Bag(AbstractContextManager['Bag']):
                 self.skipped[name] = why
             else:
                 self.topics[name] = Topic(
-                    name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
-                    any(c.ext.latching if isinstance(c.ext, ConnectionExtRosbag1) else
-                        is_latched(c) for c in connections))
+                    name, connections[0].msgtype, sum(c.msgcount for c in connections),
+                    any(map(_latched, connections)))
         self._connections = groups
 
     @property
@@ -156,7 +153,9 @@ class Bag(AbstractContextManager['Bag']):
                     start=start_ns, stop=stop_ns):
                 topic = self.topics[absolute(connection.topic)]
                 yielded += 1
-                yield BagMessage(topic.name, topic.msgtype, stamp_ns, _cdr(raw, topic, connection))
+                if isinstance(connection.ext, ConnectionExtRosbag1):
+                    raw = bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
+                yield BagMessage(topic.name, topic.msgtype, stamp_ns, raw)
         announced = sum(self.topics[name].count for name in names)
         if start_ns is None and stop_ns is None and yielded != announced:
             raise BagError(
@@ -175,7 +174,7 @@ def open_bag(path: str | Path) -> Bag:
     """
     Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
 
-    One that was never finished is read as far as it goes, see ``Bag.incomplete``.
+    One in MCAP that was never finished is read as far as it goes, see ``Bag.incomplete``.
 
     :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
     """
@@ -185,13 +184,14 @@ def open_bag(path: str | Path) -> Bag:
     if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
     with failures(path, _UNREADABLE):
-        cut = missing_end(path)
-    reason = incomplete(path) or cut
+        files = mcap_files(path) if path.is_dir() else [path] if path.suffix == '.mcap' else []
+        reason = incomplete(path) or _missing_end(path, files)
+        reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader
+        if files and reason:
+            reader = UnfinishedReader(files)
+        else:
+            reader = Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path)
     with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
-        for database in path.glob('*.db3') if path.is_dir() else [path]:
-            if problem := _sqlite3_problem(database):
-                raise BagError(f'{database}: {problem}')
-        reader = _reader(path, bool(cut or (reason and path.is_dir() and mcap_files(path))))
         reader.open()
         bag = Bag(path, reader, reason)
         if bag.message_count == 0:
@@ -201,17 +201,14 @@ def open_bag(path: str | Path) -> Bag:
     return bag
 
 
-def _reader(path: Path, unfinished: bool) -> Rosbag1Reader | Rosbag2Reader | UnfinishedReader:
-    if unfinished:
-        return UnfinishedReader(path)
-    if path.suffix == '.bag' and not path.is_dir():
-        return Rosbag1Reader(path)
-    if path.is_dir() and not (path / METADATA).is_file():
-        databases = list(path.glob('*.db3'))
-        if not incomplete(path) or len(databases) != 1:
-            raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
-        path = databases[0]
-    return Rosbag2Reader(path)
+def _missing_end(path: Path, files: Sequence[Path]) -> str:
+    """Return what MCAP files lack that those of a finished bag have, or ''."""
+    for file in files:
+        if not has_end(file):
+            return f'{file.name} was cut short'
+    if files and path.is_dir() and not (path / METADATA).is_file():
+        return 'no metadata.yaml in it'
+    return ''
 
 
 @contextmanager
@@ -221,17 +218,11 @@ def failures(subject: str | Path, what: str) -> Iterator[None]:
         yield
     except BagError:
         raise
+    except OSError as error:
+        raise BagError(f'{subject}: {error.strerror or error}') from error
     except Exception as error:  # struct, yaml, sqlite, zlib, assertion and type errors alike
-        reason = reason_of(error)
-        if isinstance(error, OSError) and error.strerror:
-            raise BagError(f'{subject}: {reason}') from error
+        reason = ' '.join(str(error).split())
         raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
-
-
-def reason_of(error: Exception) -> str:
-    """Return what an exception says, in one line."""
-    strerror = error.strerror if isinstance(error, OSError) else None
-    return strerror or ' '.join(str(error).split())
 
 
 def absolute(topic: str) -> str:
@@ -239,9 +230,16 @@ def absolute(topic: str) -> str:
     return f'/{topic.strip("/")}'
 
 
+def _latched(connection: Connection) -> bool:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return bool(connection.ext.latching)
+    return any(qos.durability is QosDurability.TRANSIENT_LOCAL
+               for qos in connection.ext.offered_qos_profiles)
+
+
 def _unreadable(connections: list[Connection]) -> str | None:
     """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
-    msgtypes = sorted({ros2_type(c.msgtype) for c in connections})
+    msgtypes = sorted({c.msgtype for c in connections})
     if len(msgtypes) > 1:
         return f'several types on one topic ({", ".join(msgtypes)})'
     for connection in connections:
@@ -251,33 +249,3 @@ def _unreadable(connections: list[Connection]) -> str | None:
         elif reason := migration_obstacle(connection.msgtype, connection.msgdef.data):
             return reason
     return None
-
-
-def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
-    if isinstance(connection.ext, ConnectionExtRosbag1):
-        return bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
-    if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
-        raise ValueError(f'a message of {topic.name} has no valid CDR header')
-    return raw
-
-
-def _sqlite3_problem(path: Path) -> str:
-    """
-    Return why a ``.db3`` file lost its end or was never closed; '' for all others.
-
-    SQLite reads a file cut in its last pages, and one whose newest rows still lie in a
-    write-ahead log, as if nothing were missing. Its header counts the pages (offsets: page
-    size 16, change counter 24, pages 28, change counter the page count is valid for 92).
-    """
-    with path.open('rb') as file:
-        header = file.read(100)
-    if path.suffix != '.db3' or len(header) < 100:
-        return ''
-    page_size, changes, pages, valid_for = struct.unpack('>16xH6xII60xI4x', header)
-    size = pages * (65536 if page_size == 1 else page_size)
-    if changes == valid_for and path.stat().st_size < size:
-        return f'truncated: {path.stat().st_size} of {size} bytes'
-    log = Path(f'{path}-wal')
-    if log.exists() and log.stat().st_size:
-        return f'recording was not closed: {log.name} holds part of it'
-    return ''

@@ -16,51 +16,39 @@
 The files beside the data of a recording: its ``metadata.yaml``, and the mark of an unfinished one.
 
 A bag's folder holds a file MARK from when it is made until it is finished. If writing ended
-otherwise (a full disk, an exception, a kill), the mark stays and says why, as far as it is known.
+otherwise (a full disk, an exception, a kill), the mark stays.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Sequence
 import json
-import os
 from pathlib import Path
-import shutil
-from typing import NamedTuple
+from typing import Any
 
-from rosbags.interfaces import Connection, QosDurability
-from rosbags.rosbag2 import Reader
+from flock_follower.bags.mcap_file import McapFile, RecordedTopic, type_hash
+from flock_follower.files import whole_file
 
-from flock_follower.bags.mcap_file import end_mcap, RecordedTopic, type_hash
-
-#: The file in a bag's folder that says that the bag was not finished, and why.
+#: The file in a bag's folder until the bag is finished.
 MARK = 'INCOMPLETE.txt'
 METADATA = 'metadata.yaml'
-_MARK_SIZE = 400
-_UNFINISHED = 'still being written, or the process that wrote it was killed'
+_UNFINISHED = 'still being written, or the process that wrote it failed or was killed'
 
 
-def mark_incomplete(folder: Path, reason: str = _UNFINISHED) -> None:
+def mark_incomplete(folder: Path) -> None:
     """
-    Mark a bag as not finished, and say why.
+    Mark a bag as not finished.
 
-    An existing mark is overwritten in place: a full disk has no room for a new file.
-
-    :raises OSError: there is no mark yet, and none can be made.
+    :raises OSError: that cannot be written.
     """
-    text = f'This bag is incomplete: {" ".join(reason.split())}'.encode()[:_MARK_SIZE - 1]
-    with (folder / MARK).open('r+b' if (folder / MARK).exists() else 'wb') as file:
-        file.write(text.ljust(_MARK_SIZE - 1) + b'\n')
+    (folder / MARK).write_text(f'This bag is incomplete: {_UNFINISHED}\n')
 
 
 def incomplete(path: Path) -> str:
     """Return why a bag, its folder or the file in it, was not finished; '' if it was."""
-    mark = (path if path.is_dir() else path.parent) / MARK
-    with suppress(OSError):
-        return mark.read_text(errors='replace').partition(': ')[2].strip() or _UNFINISHED
-    return ''
+    folder = path if path.is_dir() else path.parent
+    return _UNFINISHED if (folder / MARK).exists() else ''
 
 
 def mcap_files(folder: Path) -> list[Path]:
@@ -69,92 +57,34 @@ def mcap_files(folder: Path) -> list[Path]:
                   key=lambda file: (len(file.name), file.name))
 
 
-class Facts(NamedTuple):
-    """The content of a file: messages by topic, and the stamps of the first and the last, ns."""
-
-    counts: Mapping[RecordedTopic, int]
-    start_ns: int
-    end_ns: int
-
-
-def finish(path: Path) -> None:
+def finish(folder: Path, files: Sequence[McapFile]) -> None:
     """
-    Finish a recording, also one that was broken off; an empty one is deleted.
+    Write the ``metadata.yaml`` of a bag of several closed files, and remove its mark.
 
-    Damaged files stay in place, but are no part of the recording any more.
-
-    :raises OSError: it cannot be written.
+    :raises OSError: if that fails.
     """
-    facts = {}
-    for file in mcap_files(path):
-        end_mcap(file)
-        found = facts_of(file)
-        if found is not None and found.counts:
-            facts[file] = found
-        elif found is not None:
-            file.unlink()
-    if not mcap_files(path):
-        shutil.rmtree(path)
-        return
-    describe(path, facts)
-    (path / MARK).unlink()
-
-
-def facts_of(file: Path) -> Facts | None:
-    """Return the content of a finished file; None if it is damaged."""
-    try:
-        with Reader(file) as reader:
-            counts = {RecordedTopic(one.topic, one.msgtype, is_latched(one)): one.msgcount
-                      for one in reader.connections if one.msgcount}
-            return Facts(counts, reader.start_time, reader.end_time - 1)
-    except Exception:  # whatever a damaged file makes rosbags raise
-        return None
-
-
-def is_latched(connection: Connection) -> bool:
-    """Return whether a topic of a ROS 2 bag is transient local."""
-    return any(qos.durability is QosDurability.TRANSIENT_LOCAL
-               for qos in connection.ext.offered_qos_profiles)
-
-
-def describe(folder: Path, files: Mapping[Path, Facts]) -> None:
-    """Write the ``metadata.yaml`` of a bag of several files, as rosbag2 wants it; JSON is YAML."""
     counts: Counter[RecordedTopic] = Counter()
-    for facts in files.values():
-        counts.update(facts.counts)
-    replace(folder / METADATA, json.dumps({'rosbag2_bagfile_information': {
-        'version': 9, 'storage_identifier': 'mcap', 'compression_format': '',
-        'compression_mode': '', 'custom_data': None, 'ros_distro': 'jazzy',
-        'relative_file_paths': [file.name for file in files],
-        'message_count': counts.total(), **_span(files.values()),
-        'files': [{'path': file.name, 'message_count': sum(facts.counts.values()),
-                   **_span([facts])} for file, facts in files.items()],
-        'topics_with_message_count': [{
-            'topic_metadata': {
-                'name': topic.name, 'type': topic.msgtype, 'serialization_format': 'cdr',
-                'offered_qos_profiles': topic.qos,
-                'type_description_hash': type_hash(topic.msgtype)},
-            'message_count': count} for topic, count in counts.items()]}}, indent=1).encode())
+    for file in files:
+        counts.update(file.counts)
+    with whole_file(folder / METADATA) as metadata:  # as rosbag2 has it; JSON is YAML
+        metadata.write(json.dumps({'rosbag2_bagfile_information': {
+            'version': 9, 'storage_identifier': 'mcap', 'compression_format': '',
+            'compression_mode': '', 'custom_data': None, 'ros_distro': 'jazzy',
+            'relative_file_paths': [file.path.name for file in files],
+            'message_count': counts.total(), **_span(files),
+            'files': [{'path': file.path.name, 'message_count': file.counts.total(),
+                       **_span([file])} for file in files],
+            'topics_with_message_count': [{
+                'topic_metadata': {
+                    'name': topic.name, 'type': topic.msgtype, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': topic.qos,
+                    'type_description_hash': type_hash(topic.msgtype)},
+                'message_count': count} for topic, count in counts.items()]}}, indent=1).encode())
+    (folder / MARK).unlink()
 
 
-def _span(files: Iterable[Facts]) -> dict[str, dict[str, int]]:
-    filled = [facts for facts in files if facts.counts]
-    start = min((facts.start_ns for facts in filled), default=0)
-    end = max((facts.end_ns for facts in filled), default=0)
+def _span(files: Sequence[McapFile]) -> dict[str, Any]:
+    start = min((file.start_ns for file in files if file.counts), default=0)
+    end = max((file.end_ns for file in files), default=0)
     return {'starting_time': {'nanoseconds_since_epoch': start},
             'duration': {'nanoseconds': end - start}}
-
-
-def replace(path: Path, data: bytes) -> None:
-    """Write a small file: whatever happens, it is whole, or as before."""
-    part = path.with_name(f'{path.name}.part')
-    try:
-        with part.open('wb') as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        with suppress(OSError):
-            part.unlink()
-        raise

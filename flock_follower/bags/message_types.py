@@ -25,7 +25,6 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-_ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 _ZEROS: dict[str, Any] = {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}
 _BYTES = dict.fromkeys(('byte', 'octet', 'char'), 'uint8')
 
@@ -63,24 +62,18 @@ def _zero(description: Any) -> Callable[[], Any]:
     return lambda: [_zero(element)() for _ in range(count)]
 
 
-def ros2_type(msgtype: str) -> str:
-    """Return the ROS 2 name of a message type, which may be one of ROS 1."""
-    return _ROS1_RENAMES.get(msgtype, msgtype)
-
-
 def migration_obstacle(msgtype: str, definition: str) -> str | None:
     """
     Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None.
 
     :param definition: the definition recorded in the bag, with those of the types it holds.
     """
-    target = ros2_type(msgtype)
-    if target not in typestore().types:
+    if msgtype not in typestore().types:
         return f'type {msgtype} does not exist in ROS 2 Jazzy'
     source = get_typestore(Stores.EMPTY)
     try:
         source.register(get_types_from_msg(definition, msgtype))
-        same = _layout(source, msgtype) == _layout(typestore(), target)
+        same = _layout(source, msgtype) == _layout(typestore(), msgtype)
     except Exception as error:  # the definition is the recorder's text: anything can be wrong
         return f'definition of {msgtype} not understood ({type(error).__name__})'
     return None if same else f'type {msgtype} has other fields in ROS 2 Jazzy'

@@ -16,7 +16,7 @@
 Recordings in flight: one folder each, in files of limited size, of which the oldest make way.
 
 Each recording is a ROS 2 bag of several MCAP files. The data is on the disk when ``write``
-returns. Whatever is at hand goes with it as files beside them, see ``note``.
+returns. Text files lie beside them, see ``note``.
 """
 
 from __future__ import annotations
@@ -32,128 +32,96 @@ import re
 import shutil
 import time
 
-from flock_follower.bags.description import (
-    describe,
-    Facts,
-    facts_of,
-    finish,
-    incomplete,
-    mark_incomplete,
-    mcap_files,
-    METADATA,
-    replace,
-)
+from flock_follower.bags.description import finish, mark_incomplete, mcap_files, METADATA
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.schedule import NANOSECONDS
+from flock_follower.files import whole_file
 
 #: The name of the folder of a recording; the group is its number.
 NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
 _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
-_STEP = NANOSECONDS  # by which a clock may go back within a recording ...
-_FORWARD = 10.0  # s: ... and ahead, of a computer that gets the time from the network
+_CLOCK_STEP = 5.0  # s by which a clock may be set, back or ahead, within a recording
 _MEGABYTE = 1_000_000
+FILE_SIZE = 64.0  # MB, from which on the next file begins
+KEPT = 10  # the newest files, which are never deleted
 
 
 @dataclass(frozen=True)
 class Limits:
-    """
-    What recordings may take of a disk, MB: each file, all of them, and what stays free.
-
-    ``kept`` is the time, s, back from now of which nothing is deleted to keep to ``disk_used``.
-    """
+    """What recordings may take of a disk, and what stays free, MB."""
 
     disk_used: float
     disk_free: float
-    file_size: float = 64.0
-    kept: float = 600.0
 
 
 class FlightRecording:
     """
     The recordings in a folder, and the current one, which begins with the first message.
 
-    Interrupted recordings are completed. ``now`` is s of a monotonic clock throughout.
-
     :param folder: for the recordings of one vehicle; created if missing.
-    :param clock: the time of day, s since 1970.
-    :raises OSError: it cannot be read or made, or another process records there.
+    :raises OSError: it cannot be made, or another process records there.
     """
 
-    def __init__(self, folder: Path, limits: Limits, now: float, clock: float) -> None:
+    def __init__(self, folder: Path, limits: Limits) -> None:
         self.folder = folder
         self.path: Path | None = None
         self._limits = limits
         self._lock = _locked(folder)
-        self._file: McapFile | None = None
-        self._number = 0
+        self._files: list[McapFile] = []  # of the current recording
+        self._file: McapFile | None = None  # the last of them, while it is open
         self._last = 0
         self._looked = -_LOOK_PERIOD
         self._latched: dict[RecordedTopic, bytes] = {}
         self._notes: dict[str, str] = {}
-        self._facts: dict[Path, Facts] = {}
-        # When each file was written last; that of a clock which is wrong is taken for new.
-        self._written: dict[Path, float] = {}
-        self._ahead: float | None = None  # the time of day of the last message less ``now``, s
-        try:
-            for earlier in self._recordings():
-                for file in mcap_files(earlier):
-                    self._written[file] = now - max(clock - file.stat().st_mtime, 0.0)
-                if incomplete(earlier):
-                    with suppress(OSError):  # a full disk, or not ours: it can be read as it is
-                        finish(earlier)
-        except OSError:
-            os.close(self._lock)
-            raise
+        self._ahead: float | None = None  # the first stamp of the last write less ``now``, s
 
     def note(self, name: str, text: str) -> None:
         """
-        Have a file beside the recording, and beside those that follow.
+        Write a text file beside the recording, and beside those that follow.
 
         :raises OSError: it cannot be written.
         """
-        if self._notes.get(name) != text:
-            self._notes[name] = text
-            if self.path is not None:
-                replace(self.path / name, text.encode())
+        self._notes[name] = text
+        if self.path is not None:
+            with whole_file(self.path / name) as file:
+                file.write(text.encode())
 
     def write(self, messages: Sequence[TakenMessage], now: float) -> None:
         """
         Write messages and have them on the disk.
 
-        :raises OSError: if that fails; nothing of the messages is kept then, the file is
+        :param now: s of a monotonic clock.
+        :raises OSError: if that fails; none of the messages is kept then, the file is
             closed, and the next ones go into a new one.
         """
         if not messages:
             return
         first = min(message.stamp_ns for message in messages)
-        ahead, before = max(m.stamp_ns for m in messages) * 1e-9 - now, self._ahead
-        if first < self._last - _STEP or (  # the clock was set, back or ahead
-                before is not None and ahead - before > _FORWARD):
+        before, self._ahead = self._ahead, first / NANOSECONDS - now
+        if before is not None and abs(self._ahead - before) > _CLOCK_STEP:
             self._end()
-        self._ahead = ahead
         if now - self._looked >= _LOOK_PERIOD:
             self._looked = now
-            self._make_room(now)
+            self._make_room()
         # They come once: each file has them, as the oldest make way.
         latched = [TakenMessage(topic, first, data) for topic, data in self._latched.items()]
         self._latched.update({
             message.topic: message.data for message in messages if message.topic.latched})
-        # Readers want files that have no index in order.
+        # Readers need files that have no index in order.
         try:
-            file = self._opened(first, now)
+            file = self._opened(first)
             file.write([message._replace(stamp_ns=max(message.stamp_ns, self._last))
                         for message in (*(() if file.counts else latched), *messages)])
         except OSError:
             self._close_file()
             raise
         self._last = file.end_ns
-        self._written[file.path] = now
-        if file.size >= self._limits.file_size * _MEGABYTE:
+        if file.size >= FILE_SIZE * _MEGABYTE:
             self._close_file()
 
     def close(self) -> None:
         """
-        Finish the recording under way.
+        Finish the current recording.
 
         :raises OSError: if that fails; the recording stays readable.
         """
@@ -164,94 +132,68 @@ class FlightRecording:
 
     def _end(self) -> None:
         self._close_file()
-        path, self.path, self._last = self.path, None, 0
-        if path is not None:
-            finish(path)
+        path, files = self.path, [file for file in self._files if file.path.exists()]
+        self.path, self._files, self._last = None, [], 0
+        if path is not None and files:
+            finish(path, files)
 
-    def _opened(self, stamp_ns: int, now: float) -> McapFile:
+    def _opened(self, stamp_ns: int) -> McapFile:
         """Return the file to write to."""
         if self.path is None:
             numbers = [int(path.name.partition('_')[0]) for path in self._recordings()]
             began = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(stamp_ns // NANOSECONDS))
             path = self.folder / f'{max(numbers, default=0) + 1:04d}_{began}'
-            path.mkdir(parents=True)
+            path.mkdir()
             mark_incomplete(path)
+            self.path = path
             for name, text in self._notes.items():
-                replace(path / name, text.encode())
-            self.path, self._number = path, 0
+                self.note(name, text)
             _sync(self.folder)
         if self._file is None:
-            self._file = McapFile(self.path / f'{self.path.name}_{self._number}.mcap')
-            self._number += 1
-            self._written[self._file.path] = now
+            self._file = McapFile(self.path / f'{self.path.name}_{len(self._files)}.mcap')
+            self._files.append(self._file)
             _sync(self.path)
         return self._file
 
     def _close_file(self) -> None:
         file, self._file = self._file, None
-        if file is None:
-            return
-        with suppress(OSError):  # without its summary it is read, too
-            file.close()
-        with suppress(OSError):
+        if file is not None:
+            with suppress(OSError):  # without its summary it is read, too
+                file.close()
             if not file.counts:
-                self._delete(file.path)
-            else:
-                self._describe(file.path.parent)
+                file.path.unlink()
 
     def _recordings(self) -> list[Path]:
-        return sorted((path for path in self.folder.iterdir()
-                       if NAME.fullmatch(path.name) and path.is_dir()),
+        return sorted((path for path in self.folder.iterdir() if NAME.fullmatch(path.name)),
                       key=lambda path: int(path.name.partition('_')[0]))
 
-    def _make_room(self, now: float) -> None:
+    def _make_room(self) -> None:
         """
-        Delete the oldest files where recordings take too much, or little of the disk is free.
+        Delete the oldest files if recordings take too much, or little of the disk is free.
 
         :raises OSError: too little is free, and there is nothing more to delete.
         """
         limits = self._limits
-        sizes = {file: file.stat().st_size for path in self._recordings()
-                 for file in mcap_files(path)}
-        used = sum(sizes.values())
-        if self._file is not None:
-            sizes.pop(self._file.path)
-        # If another program fills the disk, deleting new recordings would not help.
-        helps = _free(self.folder) + sum(sizes.values()) > _MEGABYTE * (
-            limits.disk_free + limits.file_size)
-        for oldest, size in sizes.items():
-            old = now - self._written.get(oldest, now) > limits.kept
-            if not (self._little_room and (helps or old)) and not (
-                    old and used > limits.disk_used * _MEGABYTE):
+        files = [file for path in self._recordings() for file in mcap_files(path)]
+        sizes = [file.stat().st_size for file in files]
+        used, least = sum(sizes), limits.disk_free * _MEGABYTE
+        for file, size in list(zip(files, sizes))[:-KEPT]:
+            if used <= limits.disk_used * _MEGABYTE and _free(self.folder) >= least:
                 break
-            with suppress(OSError):  # not ours: the next one, then
-                self._delete(oldest)
+            with suppress(OSError):  # of another owner: the next one, then
+                self._delete(file)
                 used -= size
-        if self._little_room:
+        if _free(self.folder) < least:
             self._close_file()
             raise OSError(errno.ENOSPC, f'less than {limits.disk_free:.0f} MB free')
 
-    @property
-    def _little_room(self) -> bool:
-        return _free(self.folder) < self._limits.disk_free * _MEGABYTE
-
     def _delete(self, file: Path) -> None:
+        """Delete a file, and its recording with the last one; the rest is an incomplete bag."""
         file.unlink()
-        self._written.pop(file, None)
-        self._facts.pop(file, None)
-        if file.parent != self.path and not mcap_files(file.parent):
-            shutil.rmtree(file.parent, ignore_errors=True)
-        elif (file.parent / METADATA).exists():
-            self._describe(file.parent)
-
-    def _describe(self, path: Path) -> None:
-        """Write the ``metadata.yaml`` of a recording, of all files but the one under way."""
-        for file in mcap_files(path):
-            if (self._file is None or file != self._file.path) and file not in self._facts and (
-                    found := facts_of(file)):
-                self._facts[file] = found
-        describe(path, {file: self._facts[file] for file in mcap_files(path)
-                        if file in self._facts})
+        if file.parent != self.path:
+            (file.parent / METADATA).unlink(missing_ok=True)
+            if not mcap_files(file.parent):
+                shutil.rmtree(file.parent, ignore_errors=True)
 
 
 def _free(folder: Path) -> int:

@@ -15,14 +15,16 @@
 """
 Reading ROS 2 recordings in MCAP that were never finished: as far as they go, changing nothing.
 
-rosbags wants a file's end, and a folder's ``metadata.yaml``. If one is missing, the library mcap
+rosbags needs a file's end, and a folder's ``metadata.yaml``. If one is missing, the library mcap
 reads the files of the folder one after the other, each up to its last good chunk. On a vehicle it
-need not be installed: the black box completes unfinished files by itself.
+need not be installed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+import os
 from pathlib import Path
 from typing import Any
 
@@ -34,41 +36,40 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import parse_qos
 
-from flock_follower.bags.description import mcap_files, METADATA
-from flock_follower.bags.mcap_file import has_mcap_end, MCAP_MAGIC
-
-_NOTHING = 'cut short before its first message'
+from flock_follower.bags.mcap_file import MCAP_MAGIC
 
 
-def missing_end(path: Path) -> str:
+def has_end(file: Path) -> bool:
     """
-    Return what an MCAP file, or a folder of them, lacks that one that was finished has; or ''.
+    Return whether an MCAP file ends as a finished one does; one of another format does, too.
 
     :raises OSError: it cannot be read.
     """
-    files = mcap_files(path) if path.is_dir() else [path] if path.suffix == '.mcap' else []
-    for file in files:
-        with file.open('rb') as opened:
-            if opened.read(len(MCAP_MAGIC)) in (MCAP_MAGIC, b'') and not has_mcap_end(opened):
-                return f'{file.name} was cut short'
-    if files and path.is_dir() and not (path / METADATA).is_file():
-        return 'no metadata.yaml in it'
-    return ''
+    size = file.stat().st_size
+    with file.open('rb') as opened:
+        if opened.read(len(MCAP_MAGIC)) not in (MCAP_MAGIC, b''):
+            return True
+        opened.seek(max(size - len(MCAP_MAGIC), 0), os.SEEK_SET)
+        return size > len(MCAP_MAGIC) and opened.read() == MCAP_MAGIC
 
 
 class UnfinishedReader:
     """
-    The files of a recording, read one after the other, with rosbags' interface of a reader.
+    MCAP files, read one after the other, with rosbags' interface of a reader.
 
-    :param path: an MCAP file, or a folder of them.
+    ``start_time`` is the stamp of the first message, ``end_time`` a nanosecond more than that of
+    the last, ns.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.connections: list[Connection] = []
+    def __init__(self, files: Sequence[Path]) -> None:
         self.start_time, self.end_time = 2**63, 0
-        """The stamp of the first message, and a nanosecond more than that of the last, ns."""
-        self._path = path
-        self._files: dict[Path, dict[int, Connection]] = {}
+        self._files = files
+        self._connections: dict[tuple[str, str], Connection] = {}
+
+    @property
+    def connections(self) -> list[Connection]:
+        """Return the topics that hold messages."""
+        return list(self._connections.values())
 
     def open(self) -> None:
         """
@@ -76,70 +77,54 @@ class UnfinishedReader:
 
         :raises ValueError: all of them hold nothing, or the library mcap is not installed.
         """
-        for file in mcap_files(self._path) if self._path.is_dir() else [self._path]:
-            schemas, channels, counts = dict[int, Any](), dict[int, Any](), dict[int, int]()
-            for record in _records(file):
-                if hasattr(record, 'log_time'):
-                    counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
-                    self.start_time = min(self.start_time, record.log_time)
-                    self.end_time = max(self.end_time, record.log_time + 1)
-                else:
-                    (channels if hasattr(record, 'topic') else schemas)[record.id] = record
-            own = self._files[file] = {
-                number: _connection(channels[number], schemas[channels[number].schema_id], count)
-                for number, count in counts.items()}
-            self.connections += own.values()
-        if not self.connections:
-            raise ValueError(f'{_NOTHING}, nothing is in it')
+        counts: Counter[tuple[str, str]] = Counter()
+        for schema, channel, message in self._records():
+            key = channel.topic, schema.name
+            counts[key] += 1
+            self.start_time = min(self.start_time, message.log_time)
+            self.end_time = max(self.end_time, message.log_time + 1)
+            if key not in self._connections:
+                qos = channel.metadata.get('offered_qos_profiles')
+                self._connections[key] = Connection(
+                    len(counts), channel.topic, schema.name,
+                    MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode()), '', 0,
+                    ConnectionExtRosbag2(
+                        channel.message_encoding, parse_qos(qos) if qos else []), None)
+        if not counts:
+            raise ValueError('cut short before its first message, nothing is in it')
+        for key, count in counts.items():
+            self._connections[key] = self._connections[key]._replace(msgcount=count)
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
                  stop: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield the messages of some connections from ``start`` to before ``stop``, ns."""
-        for file, own in self._files.items():
-            wanted = {number: one for number, one in own.items() if one in connections}
-            for record in _records(file):
-                if hasattr(record, 'log_time') and record.channel_id in wanted and (
-                        start or 0) <= record.log_time < (self.end_time if stop is None else stop):
-                    yield wanted[record.channel_id], record.log_time, record.data
+        wanted = {(one.topic, one.msgtype) for one in connections}
+        stop = self.end_time if stop is None else stop
+        for schema, channel, message in self._records():
+            key = channel.topic, schema.name
+            if key in wanted and (start or 0) <= message.log_time < stop:
+                yield self._connections[key], message.log_time, message.data
 
     def close(self) -> None:
-        """Forget the files: none stays open."""
-        self._files.clear()
+        """Do nothing: no file stays open."""
 
+    def _records(self) -> Iterator[tuple[Any, Any, Any]]:
+        """
+        Yield the schema, the channel and the message for each message, as far as the files go.
 
-def _connection(channel: Any, schema: Any, count: int) -> Connection:
-    qos = channel.metadata.get('offered_qos_profiles')
-    return Connection(
-        channel.id, channel.topic, schema.name,
-        MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode()), '', count,
-        ConnectionExtRosbag2(channel.message_encoding, parse_qos(qos) if qos else []), None)
-
-
-def _records(path: Path) -> Iterator[Any]:
-    """
-    Yield schemas, channels and messages, those of a chunk by their stamps, as far as it goes.
-
-    :raises ValueError: the library mcap is not installed.
-    :raises Exception: whatever the library raises for damage in a file that has an end.
-    """
-    try:
-        from mcap.records import Chunk
-        from mcap.stream_reader import breakup_chunk, StreamReader
-    except ImportError:
-        raise ValueError('its end is missing, and to read it without one needs the library mcap: '
-                         'pip install mcap') from None
-    with path.open('rb') as file:
-        whole = has_mcap_end(file)
-        file.seek(0)
-        chunks = StreamReader(file, emit_chunks=True).records
-        while True:
-            try:
-                record = next(chunks, None)
-                if record is None:
-                    return
-                held = breakup_chunk(record, True) if isinstance(record, Chunk) else []
-            except Exception:
-                if whole:
-                    raise
-                return
-            yield from sorted(held, key=lambda each: getattr(each, 'log_time', 0))
+        :raises ValueError: the library mcap is not installed.
+        :raises Exception: whatever the library raises for damage in a file that has an end.
+        """
+        try:
+            from mcap.reader import NonSeekingReader
+        except ImportError:
+            raise ValueError('its end is missing, and to read it without one needs the library '
+                             'mcap: pip install mcap') from None
+        for path in self._files:
+            with path.open('rb') as file:
+                try:
+                    yield from NonSeekingReader(
+                        file, validate_crcs=True).iter_messages(log_time_order=False)
+                except Exception:
+                    if has_end(path):
+                        raise

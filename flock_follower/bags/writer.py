@@ -22,9 +22,9 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from flock_follower.bags.bag import absolute, BagError, failures, reason_of, serialize
-from flock_follower.bags.description import describe, Facts, MARK, mark_incomplete
-from flock_follower.bags.mcap_file import end_mcap, McapFile, RecordedTopic, TakenMessage
+from flock_follower.bags.bag import absolute, BagError, failures, serialize
+from flock_follower.bags.description import finish, mark_incomplete
+from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import typestore
 
 #: Messages of so many bytes are written at once.
@@ -38,7 +38,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     The bytes written depend only on the calls made and the directory's name, never on a clock, so
     a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
     but the last chunk of 1 MiB is kept and marked incomplete, see ``bags.description``. An empty
-    bag is deleted.
+    bag is deleted then.
 
     :param path: directory to create; it must not exist.
     :param latched: topics recorded as transient local; all others are reliable and volatile.
@@ -51,17 +51,12 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._topics: dict[str, RecordedTopic] = {}
         self._pending: list[TakenMessage] = []
         self._size = 0
-        self._fault = ''
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
         with failures(self.path, 'cannot be written'):
             self.path.mkdir(parents=True)
-            try:
-                mark_incomplete(self.path)
-                self._file = McapFile(self.path / f'{self.path.name}.mcap', durable=False)
-            except OSError:
-                self._remove()
-                raise
+            mark_incomplete(self.path)
+            self._file = McapFile(self.path / f'{self.path.name}.mcap', durable=False)
 
     def write(self, topic: str, msgtype: str, stamp_ns: int, message: Any) -> None:
         """
@@ -73,54 +68,28 @@ class BagWriter(AbstractContextManager['BagWriter']):
         :param message: a message of :func:`typestore`, or its CDR bytes.
         :raises BagError: the type is unknown, the topic has another type, or the disk is full.
         """
-        if self._fault:
-            raise BagError(self._fault)
         data = message if isinstance(message, bytes) else serialize(message, msgtype)
         self._pending.append(TakenMessage(self._topic(topic, msgtype), stamp_ns, data))
         self._size += len(data)
         if self._size >= CHUNK:
             self._flush()
-            if self._fault:
-                raise BagError(self._fault)
 
     def close(self) -> None:
         """
         Finish the bag: its index and ``metadata.yaml``.
 
-        :raises BagError: if that fails, or a write failed before; messages written until then are
-            kept, and marked incomplete.
+        :raises BagError: if that fails; messages written until then are kept, and marked
+            incomplete.
         """
-        self._end('')
-        if self._fault:
-            raise BagError(self._fault)
+        self._flush()
+        with failures(self.path, 'cannot be finished'):
+            self._file.close()
+            finish(self.path, [self._file])
 
     def _flush(self) -> None:
-        try:
-            self._file.write(self._pending)
-        except OSError as error:
-            self._fault = f'{self.path}: {reason_of(error)}'
-        self._pending, self._size = [], 0
-
-    def _end(self, reason: str) -> None:
-        """Finish the files, as far as the disk permits; for a reason, or a fault, marked so."""
-        if not self._fault:
-            self._flush()
-        try:
-            self._file.close()
-            if not self._fault and not reason:
-                file = self._file
-                describe(self.path, {
-                    file.path: Facts(file.counts, file.start_ns, file.end_ns)})
-                (self.path / MARK).unlink()
-        except OSError as error:
-            self._fault = self._fault or f'{self.path}: {reason_of(error)}'
-        if self._fault or reason:
-            with suppress(OSError):
-                mark_incomplete(self.path, self._fault or reason)
-                end_mcap(self._file.path)
-
-    def _remove(self) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
+        pending, self._pending, self._size = self._pending, [], 0
+        with failures(self.path, 'cannot be written'):
+            self._file.write(pending)
 
     def _topic(self, name: str, msgtype: str) -> RecordedTopic:
         topic = self._topics.get(name)
@@ -138,9 +107,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """Finish the bag; after a failure mark it incomplete, or remove an empty one."""
         if kind is None:
             self.close()
-        elif self._pending or self._file.counts:
-            self._end(f'{kind.__name__}: {error}')
-        else:
-            with suppress(OSError):
-                self._file.close()
-            self._remove()
+            return
+        if not self._pending and not self._file.counts:
+            shutil.rmtree(self.path, ignore_errors=True)
+        with suppress(BagError, OSError):
+            self._flush()
+            self._file.close()

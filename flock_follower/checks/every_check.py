@@ -16,19 +16,18 @@
 
 from __future__ import annotations
 
-from flock_follower.checks.connections import check_connections
 from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.own_motion import check_own_motion
 from flock_follower.checks.pictures import check_pictures
 from flock_follower.checks.system import check_diagnostics, check_machine
-from flock_follower.checks.timing import check_timing
+from flock_follower.checks.topics import check_nodes, check_topics
 
 
 def judge_all(seen: Observations) -> list[Finding]:
     """Return the findings of every check, without those that only follow from another one."""
-    if seen.nothing_there:
-        return list(check_connections(seen))
+    if seen.live and not seen.nodes:
+        return [check_nodes(seen)]
     return without_consequences(finding for check in (
-        check_connections, check_timing, check_pictures, check_own_motion, check_machine,
-        check_diagnostics) for finding in check(seen))
+        check_topics, check_pictures, check_own_motion, check_machine, check_diagnostics)
+        for finding in check(seen))

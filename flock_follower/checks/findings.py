@@ -35,7 +35,6 @@ CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     'camera time offset': _AXES, 'marker size': (*_AXES, 'focal length'),
     'focal length': _AXES, 'camera mounting': _AXES,
     'images rate': ('images',), 'odom rate': ('odom',),
-    'images processed': (*_CAMERA, 'odom'),
     'relative_pose says': (*_CAMERA, 'odom'),
     'planner says': (*_CAMERA, 'odom', 'relative_pose says'),
     'mavlink_bridge says': ('autopilot',),
@@ -63,32 +62,12 @@ class Finding(NamedTuple):
         return f'{line}; do: {self.advice}' if self.advice else line
 
 
-def ok(what: str, measured: str, wanted: str) -> Finding:
-    """Return that a property is as it should be."""
-    return Finding(OK, what, measured, wanted)
-
-
-def warning(what: str, measured: str, wanted: str, advice: str) -> Finding:
-    """Return that a property should be better; it does not prevent a flight."""
-    return Finding(WARNING, what, measured, wanted, advice)
-
-
-def error(what: str, measured: str, wanted: str, advice: str) -> Finding:
-    """Return that a property prevents a flight."""
-    return Finding(ERROR, what, measured, wanted, advice)
-
-
-def unmeasured(what: str, why: str, wanted: str) -> Finding:
-    """Return that a property could not be measured, and why."""
-    return Finding(UNMEASURED, what, why, wanted)
-
-
 def judged(bad: bool, poor: bool, what: str, measured: str, wanted: str,
            advice: str) -> Finding:
     """Return an error if ``bad``, a warning if only ``poor``, else OK without the advice."""
     if bad or poor:
         return Finding(ERROR if bad else WARNING, what, measured, wanted, advice)
-    return ok(what, measured, wanted)
+    return Finding(OK, what, measured, wanted)
 
 
 def first(what: str, wanted: str, *cases: tuple[Any, str, str, str]) -> Finding:

@@ -26,7 +26,7 @@ calibration: the error of the focal length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import permutations, product
 import math
 from typing import NamedTuple
@@ -35,7 +35,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, skew
+from flock_follower.geometry import (
+    Array,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+    skew,
+)
+from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 
@@ -62,9 +68,44 @@ PRIOR = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (ROWS * COLUMNS)])
 #: near walls looks like a longer focal length, unless it pitches by this share of its yaw.
 WIDENED, ZOOM_ERROR, DEPTHS, BOTH = 2.0, 0.03, 1.0, 0.2
 _PASSES, _FAR = 8, 2.0
+#: s: between attitudes farther apart the rotation is unknown.
+LONGEST = 0.3
 
-#: Returns attitudes (m, 4) at stamps (m,), s, and where they are known (m,).
-Attitude = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
+
+class OwnPath:
+    """The own motion between the states of an odometry, in order."""
+
+    def __init__(self, states: Sequence[OdometryState]) -> None:
+        quaternions = np.array([state.quaternion for state in states])
+        turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+        same = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])
+        self._stamps = np.array([state.stamp for state in states]) / NANOSECONDS
+        self._quaternions = quaternions * same[:, None]
+        self._positions = np.array([state.position for state in states])
+        self._velocities = np.array([state.velocity @ quaternion_to_matrix(state.quaternion)
+                                     for state in states])
+
+    def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return attitudes (m, 4) at stamps (m,), s, and where they are known (m,)."""
+        stamps = self._stamps
+        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+        span = stamps[after] - stamps[after - 1]
+        part = (times - stamps[after - 1]) / np.where(span > 0.0, span, 1.0)
+        mixed = ((1.0 - part)[:, None] * self._quaternions[after - 1]
+                 + part[:, None] * self._quaternions[after])
+        known = (part >= 0.0) & (part <= 1.0) & (span <= LONGEST)
+        return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), known
+
+    def position(self, times: Array) -> Array:
+        """Return positions (m, 3), m, in odom at stamps (m,), s."""
+        return self._interpolated(times, self._positions)
+
+    def velocity(self, times: Array) -> Array:
+        """Return velocities (m, 3), m/s, along base_link's axes at stamps (m,), s."""
+        return self._interpolated(times, self._velocities)
+
+    def _interpolated(self, times: Array, values: Array) -> Array:
+        return np.column_stack([np.interp(times, self._stamps, column) for column in values.T])
 
 
 def small(image: GrayImage) -> Array:
@@ -125,15 +166,12 @@ class AxesFit(NamedTuple):
     zoom_deviation: float
 
 
-def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
-             velocity: Callable[[Array], Array], camera: CameraModel, R_base_optical: Array,
-             up: Array | None = None) -> AxesFit | None:
+def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraModel,
+             R_base_optical: Array, up: Array | None = None) -> AxesFit | None:
     """
     Return how the axes fit, or None if the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, and the numbers of :func:`shift`.
-    :param attitude: returns ``q_odom_base``, see :func:`interpolated`.
-    :param velocity: returns velocities (m, 3), m/s, along base_link's axes, at stamps (m,), s.
     :param up: (3,), the upward direction in base_link as configured: besides the identity only
         rotations that make it z are tried. None: it is z already, and all rotations are tried.
     """
@@ -148,7 +186,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
                       if n == 0 or up is None or turn[2].dot(up) > 0.5])
     to_optical = turns.transpose(0, 2, 1) @ R_base_optical
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
-    moves = [_turned(rows, attitude, offset) for offset in offsets.tolist()]
+    moves = [_turned(rows, path, offset) for offset in offsets.tolist()]
     shares = _shares(moves, to_optical)
     if shares.max() < 0.0:
         return None
@@ -156,9 +194,9 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude,
     best = 0 if shares[:, 0].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
     R, curve = to_optical[best], shares[:, best]
     for _ in range(2):  # an error of the mounting looks like an offset, too
-        offset = _summit(offsets, curve, int(curve.argmax()))
-        turned, known = _turned(rows, attitude, offset)
-        moved = np.diff(known[:, :2]) * velocity(known[:, :2].mean(axis=1) - offset)
+        offset = _summit(offsets, curve)
+        turned, known = _turned(rows, path, offset)
+        moved = np.diff(known[:, :2]) * path.velocity(known[:, :2].mean(axis=1) - offset)
         solution, covariance = _refined(
             turned @ R, moved @ R, known[:, 4:].reshape(-1, ROWS * COLUMNS, 3), camera)
         curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))
@@ -209,9 +247,9 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
     return solution, np.linalg.inv(information)[:4, :4] + np.outer(effect, effect)
 
 
-def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:
+def _turned(rows: Array, path: OwnPath, offset: float) -> tuple[Array, Array]:
     """Return rotation vectors in base_link (n, 3), and those rows for which they are known."""
-    (q1, known1), (q2, known2) = (attitude(rows[:, k] - offset) for k in (0, 1))
+    (q1, known1), (q2, known2) = (path.attitude(rows[:, k] - offset) for k in (0, 1))
     known = known1 & known2
     v1, w1, v2, w2 = q1[known, :3], q1[known, 3:], q2[known, :3], q2[known, 3:]
     turned = w1 * v2 - w2 * v1 - np.cross(v1, v2)
@@ -236,29 +274,9 @@ def _shares(moves: Sequence[tuple[Array, Array]], R_base_optical: Array) -> Arra
     return shares
 
 
-def _summit(offsets: Array, curve: Array, peak: int) -> float:
+def _summit(offsets: Array, curve: Array) -> float:
     """Return the maximum of the parabola through the three points about the peak."""
-    if not 0 < peak < len(curve) - 1:
-        return float(offsets[peak])
+    peak = min(max(int(curve.argmax()), 1), len(curve) - 2)
     before, top, after = curve[peak - 1:peak + 2].tolist()
-    bend = before - 2.0 * top + after
-    return float(offsets[peak]) + (0.0 if bend >= 0.0 else STEP * 0.5 * (before - after) / bend)
-
-
-def interpolated(stamps: Array, quaternions: Array, longest: float = 0.3) -> Attitude:
-    """
-    Return a function that interpolates attitudes (n, 4) at ``stamps`` (n,), s, in order.
-
-    An attitude is known between two that are at most ``longest`` s apart.
-    """
-    same = np.cumprod(np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1, 1))
-    smooth = quaternions * np.concatenate([[1.0], same])[:, None]
-
-    def attitude(wanted: Array) -> tuple[Array, NDArray[np.bool_]]:
-        after = np.clip(np.searchsorted(stamps, wanted), 1, len(stamps) - 1)
-        span = stamps[after] - stamps[after - 1]
-        part = (wanted - stamps[after - 1]) / np.where(span > 0.0, span, 1.0)
-        mixed = (1.0 - part)[:, None] * smooth[after - 1] + part[:, None] * smooth[after]
-        known = (part >= 0.0) & (part <= 1.0) & (span <= longest)
-        return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), known
-    return attitude
+    bend = min(before - 2.0 * top + after, -1e-12)
+    return float(offsets[peak] + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * STEP)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The mounting of the camera: each axis by itself, from all measurements of it."""
+"""The mounting of the camera: each axis by itself."""
 
 from __future__ import annotations
 
@@ -22,15 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import (
-    ERROR,
-    Finding,
-    first,
-    OK,
-    UNMEASURED,
-    unmeasured,
-    WARNING,
-)
+from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
 from flock_follower.geometry import (
     Array,
     quaternion_from_rpy,
@@ -41,27 +33,21 @@ from flock_follower.geometry import (
 
 #: Errors, rad, of a warning and of an error; an error must exceed so many deviations.
 LOOKS, BAD_LOOKS, SURE = math.radians(4.0), math.radians(8.0), 3.0
-WHAT: Final = 'camera mounting'
 MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
 _AXES: Final = ('roll', 'pitch', 'yaw')
 _WAYS: Final = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
                 ('looks further right', 'looks further left'))
 
 
-def check_mounting(estimates: Sequence[tuple[Array, Array]], rpy: Sequence[float],
-                   why: str) -> Finding:
+def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Finding:
     """
     Return the finding about roll, pitch and yaw of the camera.
 
-    :param estimates: of independent measurements the rotation vector (3,), rad, along base_link's
-        axes, by which the camera is mounted otherwise than configured, and its deviations (3,).
-    :param rpy: the configured ``camera_rpy``, rad; :param why: the reason if none was measured.
+    :param turn: the rotation vector (3,), rad, along base_link's axes, by which the camera is
+        mounted otherwise than configured; :param deviations: (3,) of it.
+    :param rpy: the configured ``camera_rpy``, rad.
     """
-    if not estimates:
-        return unmeasured(WHAT, why, MOUNTED)
-    information = np.sum([deviations**-2 for _, deviations in estimates], axis=0)
-    turn = np.sum([turn * deviations**-2 for turn, deviations in estimates], axis=0) / information
-    margin = SURE / np.sqrt(information)
+    margin = SURE * deviations
     wrong = np.abs(turn) > np.maximum(LOOKS, margin)
     unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
                         if not bad and by > LOOKS)
@@ -74,7 +60,7 @@ def check_mounting(estimates: Sequence[tuple[Array, Array]], rpy: Sequence[float
     advice = (f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose '
               'of the odometry on the body (odom_child_rpy) wrong?')
     return first(
-        WHAT, MOUNTED,
+        'camera mounting', MOUNTED,
         (np.any(wrong & (np.abs(turn) > BAD_LOOKS)), ERROR, measured, advice),
         (wrong.any(), WARNING, measured, advice),
         (unknown, UNMEASURED, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', ''),

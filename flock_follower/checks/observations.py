@@ -22,10 +22,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 
@@ -33,15 +33,11 @@ from flock_follower.odometry.reader import OdometrySource
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
 
 
-@dataclass
-class TopicEnd:
-    """A publisher or subscriber of a topic; ``node`` is '' if unknown, as in bags."""
+class TopicEnd(NamedTuple):
+    """A publisher of a topic; ``node`` is '' if unknown, as in bags."""
 
     node: str
     type: str
-    reliable: bool = True
-    latched: bool = False
-    """Transient local."""
 
 
 @dataclass
@@ -49,7 +45,6 @@ class TopicSeen:
     """A topic; ``arrivals`` and ``stamps`` of the messages received; a stamp of 0 is missing."""
 
     publishers: list[TopicEnd] = field(default_factory=list)
-    subscribers: list[TopicEnd] = field(default_factory=list)
     arrivals: list[float] = field(default_factory=list)
     stamps: list[float] = field(default_factory=list)
 
@@ -71,8 +66,8 @@ class Picture:
     An image that was searched for markers.
 
     ``brightness`` and ``contrast`` are mean and deviation of its grey levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px; ``repeated`` are those found more
-    than once; ``fault`` says why it cannot be decoded.
+    ids of the markers found to the length of their sides, px; ``fault`` says why it cannot be
+    decoded.
     """
 
     stamp: float
@@ -83,7 +78,6 @@ class Picture:
     brightness: float = 0.0
     contrast: float = 0.0
     markers: dict[int, float] = field(default_factory=dict)
-    repeated: list[int] = field(default_factory=list)
     fault: str = ''
 
 
@@ -104,8 +98,8 @@ class Machine:
     ``idle``: idle share of the processors, 0 to 1, None if unknown;
     ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
     ``shares_memory``: whether images may come through shared memory; ``segment``: its size, bytes.
-    ``reach``: ROS_AUTOMATIC_DISCOVERY_RANGE. ``open_nodes``: our nodes on this computer that
-    others on the network can reach; 'check' if theirs are unknown and others can reach itself.
+    ``open_nodes``: our nodes on this computer that others on the network can reach; 'check' if
+    theirs are unknown and others can reach itself.
     """
 
     processors: int = 0
@@ -114,7 +108,6 @@ class Machine:
     shares_memory: bool = False
     segment: int = 512 * 1024
     domain: str = '0'
-    reach: str = ''
     open_nodes: list[str] = field(default_factory=list)
     dead_segments: int = 0
 
@@ -154,7 +147,7 @@ class Observations:
     ``names`` maps our names of topics to their full names. ``calibration`` is the newest
     CameraInfo. ``shifts`` are rows of image motion, see ``image_motion.fit_axes``, ``sightings``
     rows of markers, see ``collector.sightings``. ``parameters`` are those of each of our nodes, by
-    its plain name, ``file_parameters`` those that a parameter file sets, if one was named.
+    its plain name.
     """
 
     live: bool = True
@@ -165,30 +158,17 @@ class Observations:
     names: dict[str, str] = field(default_factory=dict)
     topics: dict[str, TopicSeen] = field(default_factory=dict)
     nodes: list[str] = field(default_factory=list)
-    clock: bool = False
-    """Whether /clock is published."""
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
-    file_parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
-    file_problems: list[str] = field(default_factory=list)
-    odometry: list[tuple[int, Any]] = field(default_factory=list)
-    """Arrival, ns, and message of each ``odom``."""
     own: OwnMotion | None = None
-    """The odometry as the caller has read it, in place of ``odometry``."""
-    frames: list[list[str]] = field(default_factory=list)
-    """Header's and child frame of ``odom``, after each change."""
+    child_frame: str = ''
+    """Of the newest ``odom``."""
     static_child: Transform | None = None
-    """Pose of odom's child frame on base_link by tf_static."""
-    autopilot: list[tuple[float, Array]] = field(default_factory=list)
-    """Stamp and attitude (x, y, z, w) of each ``mavlink/odom``."""
+    """Pose of this frame on base_link by tf_static."""
     calibration: Any = None
     dictionary: str = ''
-    wanted_markers: dict[int, str] = field(default_factory=dict)
-    """The neighbour that carries a marker, by its id."""
     marker_sides: dict[int, float] = field(default_factory=dict)
-    """The configured length of its sides, m, by its id."""
+    """The configured length of the sides of each neighbour's marker, m, by its id."""
     pictures: list[Picture] = field(default_factory=list)
-    strangers: dict[str, list[int]] = field(default_factory=dict)
-    """Markers of other dictionaries, by the dictionary, if none of ours was found."""
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
@@ -202,11 +182,6 @@ class Observations:
     def topic(self, name: str) -> TopicSeen:
         """Return the observation of a topic of ours; an empty one if there is none."""
         return self.topics.get(self.names.get(name, ''), TopicSeen())
-
-    @property
-    def nothing_there(self) -> bool:
-        """Return whether a running system has no node and no topic."""
-        return self.live and not self.nodes and not self.topics
 
     @property
     def image_name(self) -> str:

@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import ERROR, error, Finding, first, judged, OK, WARNING
+from flock_follower.checks.findings import ERROR, Finding, first, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
 from flock_follower.perception.camera import CameraModel
 
@@ -34,8 +34,6 @@ DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
 OFF_CENTRE: Final = 0.15
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
-#: Number of images that show a marker twice: a single one may be a false detection.
-TWICE: Final = 2
 
 
 def camera_model(seen: Observations) -> CameraModel:
@@ -58,14 +56,13 @@ def check_pictures(seen: Observations) -> Iterator[Finding]:
     """Check calibration, images and markers."""
     good = [picture for picture in seen.pictures if not picture.fault]
     if faults := [picture.fault for picture in seen.pictures if picture.fault]:
-        yield error('images', faults[0], 'an encoding that can be read',
-                    'set the format of the camera driver to mono8, rgb8 or bgr8')
+        yield Finding(ERROR, 'images', faults[0], 'an encoding that can be read',
+                      'set the format of the camera driver to mono8, rgb8 or bgr8')
     if seen.calibration is not None:  # else it is reported as a missing topic
         yield _calibration(seen, good)
     if good:
         yield _exposure(good)
         yield _marker(seen, good)
-        yield from _duplicates(seen, good)
 
 
 def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
@@ -74,25 +71,17 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     try:
         camera = camera_model(seen)
     except ValueError as problem:
-        return error(what, str(problem), wanted, calibrate)
+        return Finding(ERROR, what, str(problem), wanted, calibrate)
     size = f'{camera.width}x{camera.height}'
     others = sorted({f'{picture.width}x{picture.height}' for picture in pictures} - {size})
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     shares = camera.matrix[:2, 2] / (camera.width, camera.height)
-    rectified = bool(seen.value('relative_pose', 'rectified', False))
-    straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     return first(
         what, wanted,
         (others, ERROR, f'for {size}, images are {"".join(others[:1])}', calibrate),
         (np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width, ERROR,
          f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the image: K is for '
          'another resolution', calibrate),
-        (straight and not rectified and np.any(camera.distortion), ERROR,
-         f'{measured}, distorted, but the topic is marked as rectified',
-         'start relative_pose with rectified:=true'),
-        (rectified and not straight and any(seen.calibration.d), WARNING,
-         f'{measured}; rectified is true, but the topic is not marked as rectified',
-         'rectified:=true only for images whose distortion was removed'),
         (True, OK, measured, ''))
 
 
@@ -113,40 +102,21 @@ def _exposure(pictures: list[Picture]) -> Finding:
 
 
 def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
-    ours = f'marker {", ".join(map(str, sorted(seen.wanted_markers)))} of {seen.dictionary}'
-    what, wanted = 'marker', f'{ours}, {SMALL:.0f} px'
-    found = [[side for number, side in picture.markers.items() if number in seen.wanted_markers]
+    ours = f'marker {", ".join(map(str, sorted(seen.marker_sides)))} of {seen.dictionary}'
+    found = [[side for number, side in picture.markers.items() if number in seen.marker_sides]
              for picture in pictures]
-    sides = [side for each in found for side in each]
-    if not sides:
-        name, numbers = next(iter(seen.strangers.items()), ('', []))
-        return first(
-            what, wanted,
-            (name, ERROR, f'marker {", ".join(map(str, numbers[:4]))} of {name} in sight, not '
-             f'{ours}', 'write dictionary and marker_id of the print into config/neighbors.yaml, '
-             'or print that one'),
-            (True, WARNING, f'not in sight in {len(pictures)} images',
-             'hold the leader before the camera; is the print flat, its margin white?'))
-    share, side = sum(map(bool, found)) / len(pictures), float(np.median(sides))
+    share = sum(map(bool, found)) / len(pictures)
+    side = float(np.median([side for each in found for side in each] or [0.0]))
     measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
-    seldom = side >= SMALL and share < SELDOM
     return first(
-        what, f'{wanted}, most of the time' if seldom else wanted,
+        'marker', f'{ours}, {SMALL:.0f} px, most of the time',
+        (share == 0.0, WARNING, f'not in sight in {len(pictures)} images',
+         'hold the leader before the camera; is it the dictionary and id of the print, flat, its '
+         'margin white?'),
         (side < TINY, ERROR, measured,
          'come nearer, print it larger, or use a longer lens or a finer image'),
         (side < SMALL, WARNING, measured,
          'come nearer, or print the marker larger: a small marker is lost easily'),
-        (seldom, WARNING, measured,
+        (share < SELDOM, WARNING, measured,
          'keep the marker in sight; check light, blur and the white margin'),
         (True, OK, measured, ''))
-
-
-def _duplicates(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:
-    """Report the neighbours' markers that were seen more than once in an image."""
-    for number, name in sorted(seen.wanted_markers.items()):
-        count = sum(number in picture.repeated for picture in pictures)
-        if count >= TWICE:
-            yield judged(seen.live, True, 'marker id',
-                         f'marker {number} twice in {count} of {len(pictures)} images',
-                         'each id once', f'cover the print that is not on {name}, or give {name} '
-                         'another id')

@@ -42,14 +42,13 @@ from flock_follower.parameters.spec import filled
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 
-#: s: of a longer bag only the beginning is checked, and the diagnostics of the last LAST ns.
+#: s: of a longer bag only the beginning is checked.
 LONGEST: Final = 300.0
-LAST: Final = 60_000_000_000
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
-#: Of the other topics only the messages are counted.
-READ: Final = (*_IMAGES, 'odom', 'camera_info', 'mavlink/odom', DIAGNOSTICS)
-_AFTER_STAMP: Final = 12  # bytes: CDR's header, and the stamp
+#: The topics to take, and their types.
+READ: Final = {**{name: TYPES[name] for name in (*_IMAGES, 'odom', 'camera_info')},
+               DIAGNOSTICS: 'diagnostic_msgs/msg/DiagnosticArray'}
 
 
 class RecordedSystem:
@@ -71,27 +70,26 @@ class RecordedSystem:
         names = names_there(namespace, {
             **topics_of_camera(chosen.image, chosen.camera_info), **(remaps or {})})
         images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
-        self._reads = own is None
-        self._own = own or OwnMotion(OdometrySource(filled(SourceParams(), perception, 'odom_')))
+        self._read = None if own else OwnMotion(
+            OdometrySource(filled(SourceParams(), perception, 'odom_')))
         self.seen = Observations(
             live=False, source=str(bag.path), duration=bag.duration_ns / NANOSECONDS,
-            namespace=namespace, names=names, incomplete=bag.incomplete, own=self._own,
+            namespace=namespace, names=names, incomplete=bag.incomplete, own=own or self._read,
             parameters={**values, 'relative_pose': perception,
                         'planner': alone(values['planner'], camera)[1]},
             unreadable=dict(bag.skipped), topics={
-                name: TopicSeen([TopicEnd('', topic.msgtype, latched=topic.latched)])
+                name: TopicSeen([TopicEnd('', topic.msgtype)])
                 for name, topic in bag.topics.items() if topic.count})
         self._neighbors = load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
         self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
-        self._calibration = b''
         self.stop_ns = bag.start_ns + round(LONGEST * NANOSECONDS)
         """What comes later is not checked."""
-        self.topics = {full: name for name, full in names.items()
-                       if full in self.seen.topics and bag.topics[full].msgtype == TYPES[name]
+        names[DIAGNOSTICS] = DIAGNOSTICS
+        self.topics = {names[name]: name for name, msgtype in READ.items()
+                       if names[name] in self.seen.topics
+                       and bag.topics[names[name]].msgtype == msgtype
                        and (name not in _IMAGES or name == self.seen.image_name)}
         """Our names of the topics to take, by their full names."""
-        if DIAGNOSTICS in self.seen.topics:
-            self.topics[DIAGNOSTICS] = DIAGNOSTICS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
              ) -> tuple[Any, GrayImage | None]:
@@ -104,21 +102,13 @@ class RecordedSystem:
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
             return None, None
-        message: Any = None
-        repeated = name == 'camera_info' and data[_AFTER_STAMP:] == self._calibration
-        if name in READ and not repeated:
-            try:
-                message = read_odometry(data) if msgtype == ODOMETRY else (
-                    deserialize(data, msgtype))
-            except ValueError as problem:
-                if name == 'odom' and self._reads:
-                    self._own.lost, self._own.last_error = self._own.lost + 1, str(problem)
-                self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
-                return None, None
-        if name == 'camera_info':
-            self._calibration = data[_AFTER_STAMP:]
-        elif name == 'odom' and self._reads:
-            self._own.take(message, time_ns)
+        try:
+            message = read_odometry(data) if msgtype == ODOMETRY else deserialize(data, msgtype)
+        except ValueError as problem:
+            self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
+            return None, None
+        if name == 'odom' and self._read is not None:
+            self._read.take(message, time_ns)
         return message, self._collector.take(name, topic, message, time_ns / NANOSECONDS)
 
     def findings(self) -> list[Finding]:
@@ -137,16 +127,9 @@ def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = ''
     """
     with open_bag(path) as bag:
         system = RecordedSystem(bag, values, camera, namespace, remaps)
-        whole = bag.end_ns < system.stop_ns
         try:
-            if system.topics:
-                for message in bag.messages(
-                        list(system.topics), stop_ns=None if whole else system.stop_ns):
-                    system.take(*message)
-            if not whole and DIAGNOSTICS in system.topics:  # those of the end count
-                system.stop_ns = bag.end_ns + 1
-                for message in bag.messages([DIAGNOSTICS], bag.end_ns - LAST, system.stop_ns):
-                    system.take(*message)
+            for message in bag.messages(list(system.topics), stop_ns=system.stop_ns):
+                system.take(*message)
         except BagError as problem:
             system.seen.incomplete = system.seen.incomplete or str(problem)
     return system.seen, system.findings()

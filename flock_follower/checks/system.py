@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import contextlib
 import fcntl
+import math
 from pathlib import Path
 import time
 from typing import Final
@@ -27,16 +28,15 @@ import numpy as np
 
 from flock_follower.checks.findings import (
     ERROR,
-    error,
     Finding,
+    first,
     judged,
-    ok,
-    unmeasured,
+    OK,
+    UNMEASURED,
     WARNING,
-    warning,
 )
-from flock_follower.checks.observations import Observations, OURS
-from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name
+from flock_follower.checks.observations import Machine, Observations, OURS
+from flock_follower.checks.topic_names import full_name
 
 #: Share of the processors that is idle: below the first a warning, below the second an error.
 IDLE = 0.25
@@ -48,12 +48,6 @@ ROOM = 32.0
 DEAD_SEGMENTS = 20
 #: A younger segment may be one whose process is about to lock it, s.
 YOUNG = 10.0
-#: Share of the images sent that arrive, below which images are lost.
-COMING = 0.8
-#: Share of the images that relative_pose processes, below which there is a warning.
-PROCESSED = 0.7
-#: Least number of images to judge that.
-FEW = 10
 #: Keys of the bridge's diagnostics.
 PARAMETER: Final = 'parameter '
 NOT_READY: Final = 'not ready to arm'
@@ -77,9 +71,7 @@ ADVICE: Final[Mapping[str, str]] = {
 
 
 def check_machine(seen: Observations) -> Iterator[Finding]:
-    """Check the computer, and whether perception keeps up."""
-    if not seen.live:
-        return
+    """Check the computer."""
     machine = seen.machine
     if machine.idle is not None:
         yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
@@ -88,38 +80,23 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
                      'end programs that are not needed (rviz, recordings), or reduce the load of '
                      'the odometry')
     if machine.shares_memory:
-        yield from _shared_memory(seen)
-    images, frames = seen.topic(seen.image_name), seen.topic('neighbors/frames')
-    if len(images.arrivals) >= FEW and frames.publishers:
-        share = frames.rate / images.rate
-        yield judged(
-            not frames.arrivals, share < PROCESSED, 'images processed',
-            f'{min(share, 1.0):.0%} of the images' if frames.arrivals else 'none',
-            f'{PROCESSED:.0%} or more',
-            'reduce the load of the processor, or the frame rate' if frames.arrivals else
-            'see images, calibration and odometry; its log names the dropped messages')
+        yield _shared_memory(machine, max((p.bytes for p in seen.pictures), default=0))
 
 
-def _shared_memory(seen: Observations) -> Iterator[Finding]:
-    machine = seen.machine
-    what = 'shared memory'
-    if machine.shared_memory_free is not None and machine.shared_memory_free < ROOM:
-        yield error(what, f'{machine.shared_memory_free:.0f} MB free in /dev/shm',
-                    f'{ROOM:.0f} MB', 'delete /dev/shm/fastrtps_* of processes that are gone; '
-                    'in a container, --shm-size')
-    if machine.dead_segments >= DEAD_SEGMENTS:
-        yield warning(what, f'{machine.dead_segments} segments of processes that were killed',
-                      'none: they slow every node', 'fastdds shm clean')
-    largest = max((picture.bytes for picture in seen.pictures), default=0)
-    if not largest:
-        return
-    images, infos = seen.topic(seen.image_name).rate, seen.topic('camera_info').rate
-    large = largest > machine.segment
-    lost = large and seen.image_name != COMPRESSED_IMAGES and images < COMING * infos
-    yield judged(lost, large, what, f'images of {largest / 1024:.0f} kB'
-                 f'{f", {1.0 - images / infos:.0%} are lost" if lost else ""}',
-                 f'images fit into {machine.segment // 1024} kB',
-                 'export FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml for every node')
+def _shared_memory(machine: Machine, image: int) -> Finding:
+    """Check the shared memory; ``image`` is the size of the largest image, bytes."""
+    free = math.inf if machine.shared_memory_free is None else machine.shared_memory_free
+    return first(
+        'shared memory', f'{ROOM:.0f} MB, images that fit into {machine.segment // 1024} kB',
+        (free < ROOM, ERROR, f'{free:.0f} MB free in /dev/shm', 'delete /dev/shm/fastrtps_* of '
+         'processes that are gone; in a container, --shm-size'),
+        (machine.dead_segments >= DEAD_SEGMENTS, WARNING,
+         f'{machine.dead_segments} segments of processes that were killed slow every node',
+         'fastdds shm clean'),
+        (image > machine.segment, WARNING,
+         f'images of {image / 1024:.0f} kB, of which some may be lost',
+         'export FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml for every node'),
+        (True, OK, f'images of {image / 1024:.0f} kB', ''))
 
 
 def dead_segments(folder: Path = Path('/dev/shm')) -> list[Path]:
@@ -153,7 +130,8 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
         status = seen.statuses.get(full.lstrip('/'))
         if status is None:
             if full in seen.nodes:
-                yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
+                yield Finding(UNMEASURED, f'{node} says', 'nothing received on /diagnostics',
+                              'running')
             continue
         advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
@@ -168,30 +146,26 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
-    what = 'autopilot'
-    if values.get('link') != 'alive':
-        yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
-                    'check cable, connection and baud rate; is the autopilot on, is its MAVLink '
-                    'port set up?')
+    link = values.get('link', 'not reported')
+    alive = link == 'alive'
+    yield judged(
+        not alive, False, 'autopilot', ', '.join(
+            values.get(key) or f'no {key}' for key in ('autopilot', 'mode')) if alive else
+        f'not received ({link})', 'received', 'check cable, connection and baud rate; is the '
+        'autopilot on, is its MAVLink port set up?')
+    if not alive:
         return
-    yield ok(what, f'{values.get("autopilot") or "received"}, {values.get("mode") or "no mode"}, '
-             f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
-    wanted = 'as config/ recommends'
-    differing = [key for key in values if key.startswith(PARAMETER)]
-    for key in differing:
-        value, _, why = values[key].partition(': ')
-        yield warning('autopilot parameter', f'{key.removeprefix(PARAMETER)} {value}', wanted,
-                      f'set it in the ground station, or know why not. {why}'.strip())
-    summary = values.get('parameters', '')
-    if not summary or not differing:
-        yield judged(False, not summary, 'autopilot parameters', summary or 'not compared yet',
-                     wanted, 'wait some seconds and check again')
+    for key in values:
+        if key.startswith(PARAMETER):
+            yield Finding(WARNING, 'autopilot parameter',
+                          f'{key.removeprefix(PARAMETER)} {values[key]}', 'as config/ recommends',
+                          'set it in the ground station, or know why not')
     wanted = 'nothing speaks against it'
     for what, key, advice in (
             ('ready to arm', NOT_READY, 'these are its own words: settle them, then check again'),
             ('ready for offboard', REFUSED, 'settle that: the bridge would refuse offboard')):
         if key in values:
-            yield judged(bool(values[key]), False, what,
-                         f'no: {values[key]}' if values[key] else wanted, wanted, advice)
+            yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
+                         wanted, wanted, advice)
         elif key == NOT_READY and values.get('armed') != 'True':
-            yield unmeasured(what, 'the autopilot has not reported it yet', wanted)
+            yield Finding(UNMEASURED, what, 'the autopilot has not reported it yet', wanted)

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from flock_follower.messages import ODOMETRY, RANGE, STATE, TRAJECTORY
@@ -36,8 +36,6 @@ TYPES: Final[Mapping[str, str]] = {
 #: In plain words.
 HOLDS: Final[Mapping[str, str]] = {
     IMAGE: 'images', COMPRESSED: 'compressed images', INFO: 'a calibration', ODOMETRY: 'odometry'}
-#: Types that some sources send instead of odometry, of which none can be taken.
-POSES: Final = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped')
 #: Parts of the names of images that show no brightness.
 _NEVER: Final = ('depth', 'disparity', 'confidence')
 #: Parts of names that speak against a topic, and for it.
@@ -57,12 +55,9 @@ def parse_remaps(remaps: Iterable[str]) -> dict[str, str]:
     for remap in remaps:
         ours, separator, theirs = (part.strip() for part in remap.partition(':='))
         name = ours.strip('/')
-        if not separator or not name or not theirs.strip('/'):
-            raise ValueError(f'--remap {remap}: must be from:=to, as odom:=/camera/odom/sample')
-        if name not in TYPES:
-            hint = (f'did you mean {theirs.strip("/")}:={ours}?' if theirs.strip('/') in TYPES
-                    else f'must be one of {", ".join(TYPES)}')
-            raise ValueError(f'--remap {remap}: {name} is no name of ours: {hint}')
+        if not separator or name not in TYPES or not theirs.strip('/'):
+            raise ValueError(f'--remap {remap}: must be NAME:=TOPIC, as odom:=/camera/odom/sample,'
+                             f' with a name of ours: one of {", ".join(TYPES)}')
         found[name] = theirs
     return found
 
@@ -97,42 +92,22 @@ def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
         names[RAW_IMAGES], names[COMPRESSED_IMAGES] = names[COMPRESSED_IMAGES], names[RAW_IMAGES]
 
 
-def likely(topics: Mapping[str, str], msgtypes: Sequence[str],
-           taken: Iterable[str] = ()) -> list[str]:
-    """
-    Return the topics that hold one of the types, the likeliest first.
-
-    :param topics: the type of each, by its full name.
-    :param taken: those that are something else already.
-    """
-    fitting = [name for name, msgtype in topics.items() if msgtype in msgtypes
-               and name not in set(taken) and not any(word in name for word in _NEVER)]
-    return sorted(fitting, key=lambda name: (
-        sum(word in name for word in _UNLIKELY), not any(word in name for word in _LIKELY),
-        len(name)))
-
-
 def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> str:
     """
-    Return how to connect a topic that is missing to one that is there, or ''.
+    Return how to connect a topic that is missing to the likeliest one that is there, or ''.
 
     :param name: ours; ``image_raw`` also stands for the compressed ones.
+    :param topics: the type of each topic that is there, by its full name.
+    :param taken: those that are something else already.
     """
     msgtypes = (IMAGE, COMPRESSED) if name == RAW_IMAGES else (TYPES[name],)
-    found = likely(topics, msgtypes, taken)
-    if found:
-        best = found[0]
-        others = f' (or {", ".join(found[1:3])})' if found[1:] else ''
-        ours = COMPRESSED_IMAGES if topics[best] == COMPRESSED else name
-        return f'{best} holds {HOLDS[topics[best]]}: --remap {ours}:={best}{others}'
-    poses = likely(topics, POSES) if name == 'odom' else []
-    if poses:
-        return (f'{poses[0]} holds poses only: have its source send {ODOMETRY}, '
-                'the velocity may be left out')
-    return ''
-
-
-def elsewhere(full: str, topics: Iterable[str], ours: Iterable[str]) -> list[str]:
-    """Return the topics of the same name in other namespaces."""
-    last = full.rsplit('/', 1)[-1]
-    return sorted(name for name in set(topics) - set(ours) if name.rsplit('/', 1)[-1] == last)
+    found = sorted(
+        (full for full, msgtype in topics.items() if msgtype in msgtypes
+         and full not in set(taken) and not any(word in full for word in _NEVER)),
+        key=lambda full: (sum(word in full for word in _UNLIKELY),
+                          not any(word in full for word in _LIKELY), len(full)))
+    if not found:
+        return ''
+    others = f' (or {", ".join(found[1:3])})' if found[1:] else ''
+    ours = COMPRESSED_IMAGES if topics[found[0]] == COMPRESSED else name
+    return f'{found[0]} holds {HOLDS[topics[found[0]]]}: --remap {ours}:={found[0]}{others}'

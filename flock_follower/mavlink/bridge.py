@@ -29,9 +29,9 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import commands, estimator_health
-from flock_follower.mavlink.commands import Goal, NOT_RECEIVED, Request
+from flock_follower.mavlink.commands import NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
-from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD, LAND
+from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
@@ -56,7 +56,6 @@ BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
 #: Whether setpoints offset the wind; 'auto': if the autopilot does not.
 WIND_COMPENSATIONS: Final[tuple[str, ...]] = ('auto', 'always', 'never')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
-_GOALS: Final[dict[str, Goal]] = {HOLD: commands.HOLD, LAND: commands.LAND}
 
 
 class Cycle(NamedTuple):
@@ -162,7 +161,7 @@ class Bridge:
 
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
-        return self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))[0]
+        return self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
 
     def unready(self, now: float) -> str | None:
         """Return the reasons against the service ``arm``, '' without any; None: unknown."""
@@ -171,8 +170,7 @@ class Bridge:
                 not self.housekeeping.has_reasons(now)):
             return None
         against = self.texts.unready(now, dialect.arming_mode(status.mode))
-        return against and estimator_health.explained(
-            against, self.telemetry.estimator, now, self.housekeeping.parameters.values)
+        return against and estimator_health.explained(against, self.telemetry.estimator, now)
 
     # The setpoint thread.
 
@@ -196,7 +194,7 @@ class Bridge:
             self.motion = None if motion is None else (motion, time)
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
-                refused := self.gate.update_height(altitude.altitude, now)):
+                refused := self.gate.update_height(altitude.altitude, now, altitude.source)):
             self.link.ignored[f'{altitude.source} {refused}'] += 1
         if battery is not None and battery.time == now:
             self.end.take_battery(battery.remaining, now)
@@ -266,7 +264,7 @@ class Bridge:
         self.ground_station.take_handover(reason)
         if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else (
-                self.requests.begin(commands.LAND, now))
+                self.requests.begin(commands.land, now))
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Let heights count from the place of arming; above home if that was not seen."""
@@ -282,19 +280,20 @@ class Bridge:
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""
         flies, pending, status = self.gate.flies, self.requests.pending, self.status(now)
-        dialect, handover = self.telemetry.dialect, self.handover
-        if status is None or dialect is None:
+        handover = self.handover
+        if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
             self.gate.active_since, self.gate.command_time,
             self.gate.handover(now) if flies else '', now)
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
-            held, *_ = handover.current.modes(dialect)
+            held, *_ = handover.current.modes
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask and not self.requests.stopping:
-            self.handover = self.requests.begin(_GOALS[ask], now, why=self.end.why)
+            self.handover = self.requests.begin(
+                commands.hold if ask == HOLD else commands.land, now, why=self.end.why)
             self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
@@ -327,8 +326,9 @@ class Bridge:
         backwards.
         """
         if self.telemetry.dialect is not None and self.gate.flies:
-            goal = commands.LAND if self.requests.landing else commands.HOLD
-            self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
+            make = commands.land if self.requests.landing else commands.hold
+            goal = make(self.telemetry.dialect)
+            self.link.send_command(goal.command, goal.params)
         if self.withheld():
             return
         setpoint, _ = self.gate.decide(

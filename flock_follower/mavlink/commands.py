@@ -28,13 +28,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect, enum_name, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
-from flock_follower.ranges import first_reason
 
 #: How long to wait for HEARTBEAT (1 Hz) to show the result, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
@@ -45,7 +44,7 @@ REASON_WAIT: Final[float] = 0.5
 #: Delay and slowest climb of a take-off, s and m/s; ArduPilot spools up for seconds.
 TAKEOFF_DELAY: Final[float] = 10.0
 SLOWEST_CLIMB: Final[float] = 0.3
-#: A request fails if the setpoint stream, or HEARTBEAT, does not start within this, s.
+#: A request fails if its command cannot be sent within this, s.
 STREAM_TIMEOUT: Final[float] = 3.0
 NOT_RECEIVED: Final[str] = 'no HEARTBEAT from the autopilot'
 _SET_MODE: Final[int] = mavlink.MAV_CMD_DO_SET_MODE
@@ -56,7 +55,6 @@ TAKEOFF: Final[int] = mavlink.MAV_CMD_NAV_TAKEOFF
 class Vehicle(NamedTuple):
     """State of the vehicle while HEARTBEAT is fresh."""
 
-    dialect: Dialect
     status: VehicleStatus
     altitude: float | None = None
     """m above the origin of its local frame."""
@@ -73,15 +71,15 @@ class Outcome(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Goal:
     """A request: its command, and how the vehicle shows that it is fulfilled."""
 
     name: str
     command: int
-    params: Callable[[Dialect], tuple[float, ...]]
+    params: tuple[float, ...]
     reached: Callable[[Vehicle], bool]
-    modes: Callable[[Dialect], tuple[str, ...]] = lambda dialect: ()
+    modes: tuple[str, ...] = ()
     """The modes that it leads through; (): any. In any other mode the pilot has taken over."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
@@ -89,63 +87,63 @@ class Goal:
     """Whether it is requested even if the vehicle already shows it."""
     timeout: float = CONFIRM_TIMEOUT
     """Time to wait for the requested state, s."""
-    before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
-    """What has to be reached first, by the state of the vehicle when the request begins."""
-    instead: Callable[[Dialect], Goal | None] = lambda dialect: None
+    stream: float = 0.0
+    """Time for which setpoints must have been sent before, s."""
+    before: Goal | None = None
+    """What has to be reached first."""
+    instead: Goal | None = None
     """The request that replaces it if the autopilot refuses it."""
+    too_late: Goal | None = None
+    """The request that replaces it if it is not reached in time."""
 
 
-def _mode_goal(name: str, mode: Callable[[Dialect], str], **options: Any) -> Goal:
-    """Return the goal of entering the mode that ``mode`` returns for a dialect."""
-    return Goal(name, _SET_MODE, lambda dialect: dialect.set_mode_parameters(mode(dialect)),
-                **{'reached': lambda vehicle: vehicle.status.mode == mode(vehicle.dialect),
-                   'modes': lambda dialect: (mode(dialect),), **options})
-
-
-def enter(mode: str, *others: str, ends_flight: bool = False) -> Goal:
+def enter(dialect: Dialect, mode: str, *others: str, ends_flight: bool = False) -> Goal:
     """Return the goal of a mode; if that is refused, of the next one."""
-    return _mode_goal(
-        mode, lambda dialect: mode, ends_flight=ends_flight,
-        instead=lambda dialect: enter(*others, ends_flight=ends_flight) if others else None)
+    return Goal(name=mode, command=_SET_MODE, params=dialect.set_mode_parameters(mode),
+                reached=lambda vehicle: vehicle.status.mode == mode, modes=(mode,),
+                ends_flight=ends_flight,
+                instead=enter(dialect, *others, ends_flight=ends_flight) if others else None)
 
 
-#: The mode that obeys our setpoints: OFFBOARD, GUIDED.
-OFFBOARD: Final[Goal] = _mode_goal('offboard', lambda dialect: dialect.offboard)
-#: Out of that mode, into the one that keeps the position; PX4 has none without a global origin.
-HOLD: Final[Goal] = _mode_goal(
-    'hold', lambda dialect: dialect.hold, ends_flight=True,
-    reached=lambda vehicle: not vehicle.status.offboard,
-    instead=lambda dialect: enter(*dialect.hold_instead, ends_flight=True))
-#: Landing here: reached when the vehicle descends, not when it is down.
-LAND: Final[Goal] = _mode_goal(
-    'land', lambda dialect: dialect.land, ends_flight=True, insists=True)
+def offboard(dialect: Dialect) -> Goal:
+    """Return the goal of the mode that obeys our setpoints: OFFBOARD, GUIDED."""
+    return replace(enter(dialect, dialect.offboard), name='offboard',
+                   stream=dialect.stream_before_offboard)
 
 
-def arm(value: bool, streaming: bool = False) -> Goal:
+def hold(dialect: Dialect) -> Goal:
+    """Return the goal of keeping the position; PX4 has no Hold without a global origin."""
+    goal = enter(dialect, dialect.hold, *dialect.hold_instead, ends_flight=True)
+    return replace(goal, name='hold', reached=lambda vehicle: not vehicle.status.offboard)
+
+
+def land(dialect: Dialect) -> Goal:
+    """Return the goal of landing here: reached when the vehicle descends, not when it is down."""
+    return replace(enter(dialect, dialect.land, ends_flight=True), name='land', insists=True)
+
+
+def arm(dialect: Dialect, value: bool, mode: str = '', streaming: bool = False) -> Goal:
     """
     Return the goal of arming or disarming; disarming in the air is refused by autopilots.
 
     After a landing ArduPilot stays in LAND, and PX4 returns to OFFBOARD or AUTO.TAKEOFF. ArduPilot
     does not arm in LAND. PX4 arms in OFFBOARD only while ``streaming`` setpoints, and climbs at
-    once if armed in AUTO.TAKEOFF. So arming requests another mode first.
+    once if armed in AUTO.TAKEOFF. So arming in such a ``mode`` requests another one first.
     """
-    def armable(vehicle: Vehicle) -> Goal | None:
-        mode, dialect = vehicle.status.mode, vehicle.dialect
-        stuck = mode in dialect.unarmable_modes and not vehicle.status.armed
-        return enter(*dialect.arming_modes) if value and stuck and not (
-            streaming and mode == dialect.offboard) else None
-
-    return Goal('arm' if value else 'disarm', _ARM, lambda dialect: (float(value),),
-                lambda vehicle: vehicle.status.armed == value, ends_flight=not value,
-                insists=not value, before=armable)
+    stuck = mode in dialect.unarmable_modes and not (streaming and mode == dialect.offboard)
+    return Goal(name='arm' if value else 'disarm', command=_ARM, params=(float(value),),
+                reached=lambda vehicle: vehicle.status.armed == value,
+                ends_flight=not value, insists=not value,
+                before=enter(dialect, *dialect.arming_modes) if value and stuck else None)
 
 
-def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
+def takeoff(dialect: Dialect, height: float, altitude: float, sea_level_altitude: float | None,
             above_home: float) -> Goal:
     """
     Return the goal of climbing by ``height``, m, from the present height.
 
-    Nearly: autopilots are content a little below. ArduPilot takes off in its offboard mode.
+    Nearly: autopilots are content a little below. ArduPilot takes off in its offboard mode. A
+    climb that takes too long may go on: the vehicle lands.
 
     :param altitude: present height above the local origin, m.
     :param sea_level_altitude: present height above sea level, m; None if unknown.
@@ -153,21 +151,19 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
     """
     enough = altitude + height - max(0.2, 0.1 * height)
     return Goal(
-        'takeoff', TAKEOFF,
-        lambda dialect: dialect.takeoff_parameters(height, sea_level_altitude, above_home),
-        lambda vehicle: (vehicle.airborne and vehicle.altitude is not None
-                         and vehicle.altitude >= enough),
-        modes=lambda dialect: dialect.takeoff_modes,
-        timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
-        # A copy of OFFBOARD, which needs no setpoint stream.
-        before=lambda vehicle: (
-            replace(OFFBOARD) if vehicle.dialect.setpoints_end_takeoff else None))
+        name='takeoff', command=TAKEOFF,
+        params=dialect.takeoff_parameters(height, sea_level_altitude, above_home),
+        reached=lambda vehicle: (vehicle.airborne and vehicle.altitude is not None
+                                 and vehicle.altitude >= enough),
+        modes=dialect.takeoff_modes, timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
+        before=replace(offboard(dialect), stream=0.0) if dialect.setpoints_end_takeoff else None,
+        too_late=land(dialect))
 
 
-def result_text(result: int | None) -> str:
+def result_text(result: int) -> str:
     """Return a MAV_RESULT in words: 'temporarily rejected'."""
     name = enum_name('MAV_RESULT', result) or f'result {result}'
-    return 'no result' if result is None else name.lower().replace('_', ' ')
+    return name.lower().replace('_', ' ')
 
 
 class Request:
@@ -180,44 +176,36 @@ class Request:
     :param own: whether the bridge itself makes the request.
     """
 
-    def __init__(self, goal: Goal, now: float, superseded: Goal | None = None,
+    def __init__(self, dialect: Dialect, goal: Goal, now: float, superseded: Goal | None = None,
                  own: bool = False) -> None:
         self.goal = goal
         self.own = own
-        self.begun = now
         self.outcome: Outcome | None = None
+        self._dialect = dialect
         self._superseded = superseded
-        self._next: Goal | None = None
         self._refused: list[str] = []
-        self._known: Vehicle | None = None
-        self._advice = ''
-        self._mode = ''
-        self._begin(goal, now)
+        self._next = goal if goal.before is not None else None
+        self._begin(goal.before or goal, now)
 
     def _begin(self, goal: Goal, now: float) -> None:
         self.current = goal
         """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
         self._since = self._last_sent = now  # since the beginning, then since the first command
         self._attempts = 0
+        self._mode = ''  # the vehicle's at the beginning
         self._result: int | None = None
         self._refused_at: float | None = None
 
-    @property
-    def sent(self) -> bool:
-        """Return whether the command of ``current`` has been sent."""
-        return self._attempts > 0
-
     def acknowledge(self, command: int, result: int, now: float) -> bool:
         """Take a COMMAND_ACK; return whether it is the first that refuses."""
-        if command != self.current.command or not self.sent:
+        if command != self.current.command or not self._attempts:
             return False
         refuses = result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
         if refuses or self._result is None:
             self._result = result
-        if not refuses or self._refused_at is not None:
-            return False
-        self._refused_at = now
-        return True
+        first = refuses and self._refused_at is None
+        self._refused_at = now if first else self._refused_at
+        return first
 
     def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
@@ -227,31 +215,24 @@ class Request:
         :param vehicle: its state now, None if no HEARTBEAT is fresh.
         :param streaming_for: how long setpoints have been going out without a gap, s.
         """
-        if self.outcome is not None:
+        if self.outcome is not None or (vehicle is not None and self._shown(vehicle, now)):
             return None
-        self._known = vehicle or self._known
-        if vehicle is not None and not self._mode:
-            self._mode = vehicle.status.mode
-            before = self.goal.before(vehicle)
-            self._next = self.goal if before else None
-            self._begin(before or self.goal, now)
-        insists = self.current.insists or self._superseded is not None
-        if vehicle is not None and self.current.reached(vehicle) and (self.sent or not insists):
-            if vehicle.shown_time > self._since:
-                self._reached(vehicle, now)
-                return None
-            if not self.sent and now - self._since < STREAM_TIMEOUT:
-                return None  # the next HEARTBEAT shows whether it is still so
-        if vehicle is not None and (reason := self._overtaken(vehicle)):
-            self.refuse(reason)
+        if not self._attempts:
+            if streaming_for >= self.current.stream:
+                self._since = now
+                return self._send(now)
+            if now - self._since >= STREAM_TIMEOUT:
+                self._finish(False, f'{self.current.name}: no setpoint stream has been running '
+                                    f'for {self.current.stream} s')
             return None
-        if not self.sent:
-            return self._first(vehicle, streaming_for, now)
+        waited = now - self._since
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._fail(self._refusal(texts), vehicle, False, now)
-        elif now - self._since >= (CONFIRM_TIMEOUT if self._result is None
-                                   else self.current.timeout):
-            self._fail(self._unconfirmed(vehicle, texts), vehicle, True, now)
+            self._fail(self._refusal(texts), self.current.instead, now)
+        elif waited >= (CONFIRM_TIMEOUT if self._result is None else self.current.timeout):
+            holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
+            self._fail(self._unconfirmed(vehicle, texts),
+                       self.current.instead if holds else
+                       self.current.too_late or self.current.instead, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
                 # An ACK of a mode command may answer an earlier one: it does not say. If it was
                 # this one's, the pilot may have left the mode between two HEARTBEATs: only what
@@ -265,53 +246,48 @@ class Request:
         self._finish(False, f'{self.goal.name} refused: {message}')
         return self
 
+    def _shown(self, vehicle: Vehicle, now: float) -> bool:
+        """Return whether the vehicle shows that there is nothing to send at ``now``, s."""
+        self._mode = self._mode or vehicle.status.mode
+        insists = self.current.insists or self._superseded is not None
+        if self.current.reached(vehicle) and (self._attempts or not insists):
+            if vehicle.shown_time > self._since:
+                self._reached(vehicle, now)
+                return True
+            # The next HEARTBEAT shows whether it is still so.
+            if not self._attempts and now - self._since < STREAM_TIMEOUT:
+                return True
+        if reason := self._overtaken(vehicle):
+            self.refuse(reason)
+        return bool(reason)
+
     def _reached(self, vehicle: Vehicle, now: float) -> None:
         if self._next is not None:
-            self._mode = vehicle.status.mode
             goal, self._next = self._next, None
             self._begin(goal, now)
             return
-        duration = f'after {now - self._since:.1f} s' if self.sent else 'already'
-        self._finish(True, f'{self.current.name}: {_shown(vehicle)}, {duration}')
+        duration = f'after {now - self._since:.1f} s' if self._attempts else 'already'
+        self._finish(True, f'{self.current.name}: {_status(vehicle)}, {duration}')
 
-    def _fail(self, why: str, vehicle: Vehicle | None, late: bool, now: float) -> None:
-        """Request something else after a refusal, or after the time is over (``late``); or end."""
-        instead = self.current.instead(vehicle.dialect) if vehicle is not None else None
-        if late and self.current.command == TAKEOFF and not (
-                vehicle is not None and vehicle.status.mode == vehicle.dialect.hold):
-            instead = LAND  # it may climb on
+    def _fail(self, why: str, instead: Goal | None, now: float) -> None:
+        """Request something else after a refusal or in vain, or end."""
         if instead is None or self._result is None:
-            self._finish(False, '; '.join(filter(None, (why, self._advice))))
+            self._finish(False, why)
             return
         self._refused.append(why)
-        self._mode = vehicle.status.mode if vehicle is not None else self._mode
         self._begin(instead, now)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""
-        status, dialect = vehicle.status, vehicle.dialect
+        status, through = vehicle.status, self._dialect.takeoff_modes
         if self.current.command == TAKEOFF and not status.armed:
             return 'disarmed meanwhile'
-        goals = [goal for goal in (self.current, self._superseded) if goal is not None]
-        expected = {self._mode, *(mode for goal in goals for mode in goal.modes(dialect)),
+        expected = {self._mode, *self.current.modes,
+                    *(self._superseded.modes if self._superseded is not None else ()),
                     # One leads on to the next.
-                    *(dialect.takeoff_modes if self._mode in dialect.takeoff_modes else ())}
-        return '' if status.mode in expected or not self.current.modes(dialect) else (
+                    *(through if self._mode in through else ())}
+        return '' if status.mode in expected or not self.current.modes else (
             f'the mode was changed to {status.mode} meanwhile')
-
-    def _first(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
-        """Send the command for the first time if its conditions are met; else wait, or end."""
-        stream = vehicle.dialect.stream_before_offboard if vehicle is not None else 0.0
-        missing = first_reason(
-            (vehicle is None and not self.current.ends_flight, NOT_RECEIVED),
-            (self.current is OFFBOARD and streaming_for < stream,
-             f'no setpoint stream has been running for {stream} s'))
-        if not missing:
-            self._since = now
-            return self._send(now)
-        if now - self._since >= STREAM_TIMEOUT:
-            self._finish(False, f'{self.current.name}: {missing}')
-        return None
 
     def _send(self, now: float) -> int:
         self._last_sent = now
@@ -319,27 +295,26 @@ class Request:
         return min(self._attempts - 1, 255)
 
     def _refusal(self, texts: StatusTexts) -> str:
-        goal, vehicle, mode = self.current, self._known, ''
-        if vehicle is not None and not (goal.ends_flight and goal.command == _ARM):
-            mode, *_ = *goal.modes(vehicle.dialect), vehicle.status.mode
-        reasons = texts.why(self._since, mode)
-        self._advice = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
-        return f'{goal.name} refused: ' + ': '.join(
-            filter(None, (result_text(self._result), '; '.join(reasons))))
+        # PX4 reports what speaks against a mode, or against arming in one.
+        mode, *_ = *self.current.modes, '' if self.current.ends_flight else self._mode
+        reasons = '; '.join(texts.why(self._since, mode)) or (
+            '' if self.current.instead else self._dialect.no_reason)
+        return ': '.join(filter(None, (
+            f'{self.current.name} refused', result_text(self._result or 0), reasons)))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
-        problem = f'{self.current.name} not reached within {self.current.timeout:.1f} s: ' + (
-            'no HEARTBEAT comes' if vehicle is None else _shown(vehicle))
-        if self._result is None:
-            problem = f'{self.current.name}: no answer to {self._attempts} commands' + (
-                ', and no HEARTBEAT' if vehicle is None else '')
-        return ': '.join(filter(None, (problem, '; '.join(texts.since(self._since)))))
+        shown = 'no HEARTBEAT comes' if vehicle is None else _status(vehicle)
+        problem = (f'{self.current.name}: no answer to {self._attempts} commands'
+                   if self._result is None else
+                   f'{self.current.name} not reached within {self.current.timeout:.1f} s')
+        return ': '.join(filter(None, (
+            f'{problem}: {shown}', '; '.join(texts.since(self._since)))))
 
     def _finish(self, success: bool, message: str) -> None:
-        abandoned = self.current is LAND and self.goal is not LAND
+        abandoned = self.goal.too_late is not None and self.current is self.goal.too_late
         self.outcome = Outcome(success and not abandoned, '; '.join([*self._refused, message]))
 
 
-def _shown(vehicle: Vehicle) -> str:
+def _status(vehicle: Vehicle) -> str:
     armed = 'armed' if vehicle.status.armed else 'disarmed'
     return f'HEARTBEAT shows {vehicle.status.mode}, {armed}'

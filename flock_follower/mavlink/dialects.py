@@ -216,7 +216,8 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
         that HEARTBEAT does not name.
     """
     sender = next((d for d in DIALECTS.values() if d.firmware == heartbeat.autopilot), None)
-    if sender is ARDUPILOT and heartbeat.type not in _MULTIROTORS:
+    if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_INVALID or (  # a gimbal, a ground station
+            sender is ARDUPILOT and heartbeat.type not in _MULTIROTORS):
         return None
     if autopilot == AUTO:
         return sender
@@ -229,10 +230,3 @@ def describe(heartbeat: Any) -> str:
     return ' '.join(
         enum_name(enum, value) or f'{enum} {value}' for enum, value in (
             ('MAV_AUTOPILOT', heartbeat.autopilot), ('MAV_TYPE', heartbeat.type)))
-
-
-def is_autopilot(heartbeat: Any) -> bool:
-    """Return whether a HEARTBEAT comes from a flight controller, not a gimbal or a station."""
-    return bool(heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID
-                and heartbeat.type not in (mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_GIMBAL,
-                                           mavlink.MAV_TYPE_ONBOARD_CONTROLLER))

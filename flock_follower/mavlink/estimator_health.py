@@ -23,11 +23,8 @@ vision: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Mapping
-from functools import partial
 from itertools import pairwise
 import math
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -55,10 +52,6 @@ _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_POS_HORIZ_ABS: 'POS_HORIZ_ABS',
     mavlink.ESTIMATOR_POS_VERT_ABS: 'POS_VERT_ABS',
     mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
-#: Part of the text of PX4's arming check for a global position, see ``status_texts``.
-NO_GLOBAL_POSITION: Final[str] = 'no global position'
-UNALIGNED: Final[str] = 'its estimator lacks no flag: its yaw is not aligned; restart it'
-WITHOUT_COMPASS: Final[str] = ', and set EKF2_MAG_TYPE to 5 if it flies without GPS'
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
 GPS_SILENCE: Final[float] = 10.0
@@ -93,24 +86,11 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
         name for flag, name in _NEEDED.items() if not flags & flag))
 
 
-def explained(refusal: str, status: EstimatorStatus | None, now: float,
-              parameters: Mapping[str, float] = MappingProxyType({})) -> str:
-    """
-    Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks.
-
-    PX4 1.16 publishes no global position while its yaw is not aligned; no flag reports that. Seen
-    after a landing, for 150 s: PX4 learnt a compass offset, which ended the alignment, and yaw
-    from vision, already in use, did not restore it.
-
-    :param parameters: the values of the autopilot's parameters that are known.
-    """
-    known = status is not None and now - status.time <= STATUS_TIMEOUT
-    missing = status.missing if status is not None else ()
-    compass = '' if parameters.get('EKF2_MAG_TYPE') == 5.0 else WITHOUT_COMPASS
-    return refusal + first_reason(
-        (not known, ''),
-        (missing, f'; its estimator lacks {", ".join(missing)}'),
-        (NO_GLOBAL_POSITION in refusal, f'; {UNALIGNED}{compass}'))
+def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
+    """Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks."""
+    if status is None or now - status.time > STATUS_TIMEOUT or not status.missing:
+        return refusal
+    return f'{refusal}; its estimator lacks {", ".join(status.missing)}'
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
@@ -143,28 +123,23 @@ RECENT: Final[float] = 5.0
 #: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
 WINDOW: Final[float] = 1.0
 FEWEST: Final[int] = 5
-#: So many are remembered: RECENT at 1 kHz.
-MOST: Final[int] = 5000
 #: Stands for all messages in the place of an id.
 ANY: Final[int] = -1
 #: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
-#: Time between two requests, s; the longest where asking does no good.
-SHORTEST_WAIT: Final[float] = 2.0
-LONGEST_WAIT: Final[float] = 30.0
 
 
 class Arrivals:
     """Times of reception, s, of the messages of one autopilot, by message id."""
 
     def __init__(self) -> None:
-        self._times: defaultdict[int, deque[float]] = defaultdict(partial(deque, maxlen=MOST))
+        self._times: defaultdict[int, deque[float]] = defaultdict(deque)
 
     def take(self, message_id: int, now: float) -> None:
         """Take a message that came at ``now``."""
         for times in (self._times[message_id], self._times[ANY]):
             times.append(now)
-            while now - times[0] > RECENT and now - times[1] > RECENT:
+            while now - times[0] > RECENT:
                 times.popleft()
 
     def recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
@@ -173,59 +148,16 @@ class Arrivals:
         return [time for time in self._times[message_id].copy() if now - time < window]
 
     def rate(self, message_id: int, now: float) -> float:
-        """Return how often a message comes, Hz; 0 if the last is half of RECENT ago."""
-        times = self.recent(message_id, now)
-        if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
-            return 0.0
-        return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
+        """Return how often a message has come within RECENT, Hz."""
+        return len(self.recent(message_id, now)) / RECENT
 
     def longest_pause(self, now: float) -> float:
         """Return the longest pause in all messages within the last RECENT, s."""
-        times = [*self._times[ANY].copy(), now]
-        return max((later - time for time, later in pairwise(times) if now - later <= RECENT),
-                   default=0.0)
+        times = [*self.recent(ANY, now), now]
+        return max((later - time for time, later in pairwise(times)), default=0.0)
 
     def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
         """Return whether the rate of a message is well below the requested one, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
         return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
-
-
-class AskAgain:
-    """
-    Schedule of repeated requests for messages at too low a rate; the period grows without success.
-
-    Another one on the same line may have set other rates (MAVProxy does, every 15 s): asking
-    helps. A line that cannot carry more is only filled by asking.
-    """
-
-    def __init__(self) -> None:
-        self._asked = self._low = -math.inf
-        self._vain = 0
-        self._absent = False
-
-    def asked(self, now: float) -> None:
-        """Begin afresh: everything was asked for at ``now``, s."""
-        self._asked, self._vain = now, 0
-
-    def due(self, low: bool, now: float, comes: bool = True) -> bool:
-        """
-        Return whether to ask at ``now``, s.
-
-        :param low: whether messages come too seldom; ``comes``: whether any comes.
-        """
-        if comes and self._absent:
-            self.asked(now)  # in vain before, since there was no estimate to send
-        self._absent = not comes
-        if not low:
-            if now - max(self._low, self._asked) >= SHORTEST_WAIT:
-                self._vain = 0
-            return False
-        self._low = now
-        wait = min(SHORTEST_WAIT * 2 ** max(0, self._vain - 1), LONGEST_WAIT)
-        if now - self._asked < wait:
-            return False
-        self._asked = now
-        self._vain = min(self._vain + 1, 10)
-        return True

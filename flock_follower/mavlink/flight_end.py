@@ -140,17 +140,16 @@ class FlightEnd:
         :param command_time: when a command was accepted last, s.
         :param handover: why the gate wants to, or ''.
         """
-        most = self.params.engage_timeout
-        late = command_time >= active_since and now - command_time > COMMAND_TIMEOUT
-        causes = (
-            (handover, HOLD),
-            (self.battery_low(now), self.params.battery_action),
-            (f'no command for {COMMAND_TIMEOUT:g} s' if late else '',
-             self.params.leader_lost_action),
-            (f'no command within engage_timeout = {most:g} s' if (
-                command_time < active_since and now - active_since > most) else '',
-             self.params.leader_lost_action))
-        return next((cause for cause in causes if cause[0]), ('', HOLD))
+        if handover:
+            return handover, HOLD
+        if low := self.battery_low(now):
+            return low, self.params.battery_action
+        late, why = now - command_time > COMMAND_TIMEOUT, f'no command for {COMMAND_TIMEOUT:g} s'
+        if command_time < active_since:
+            timeout = self.params.engage_timeout
+            late = now - active_since > timeout
+            why = f'no command within engage_timeout = {timeout:g} s'
+        return (why, self.params.leader_lost_action) if late else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
              status: VehicleStatus, now: float) -> str:

@@ -43,6 +43,7 @@ from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     displaced,
     finite_vector,
+    known_motion,
     KnownMotion,
     Motion,
     ODOM,
@@ -195,14 +196,13 @@ class Gate:
             known.path.take(p, known.velocity if fresh else None, time)
             known.std = std if math.isfinite(std) else 0.0
 
-    def update_height(self, altitude: float, now: float) -> str:
-        """Take an altitude, m, of the barometer; return '' or why it is refused."""
+    def update_height(self, altitude: float, now: float, sensor: str = '') -> str:
+        """Take an altitude, m, of a barometer or another sensor; return '' or why not."""
         known = self._known(now)
         # Also from an invalid source: a constant error is estimated and removed.
-        velocity = None if self.relative.reckoning else known.source_first[0].fresh_velocity(
-            self.limits) or known.braking_velocity(self.limits)
+        velocity = None if self.relative.reckoning else known.velocity or known.braking
         refused = self.heights.take(altitude, None if velocity is None else float(
-            velocity.vector[2]), now)
+            velocity.vector[2]), now, sensor)
         height = self.heights.altitude(now)
         if not refused and height is not None:
             self._height_path.take(np.array([0.0, 0.0, height]), None, now)
@@ -226,12 +226,12 @@ class Gate:
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
-        return self._known(now).yaw_difference(self.limits)
+        return self._known(now).turned
 
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
-        what = self._known(now).contradiction(self.limits)
-        more = (f' by {self.velocity_difference:.2f} m/s, more than '
+        what = self._known(now).contradiction
+        more = (f' by {self._comparison.difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
         # Displacements are compared in each cycle.
         return f'{what}{more}' if what == VELOCITIES_DISAGREE else what or self._displaced
@@ -244,19 +244,9 @@ class Gate:
             'their frames are not aligned, commands would go the wrong way')
 
     @property
-    def velocity_difference(self) -> float:
-        """Return the average difference between the velocities of odom and autopilot, m/s."""
-        return self._comparison.difference
-
-    @property
     def wind(self) -> float:
         """Return the acceleration by the wind that setpoints offset, m/s^2."""
         return float(np.linalg.norm(self._wind))
-
-    @property
-    def jumps(self) -> int:
-        """Return how often a position or a height has jumped."""
-        return self.heights.steps + sum(source.path.jumps for source in self._sources.values())
 
     def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
@@ -267,7 +257,7 @@ class Gate:
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
-        velocity = self._known(now).braking_velocity(self.limits)
+        velocity = self._known(now).braking
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def place(self, now: float) -> Location:
@@ -318,8 +308,7 @@ class Gate:
         self._heightless_since = min(self._heightless_since, now) if heightless else math.inf
         known, place = self._known(now), self.place(now)
         self._hold(known, place, engaged, now)
-        velocity = None if known.contradiction(self.limits) else (
-            known.source_first[0].fresh_velocity(self.limits))
+        velocity = None if known.contradiction else known.velocity
         usable = velocity is not None and not self._displaced and self._source() == ODOM
         self.relative.update(active and engaged, self._commanded, usable, place.height, now)
         self._disturbance.step(self._flown, None if velocity is None or (
@@ -338,7 +327,7 @@ class Gate:
         sends = setpoint.kind != setpoint_rules.NONE
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
         self._commanded = setpoint.kind == setpoint_rules.COMMAND
-        if not sends and not withheld and known.blind(self.limits):
+        if not sends and not withheld and known.blind:
             self.permit(self.permission.blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:
             return setpoint, None
@@ -369,23 +358,23 @@ class Gate:
         yaw, time = odom.newest_yaw
         # Compared at the same time: at 1 rad/s odometry 0.25 s late would seem turned by 0.25 rad.
         then, _ = autopilot.yaw(time) if math.isfinite(time) else autopilot.newest_yaw
-        return KnownMotion(
-            odom=Motion(odom.velocity, now - odom.velocity_time, yaw, now - time),
-            autopilot=Motion(autopilot.velocity, now - autopilot.velocity_time, then,
-                             now - autopilot.newest_yaw[1]),
+        return known_motion(
+            self.limits, Motion(odom.velocity, now - odom.velocity_time, yaw, now - time),
+            Motion(autopilot.velocity, now - autopilot.velocity_time, then,
+                   now - autopilot.newest_yaw[1]),
             source=self._source(), disagreeing_for=self._comparison.disagreeing_for(now),
             distrusted_for=now - self._distrusted_since)
 
     def _compare(self, engaged: bool, now: float) -> None:
         """Compare the velocities and the displacements of the sources."""
         known, odom = self._known(now), self._sources[ODOM]
-        self._comparison.take(known.velocity_difference(self.limits),
-                              self.limits.velocity_tolerance, engaged, now)
+        self._comparison.take(
+            known.difference, self.limits.velocity_tolerance, engaged, now)
         # An estimate that rests on our odometry, or on nothing, proves nothing.
         proves = not self.fused and math.isinf(self._distrusted_since)
         self._displaced = '' if known.source != ODOM else displaced(
             odom, self._sources[AUTOPILOT] if proves else None,
-            known.yaw_difference(self.limits) or 0.0, self._height_path, now)
+            known.turned or 0.0, self._height_path, now)
         self._displaced_since = min(self._displaced_since, now) if engaged and (
             self._displaced) else math.inf
 

@@ -27,7 +27,7 @@ time since boot (PX4 ``hrt_absolute_time``, ArduPilot ``AP_HAL::micros64``): the
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Mapping, Sequence
 import math
 from types import MappingProxyType
@@ -36,7 +36,6 @@ from typing import Any, Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.mavlink.estimator_health import AskAgain, RECENT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
@@ -54,12 +53,12 @@ _WRAP = 2**32 * _MILLISECOND  # of time_boot_ms, after 50 days
 
 
 class Sample(NamedTuple):
-    """One answer."""
+    """One answer: the bounds of the autopilot's clock minus ours, ns."""
 
-    offset: int
-    """The autopilot's clock minus ours, ns."""
-    way: int
-    """There and back, ns."""
+    most: int
+    """It was written after the question."""
+    least: int
+    """It was written before it arrived."""
     time: int
     """Time of reception, ns."""
 
@@ -81,8 +80,7 @@ class TimeSync:
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
         if message.ts1 in self._asked:  # else another system has sent the request
-            self._samples.append(Sample(
-                message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))
+            self._samples.append(Sample(message.tc1 - message.ts1, message.tc1 - now, now))
         return None
 
     def age(self, time_boot_ms: int, now: int) -> float:
@@ -101,28 +99,16 @@ class TimeSync:
         samples = [sample for sample in self._samples if now - sample.time <= MEMORY]
         if len(samples) < 2:
             return 0.0
-        ahead = min(sample.offset + sample.way // 2 for sample in samples)
-        # The other bound: each answer was written before it arrived. If they clash, trust none.
-        if max(sample.offset - sample.way // 2 for sample in samples) > ahead + TOLERANCE:
-            return 0.0
+        ahead = min(sample.most for sample in samples)
+        if max(sample.least for sample in samples) > ahead + TOLERANCE:
+            return 0.0  # they clash: trust none
         late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
         return max(late, 0) * 1e-9
 
-    def unanswered(self, now: int) -> float:
-        """Return for how long, s, no question has been answered; 0 where none waits."""
-        # Copies: diagnostics read them from another thread.
-        answered = max((sample.time for sample in self._samples.copy()), default=0)
-        waiting = (now - time for time in self._asked.copy() if time > answered)
-        return max(waiting, default=0) * 1e-9
 
-    @property
-    def best(self) -> Sample | None:
-        """Return the best of the recent answers, None without one."""
-        return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
-
-
-#: Telemetry is requested again after this, s, until the vehicle reports whether it flies.
-STREAM_REQUEST_PERIOD: Final[float] = 2.0
+#: Messages that come too seldom are requested again after this, s: another program on the line may
+#: have set other rates (MAVProxy does, every 15 s).
+STREAM_REQUEST_PERIOD: Final[float] = 5.0
 #: The messages whose rate is reported.
 ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -130,20 +116,11 @@ ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
 #: The rates of the other messages wanted from any autopilot, Hz.
 RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 20.0,
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 20.0,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5})
-#: Rates below this share of the requested one are reported, except a rate of zero: its cause is
-#: not the link.
-FEW: Final[float] = 0.5
-#: A longer pause in all messages, s, is reported: the largest age of a velocity for braking.
-PAUSE: Final[float] = 0.3
-#: An autopilot that answers no TIMESYNC for this long, s, does not receive our messages.
-UNANSWERED_MAX: Final[float] = 5.0
-#: The landed state is requested for this long, s; some autopilots never send it.
-LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is sent again after this, s, until the autopilot reports one.
 ORIGIN_PERIOD: Final[float] = 5.0
 #: Latitude, longitude, deg, and height, m, of the origin sent to PX4 if none is configured: the
@@ -151,8 +128,8 @@ ORIGIN_PERIOD: Final[float] = 5.0
 #: and PX4 would expect the magnetic field off Africa, whose inclination and declination are wrong
 #: almost everywhere else.
 ANY_ORIGIN: Final[tuple[float, float, float]] = (47.397742, 8.545594, 0.0)
-#: Period of requests for the reasons that prevent arming, s, while disarmed; and the time within
-#: which the autopilot answers, s.
+#: Period of requests for the reasons that prevent arming, s, while disarmed; and the time in which
+#: the autopilot answers, s.
 WHY_PERIOD: Final[float] = 30.0
 WHY_WAIT: Final[float] = 3.0
 
@@ -180,19 +157,16 @@ class Housekeeping:
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
         self.parameters = ParameterCheck(())
-        self.alive_since = math.inf
-        """When the first message of the autopilot was received, s."""
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
         self._origin = origin
         self.without_gps = without_gps
         self._origin_sent = self._heartbeat_sent = -math.inf
-        self._timesync_sent = self._streams_requested = self._why_asked = -math.inf
+        self._timesync_sent = self._why_asked = -math.inf
         self._reboots = 0
         self._was_alive = False
-        self._request_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
-        self._watched_since = math.inf
+        self._requested: dict[int, float] = {}  # when each message was requested last, s
 
     def take_timesync(self, message: Any, now: float) -> None:
         """Take a TIMESYNC, and answer it if it is a question."""
@@ -211,19 +185,16 @@ class Housekeeping:
         if reboots != self._reboots or (alive and not self._was_alive):
             self._reboots = reboots
             self.timesync = TimeSync()  # the autopilot's clock may have restarted
-            self._streams_requested, self.parameters = -math.inf, self._new_check()
-            self._watched_since = now
-            self.alive_since = min(self.alive_since, now)
+            self._requested, self.parameters = {}, self._new_check()
         self._was_alive = alive
         if not alive:
             return
         self._request_streams(now)
-        # Not sooner if it cannot be sent: the questions kept have to cover UNANSWERED_MAX.
         if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now
             self._link.send(self.timesync.question(round(now * 1e9)))
         self._send_origin(now)
-        for name in self.parameters.step(now):
+        if name := self.parameters.step(now):
             self._link.request_parameter(name)
         status = self._link.telemetry.status
         if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
@@ -238,7 +209,7 @@ class Housekeeping:
 
     def has_reasons(self, now: float) -> bool:
         """Return whether the autopilot was asked what keeps it from arming, and had the time."""
-        return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
+        return now - self._why_asked >= WHY_WAIT
 
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
@@ -250,55 +221,29 @@ class Housekeeping:
             needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
 
-    def rates(self, now: float) -> dict[str, tuple[float, float]]:
-        """Return how often the estimate comes and was asked for, Hz, by the message's name."""
-        return {name: (self._link.telemetry.arrivals.rate(message_id, now), self._estimate_rate)
+    def rates(self, now: float) -> dict[str, float]:
+        """Return how often the estimate comes, Hz, by the message's name."""
+        return {name: self._link.telemetry.arrivals.rate(message_id, now)
                 for name, message_id in ESTIMATE.items()}
 
-    def too_slow(self, now: float) -> str:
-        """Return that the estimate comes too seldom, or the link stalls, or ''."""
-        if now - self._watched_since < RECENT + STREAM_REQUEST_PERIOD:
-            return ''  # the requested messages cannot have come yet
-        problems = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
-                for name, (rate, wanted) in self.rates(now).items() if 0.0 < rate < FEW * wanted]
-        pause = self._link.telemetry.arrivals.longest_pause(now)
-        if pause > PAUSE:
-            problems.append(f'nothing came from the autopilot for {pause:.2f} s '
-                        f'in the last {RECENT:g} s')
-        return '; '.join(problems)
-
-    def unreceived(self, now: float) -> str:
-        """Return why the autopilot does not receive our messages, or ''."""
-        if self._link.signing or not self._link.autopilot_signs or (  # USB needs no signature
-                self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
-            return ''
-        return ('the autopilot signs its messages and answers none of ours: '
-                'set signing_key_file')
-
     def _request_streams(self, now: float) -> None:
+        """Request all messages once, and again those that come too seldom."""
         telemetry, dialect = self._link.telemetry, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
-        # These must not come less often, Hz: what braking and the pilot's switch rest on.
+        # What permission, braking and the pilot's switch rest on, and the least rate, Hz.
         watched = {**{message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status)},
+            *ESTIMATE.values(), dialect.estimator_status,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)},
             dialect.mode_message: dialect.least_mode_rate}
-        unreported = telemetry.flying(now) is None and (
-            telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
-        if math.isinf(self._streams_requested) or (
-                unreported and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
-            self._link.request_streams(wanted)
-            self._streams_requested = now
-            for message_id in watched:
-                self._request_again[message_id].asked(now)
-            return
-        arrivals = telemetry.arrivals
-        self._link.request_streams({
-            message_id: wanted[message_id] for message_id, least in watched.items()
-            if self._request_again[message_id].due(
-                arrivals.too_seldom(message_id, least, now), now,
-                bool(arrivals.recent(message_id, now, STREAM_REQUEST_PERIOD)))})
+        due = {message_id: wanted[message_id] for message_id in wanted
+               if message_id not in self._requested or (
+                   message_id in watched and telemetry.arrivals.too_seldom(
+                       message_id, watched[message_id], now)
+                   and now - self._requested[message_id] >= STREAM_REQUEST_PERIOD)}
+        self._link.request_streams(due)
+        self._requested.update(dict.fromkeys(due, now))
 
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin

@@ -32,27 +32,27 @@ import hmac
 import math
 import os
 from pathlib import Path
+import re
 import stat
 import struct
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import AUTO, describe, dialect_of, is_autopilot
+from flock_follower.mavlink.dialects import AUTO, describe, dialect_of
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
-from flock_follower.ranges import first_reason, Range
+from flock_follower.ranges import Range
 
-_MARKERS: Final[tuple[int, int]] = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
+_MARKER: Final = re.compile(b'[%c%c]' % (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2))
 _SIGNED: Final[int] = mavlink.MAVLINK_IFLAG_SIGNED
 #: After this many false starts, or unknown messages, in one piece the rest of it is dropped: a
 #: flood of bytes that look like starts must not keep the caller from its other work.
 MOST_FALSE_STARTS: Final[int] = 64
 UNDECODABLE: Final[str] = 'undecodable'
-WRONG_SIGNATURE: Final[str] = 'wrong signature'
-OLDER_TIMESTAMP: Final[str] = 'older timestamp'
-FUTURE_TIMESTAMP: Final[str] = 'future timestamp'
 UNKNOWN_MESSAGE: Final[str] = 'unknown message'
+BAD_SIGNATURE: Final[str] = (
+    'unsigned, signed with another key, older than the last, or over a minute ahead of our clock')
 
 
 class Codec(mavlink.MAVLink):  # type: ignore[misc]
@@ -60,19 +60,14 @@ class Codec(mavlink.MAVLink):  # type: ignore[misc]
 
     latest = 0
     """The latest timestamp to accept."""
-    refusal = ''
-    """Why the newest refused signature was refused."""
 
     def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
         # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
         # from the future would lock the real vehicle out.
         digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
-        self.refusal = first_reason(
-            (not hmac.compare_digest(digest[:6], bytes(msgbuf[-6:])), WRONG_SIGNATURE),
-            (int.from_bytes(msgbuf[-12:-6], 'little') > self.latest, FUTURE_TIMESTAMP))
-        if not self.refusal and not super().check_signature(msgbuf, *source):
-            self.refusal = OLDER_TIMESTAMP
-        return not self.refusal
+        return (hmac.compare_digest(digest[:6], bytes(msgbuf[-6:]))
+                and int.from_bytes(msgbuf[-12:-6], 'little') <= self.latest
+                and bool(super().check_signature(msgbuf, *source)))
 
 
 class Framer:
@@ -97,8 +92,10 @@ class Framer:
         buffer = self._waiting + data
         messages: list[Any] = []
         unused: Counter[str] = Counter()
-        start, rest, whole, self.looks = 0, len(buffer), 0, 0
-        while (start := _next_marker(buffer, start)) >= 0:
+        behind, rest, whole, self.looks = 0, len(buffer), 0, 0
+        for start in (match.start() for match in _MARKER.finditer(buffer)):
+            if start < behind:
+                continue  # a byte of the last message
             if self.looks >= most or self.looks - whole > MOST_FALSE_STARTS:
                 rest = len(buffer)
                 break
@@ -107,17 +104,15 @@ class Framer:
             if end > len(buffer):
                 # Either the rest has not arrived yet, or this byte was no start. Look on: a whole
                 # message behind it shows that it was none.
-                rest, start = min(rest, start), start + 1
+                rest = min(rest, start)
                 continue
             message, fault = self._decode(buffer[start:end])
             if fault:
                 unused[fault] += 1
             else:
                 messages.append(message)
-            if fault in (UNDECODABLE, UNKNOWN_MESSAGE):
-                start += 1
-            else:
-                start, rest, whole = end, len(buffer), whole + 1
+            if fault not in (UNDECODABLE, UNKNOWN_MESSAGE):
+                behind, rest, whole = end, len(buffer), whole + 1
         self._waiting = buffer[rest:]
         if buffer and not messages and not unused and not self._waiting:
             unused[UNDECODABLE] += 1
@@ -125,31 +120,22 @@ class Framer:
 
     def _decode(self, data: bytearray) -> tuple[Any, str]:
         """Return a message, and why it cannot be used, or ''."""
-        self.codec.refusal = WRONG_SIGNATURE  # of a message without a signature
         try:
             message = self.codec.decode(data)
         except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
-            signed = 'signature' in str(error).lower()
-            return None, self.codec.refusal if signed else UNDECODABLE
+            return None, BAD_SIGNATURE if 'signature' in str(error).lower() else UNDECODABLE
         # Another dialect's, or garbage: an unknown kind has no checksum.
         return message, UNKNOWN_MESSAGE if message.get_type().startswith('UNKNOWN') else ''
 
 
 def frame_length(buffer: bytearray, start: int) -> int:
     """Return the length of the message that starts there, or more than there is if unknown."""
-    header = buffer[start:start + 3]
-    if len(header) < 3:
-        return len(header) + 1
-    marker, payload, flags = header
+    if len(buffer) < start + 3:
+        return 3
+    marker, payload, flags = buffer[start:start + 3]
     if marker == mavlink.PROTOCOL_MARKER_V1:
         return int(payload + 8)
-    signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if flags & _SIGNED else 0
-    return int(payload + 12 + signature)
-
-
-def _next_marker(buffer: bytearray, start: int) -> int:
-    found = [i for marker in _MARKERS if (i := buffer.find(marker, start)) >= 0]
-    return min(found, default=-1)
+    return int(payload + 12 + (mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if flags & _SIGNED else 0))
 
 
 #: Valid system and component ids of MAVLink; 0 means all.
@@ -163,15 +149,6 @@ _SIGNING_TICKS: Final[float] = 1e5
 _MOST_PEERS: Final[int] = 16
 #: Of messages and pieces of garbage taken in one call; what a flood brings beyond is dropped.
 MOST_PIECES: Final[int] = 300
-#: What arrives although nothing of it is used, by the reason.
-_UNUSABLE: Final[dict[str, str]] = {
-    OLDER_TIMESTAMP: (
-        'what comes is signed with our key, but with an older timestamp: a replay, '
-        'or the clock of one of the two is wrong by more than a minute'),
-    FUTURE_TIMESTAMP: (
-        "what comes is signed with our key, but more than a minute ahead of this "
-        "computer's clock: set the clock of whichever is wrong, then start the bridge again"),
-    WRONG_SIGNATURE: 'what comes is unsigned or signed with another key'}
 #: How far ahead of our clock a signed message may be, s. MAVLink's rules send with the latest
 #: timestamp that was accepted, and refuse a new stream (the autopilot, started again) that is more
 #: than a minute behind that. With a minute at most no message accepted can have that effect.
@@ -201,7 +178,7 @@ class Signing:
     @classmethod
     def from_file(cls, path: str, unix_time: float) -> Signing:
         """
-        Read a key file of 32 bytes, or of 64 hexadecimal digits.
+        Read a key file of 32 bytes.
 
         :raises ValueError: if the file cannot be read, others have access to it, or it holds no
             key; never shows its content.
@@ -216,13 +193,7 @@ class Signing:
             raise ValueError(f'signing_key_file = {path!r}: mode {mode:03o} gives others access: '
                              f'chmod 600 {path}')
         if len(data) != SIGNING_KEY_SIZE:
-            try:
-                data = bytes.fromhex(data.decode('ascii'))
-            except ValueError:
-                data = b''
-        if len(data) != SIGNING_KEY_SIZE:
-            raise ValueError(f'signing_key_file = {path!r}: must hold {SIGNING_KEY_SIZE} bytes '
-                             f'or {2 * SIGNING_KEY_SIZE} hexadecimal digits')
+            raise ValueError(f'signing_key_file = {path!r}: must hold {SIGNING_KEY_SIZE} bytes')
         return cls(data, unix_time)
 
 
@@ -247,16 +218,10 @@ class Link:
         self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
                           else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
-        #: The last vehicle with the right ids but firmware that is not ``autopilot``.
-        self.foreign = ''
-        #: HEARTBEATs of other autopilots, by system id.
-        self.other_autopilots: Counter[int] = Counter()
         #: Number of messages that were received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
         self.peer_changes = 0
-        #: Whether the newest message of the autopilot carried a signature.
-        self.autopilot_signs = False
         self.bytes_received = 0
         self.bytes_sent = 0
         self.signing = signing
@@ -289,7 +254,6 @@ class Link:
                 if unfit := self._unfit(message, peer, now):
                     self.ignored[unfit] += 1
                     continue
-                self.autopilot_signs = bool(message.get_header().incompat_flags & _SIGNED)
                 self.telemetry.update(message, now)
                 messages.append(message)
         return messages
@@ -306,18 +270,14 @@ class Link:
 
     def _unfit(self, message: Any, peer: Any, now: float) -> str:
         """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
-        kind = message.get_type()
-        system = message.get_srcSystem()
-        vehicle = (message.get_srcComponent() == AUTOPILOT_COMPONENT
-                   and (kind != 'HEARTBEAT' or is_autopilot(message)))
+        kind, system = message.get_type(), message.get_srcSystem()
+        component = message.get_srcComponent()
         if system != self.target_system:
-            self.other_autopilots[system] += kind == 'HEARTBEAT' and vehicle
-            return 'other system'
-        if not vehicle:
-            return 'other component'
+            return f'of system id {system}, not target_system {self.target_system}'
+        if component != AUTOPILOT_COMPONENT:
+            return f'of component {component}, not of an autopilot'
         if kind == 'HEARTBEAT' and dialect_of(message, self.autopilot) is None:
-            self.foreign = describe(message)
-            return 'other firmware'
+            return f'of {describe(message)}, which autopilot = {self.autopilot!r} does not send'
         if peer == self.transport.peer:
             return ''
         # Answer one vehicle only: a second one with the same id must be silent first.
@@ -362,14 +322,6 @@ class Link:
 
     def silence(self) -> str:
         """Return a text that names the messages received instead of the autopilot's."""
-        ignored = self.ignored
-        if self.foreign:
-            return f'received {self.foreign}, which autopilot = {self.autopilot!r} does not send'
-        if others := sorted(+self.other_autopilots):
-            return (f'received system id {", ".join(map(str, others))}, '
-                    f'not target_system {self.target_system}')
-        none = (f'received MAVLink, but no autopilot with system id {self.target_system} '
-                f'and component {AUTOPILOT_COMPONENT}')
-        texts = {**_UNUSABLE, 'other system': none, 'other component': none,
-                 UNDECODABLE: 'received bytes are not MAVLink'}
-        return next((text for why, text in texts.items() if ignored[why]), 'nothing arrives')
+        # A copy: the setpoint thread adds to it.
+        why = ', '.join(f'{count} {reason}' for reason, count in self.ignored.copy().items())
+        return f'received, but not used: {why}' if why else 'nothing arrives'

@@ -35,11 +35,10 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect
 
-#: An unanswered question is asked again after this, s, and this many times in all.
-RETRY_PERIOD: Final[float] = 1.0
-ATTEMPTS: Final[int] = 3
-#: Questions under way at a time: slow links have other things to carry.
-AT_ONCE: Final[int] = 2
+#: An unanswered question is asked again after this, s.
+RETRY_PERIOD: Final[float] = 2.0
+#: The differences are reported after this, s, if some are not answered by then.
+PATIENCE: Final[float] = 5.0
 #: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: How the comment of an entry begins of which any other value but 0 will do.
@@ -117,7 +116,7 @@ class CheckResult(NamedTuple):
 
 class ParameterCheck:
     """
-    Asks for each recommended parameter in turn; ``step`` returns which to ask for now.
+    Reads parameters; ``step`` returns which one to ask for now, one at a time.
 
     ``values`` holds the autopilot's answers. ``result`` may be called from any thread, everything
     else from one.
@@ -130,29 +129,19 @@ class ParameterCheck:
         self.values: dict[str, float] = {}
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
-        # When each was asked for last, s, and how often; those given up.
-        self._asked = dict.fromkeys((*needed, *self._recommended), (-math.inf, 0))
-        self._given_up: set[str] = set()
-        self._finished = False
+        self._asked = dict.fromkeys((*needed, *self._recommended), -math.inf)  # when last, s
+        self._begun = math.inf
+        self._patient = True
 
-    def step(self, now: float) -> list[str]:
-        """Return the names to ask for at ``now``, s."""
-        unanswered = {name: asked for name, asked in self._asked.items()
-                      if name not in self.values}
-        waiting = [name for name, (time, _) in unanswered.items() if now - time < RETRY_PERIOD]
-        due = [name for name, (_, count) in unanswered.items()
-               if name not in waiting and count < ATTEMPTS]
-        self._given_up = {name for name, (_, count) in unanswered.items()
-                          if name not in waiting and count >= ATTEMPTS}
-        ask = due[:max(AT_ONCE - len(waiting), 0)]
-        self._asked.update({name: (now, unanswered[name][1] + 1) for name in ask})
-        self._finished = not waiting and not due
-        return ask
-
-    def again(self, name: str) -> None:
-        """Ask once more for one that was given up."""
-        if name in self._given_up:
-            self._asked[name] = -math.inf, 0
+    def step(self, now: float) -> str:
+        """Return the name to ask for at ``now``, s, or ''."""
+        self._begun = min(self._begun, now)
+        self._patient = now - self._begun < PATIENCE
+        due = [name for name, asked in self._asked.items()
+               if name not in self.values and now - asked >= RETRY_PERIOD]
+        for name in due[:1]:
+            self._asked[name] = now
+        return ''.join(due[:1])
 
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""
@@ -162,10 +151,10 @@ class ParameterCheck:
             self.values[name] = parameter_value(message, bytewise=self._bytewise)
 
     def result(self) -> CheckResult | None:
-        """Return the differences, None until every parameter was answered or given up."""
+        """Return the differences, None until every parameter is answered or PATIENCE is over."""
         values = self.values.copy()
         unanswered = [name for name in self._asked if name not in values]
-        if not self._asked or (unanswered and not self._finished):
+        if not self._asked or (unanswered and self._patient):
             return None
         lines = [f'{name} = {values[name]:g}, recommended {entry.value:g}: {entry.why}'
                  for name, entry in self._recommended.items()
@@ -229,18 +218,11 @@ def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
 
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
-    values = parameters.values
-    return next((f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'
-                 for rule in rules(dialect, forwarding)
-                 if rule.name in values and rule.forbidden(values[rule.name])), '')
-
-
-def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
-    """Return which of them have not been read, having them asked for once more, or ''."""
-    names = [rule.name for rule in rules(dialect, forwarding)
-             if rule.name not in parameters.values]
-    for name in names:
-        parameters.again(name)
-    return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
-            f'bridge, or not fuse forwarded odometry ({_ANYWAY} flies all the same)'
-            if names else '')
+    values, applicable = parameters.values, rules(dialect, forwarding)
+    for rule in applicable:
+        if rule.name in values and rule.forbidden(values[rule.name]):
+            return f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'
+    unread = ', '.join(rule.name for rule in applicable if rule.name not in values)
+    return unread and (
+        f'{unread} could not be read: {dialect.title} might not be safe without the bridge, or '
+        f'not fuse forwarded odometry ({_ANYWAY} flies all the same)')

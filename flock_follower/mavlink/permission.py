@@ -104,10 +104,10 @@ class Permission:
         return self if self.phase is Phase.ACTIVE else Permission(
             Phase.READY, 'waiting for offboard mode', time)
 
-    def failed(self, why: str, asked: bool = True) -> Permission:
-        """End what the vehicle did not do, or not in time, or was not even ``asked``."""
+    def failed(self, why: str) -> Permission:
+        """End what the vehicle did not do, or not in time."""
         # Should the mode come late, nothing is to follow from it.
-        ends = self.streams if not asked else self.phase is Phase.READY and not self.obeyed
+        ends = self.phase is Phase.READY and not self.obeyed
         return Permission(reason=why) if ends else self
 
     def ended(self, why: str) -> Permission:

@@ -254,7 +254,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                       airborne)
     if not reason and command is not None and command.relative:
         return _relative(full, command, against, place, offset)
-    velocity = known.source_first[0].fresh_velocity(limits)
+    velocity = known.velocity
     if not reason and command is not None and velocity is not None:
         bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
         axis = _direction(command.separation_axis)
@@ -263,9 +263,9 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
                         axis, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
-    estimated = known.braking_velocity(limits)
+    estimated = known.braking
     if estimated is None:
-        kind = NONE if known.blind(limits) and not relative.begins else LEVEL
+        kind = NONE if known.blind and not relative.begins else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
@@ -282,26 +282,39 @@ def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, co
              link_age: float, unplaced: str, relative: Relative, place: Location,
              airborne: bool) -> str:
     """Return why a command may not pass, or ''."""
-    judge, _ = known.source_first
-    source, contradiction = f'velocity from {known.source}', known.contradiction(limits)
-    by_odometry = (
-        (judge.fresh_velocity(limits) is None,
-         f'no {source}' if math.isinf(judge.velocity_age) else f'{source} stale'),
-        (contradiction, contradiction))
-    by_marker = (
+    if not link_age <= limits.link_timeout:  # written so that NaN fails
+        return 'link lost'
+    if command is not None and command.relative:
+        reason = _marker_refusal(limits, relative, place, airborne)
+    else:
+        reason = _odometry_refusal(known)
+    if reason or unplaced:
+        return reason or unplaced
+    if command is None:
+        return 'no command'
+    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
+        return 'command not finite'
+    return '' if fresh(command_age, limits.planner_timeout) else 'command stale'
+
+
+def _odometry_refusal(known: KnownMotion) -> str:
+    """Return why a command may not rest on the odometry, or ''."""
+    if known.velocity is not None:
+        return known.contradiction
+    if known.never:
+        return f'no velocity from {known.source}'
+    return f'velocity from {known.source} stale'
+
+
+def _marker_refusal(limits: GateLimits, relative: Relative, place: Location,
+                    airborne: bool) -> str:
+    """Return why a command may not rest on the marker alone, or ''."""
+    return first_reason(
         (not (limits.relative_flight and 0.0 <= relative.lasted <= limits.relative_timeout),
          'relative command not permitted'),
         (not fresh(relative.marker_age, OLDEST_MARKER), 'marker lost'),
         (place.height is None or not math.isfinite(place.height + place.climb_rate), 'no height'),
         (not airborne, 'on the ground'))
-    return first_reason(
-        (not link_age <= limits.link_timeout, 'link lost'),  # written so that NaN fails
-        *(by_marker if command is not None and command.relative else by_odometry),
-        (unplaced, unplaced),
-        (command is None, 'no command'),
-        (command is not None and (finite_vector(command.acceleration) is None
-                                  or not math.isfinite(command.yaw)), 'command not finite'),
-        (not fresh(command_age, limits.planner_timeout), 'command stale'))
 
 
 def _relative(full: GateLimits, command: Command, against: Array, place: Location,

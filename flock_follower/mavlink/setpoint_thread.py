@@ -72,8 +72,6 @@ class SetpointThread:
         for end in (self._wake_receiver, self._wake_sender):
             end.setblocking(False)
         self._last_cycle = -math.inf
-        self.late = 0
-        """Number of cycles that began more than a period late."""
 
     def start(self) -> None:
         """Start the thread."""
@@ -146,8 +144,7 @@ class SetpointThread:
             return next_cycle
         self._last_cycle = now
         next_cycle += self._period
-        if next_cycle < now:
-            self.late += 1
+        if next_cycle < now:  # more than a period late
             next_cycle = now + self._period
         cycle = self._guarded(lambda: self._bridge.cycle(now))
         if cycle is not None and not self._quit.is_set():

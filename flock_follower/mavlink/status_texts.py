@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
+Texts of the autopilot: STATUSTEXT messages, and the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
 with the modes concerned, between two summaries. PX4 sends them after a change, and after
-MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
-here. Measured on 1.16.
+MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``config/px4_events.txt`` has
+the names and texts. Measured on 1.16.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
+
+from flock_follower.files import resource
 
 #: The message; common.xml has it, no pymavlink yet.
 MESSAGE_ID: Final[int] = 410
@@ -47,68 +49,6 @@ _STICKS: Final[str] = 'check_modes_manual_control'
 #: The worst level of a check that is only a remark.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
-#: Actions of PX4's failsafe, by the number in the EVENT.
-_FAILSAFES: Final[tuple[str, ...]] = (
-    'nothing', 'a warning', 'Position', 'Altitude', 'Stabilized', 'Hold', 'Return', 'Land',
-    'Descend', 'disarming', 'termination')
-#: Its parts, by the number in the EVENT.
-_PARTS: Final[Mapping[int, str]] = MappingProxyType({
-    1: 'barometer', 2: 'airspeed', 3: 'GPS', 4: 'optical flow', 5: 'vision', 6: 'distance sensor',
-    7: 'transmitter', 8: 'motors', 10: 'logging', 11: 'battery', 12: 'communication',
-    13: 'rate controller', 14: 'attitude controller', 15: 'position controller',
-    16: 'attitude estimate', 17: 'position estimate', 18: 'mission', 19: 'avoidance',
-    20: 'system', 21: 'camera', 22: 'gimbal', 23: 'payload', 24: 'global position',
-    25: 'storage', 26: 'parachute', 27: 'compass', 28: 'accelerometer', 29: 'gyroscope'})
-#: Texts of the events that are reported.
-_MEANINGS: Final[Mapping[str, str]] = MappingProxyType({
-    'check_modes_angular_velocity': 'no angular velocity',
-    'check_modes_attitude': 'no attitude estimate',
-    'check_modes_local_pos': 'no valid position estimate',
-    'check_modes_global_pos': 'no global position (neither GPS nor an origin)',
-    'check_modes_local_alt': 'no valid altitude estimate',
-    'check_modes_mission': 'no mission',
-    'check_modes_offboard_signal': 'no setpoint stream',
-    'check_modes_home_position': 'no home position',
-    _STICKS: 'no transmitter',
-    'check_modes_cannot_takeoff': 'it does not arm in this mode',
-    'check_rc_dl_no_dllink': 'no ground station',
-    'check_system_arm_auth_failed': 'arm authorization denied',
-    'check_system_safety_button': 'press the safety button',
-    'check_man_control_kill_engaged': 'the kill switch is on',
-    'commander_arm_denied_throttle_center': 'arming denied: throttle above its centre',
-    'commander_arm_denied_throttle_high': 'arming denied: throttle too high',
-    'commander_arm_denied_calibrating': 'arming denied: calibrating',
-    'commander_disarm_denied_not_landed': 'disarming denied: not landed',
-    'commander_gcs_lost': 'the ground station is lost',
-    'commander_mission_comp_lost': 'this computer is lost',
-    'commander_rc_lost': 'the transmitter is lost',
-})
-#: More of its checks, 'check_' left out; the name has the words.
-_MORE: Final[str] = """
-accel_missing accel_no_data accel_not_calibrated armable_configuration avionics_power_high
-avionics_power_low avionics_power_missing avionics_power_redundancy baro_missing baro_no_data
-battery_critical battery_disconnected battery_emergency battery_fault battery_low battery_missing
-battery_rem_flight_time_low battery_unhealthy cpuload_too_high distance_sensor_invalid
-distance_sensor_missing escs_fault escs_offline escs_telem_missing estimator_gnss_fault
-estimator_gps_fix_too_low estimator_gps_generic estimator_gps_hor_pos_drift_too_high
-estimator_gps_hor_pos_err_too_high estimator_gps_hor_speed_drift_too_high
-estimator_gps_jamming_critical estimator_gps_not_fusing estimator_gps_num_sats_too_low
-estimator_gps_pdop_too_high estimator_gps_speed_acc_too_low estimator_gps_spoofed
-estimator_gps_vert_pos_drift_too_high estimator_gps_vert_pos_err_too_high
-estimator_gps_vert_speed_drift_too_high estimator_heading_not_stable estimator_hgt_not_stable
-estimator_high_accel_bias estimator_high_gyro_bias estimator_hor_pos_not_stable
-estimator_hor_vel_not_stable estimator_low_position_accuracy estimator_mag_fault
-estimator_mag_interference estimator_missing_data estimator_vert_vel_not_stable
-external_modes_unavailable external_modes_unresponsive failure_detector_alt
-failure_detector_arm_esc failure_detector_ext failure_detector_imbalanced_prop
-failure_detector_motor failure_detector_pitch failure_detector_roll flight_time_limit gf_no_home
-gf_violation_custom_gf gf_violation_max_alt gf_violation_max_hor_dist gyro_missing gyro_no_data
-gyro_not_calibrated hardfault_present imu_accel_inconsistent imu_gyro_inconsistent mag_consistency
-mag_fault mag_missing mag_no_data mag_not_calibrated mag_sys_has_mag_missing
-man_control_rtl_engaged missing_cpuload missing_fmu_sdcard missing_system_power mission_failure
-navigator_failure_hagl optical_flow_sensor_invalid ram_usage_too_high rc_dz_too_high
-rc_max_too_high rc_min_too_small rc_trim_too_high rc_trim_too_small system_flight_term_active
-system_no_global_pos system_no_home_pos system_usb_connected wind_too_high"""
 _ENTERS: Final[tuple[str, ...]] = (
     'commander_failsafe_enter', 'commander_failsafe_enter_generic',
     'commander_failsafe_enter_autopilot_disengaged', 'commander_failsafe_enter_hold',
@@ -123,9 +63,17 @@ def event_number(name: str) -> int:
     return value % 2**24
 
 
+def _read_texts() -> dict[str, str]:
+    """Return the text of each event by its name."""
+    lines = resource('config/px4_events.txt').read_text(encoding='utf-8').splitlines()
+    found = (line.partition(': ') for line in lines if not line.startswith('#'))
+    return {name: text or name.removeprefix('check_').replace('_', ' ')
+            for name, _, text in found}
+
+
+_TEXTS: Final[Mapping[str, str]] = MappingProxyType(_read_texts())
 _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
-    {event_number(name): name for name in (
-        *_MEANINGS, *_ENTERS, _BEGIN, _END, *(f'check_{text}' for text in _MORE.split()))})
+    {event_number(name): name for name in (*_TEXTS, *_ENTERS, _BEGIN, _END)})
 
 
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
@@ -180,15 +128,12 @@ class ArmingChecks:
                 self._failures = tuple(self._coming)
             self._coming = None
         elif name in _ENTERS:
-            action = dict(enumerate(_FAILSAFES)).get(arguments[4], f'action {arguments[4]}')
-            return f'failsafe: {action}'
+            return f'failsafe: action {arguments[4]} of PX4'
         elif name.startswith('commander_'):
-            return _MEANINGS[name]
+            return _TEXTS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:
-            modes, part = struct.unpack_from('<IB', arguments)
-            text = _MEANINGS.get(name) or name.removeprefix('check_').replace('_', ' ') or (
-                f'{_PARTS.get(part, f"part {part}")}: event {message.number % 2**24}')
-            self._coming.append(Failure(text, modes, level))
+            self._coming.append(Failure(_TEXTS.get(name, f'event {message.number % 2**24}'),
+                                        int.from_bytes(arguments[:4], 'little'), level))
         return ''
 
     def against(self, mode: str) -> list[str]:
@@ -198,80 +143,49 @@ class ArmingChecks:
                 # For every mode come remarks, too, that keep it from nothing,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which keeps it from the pilot's.
-                     or (failure.text == _MEANINGS[_STICKS] and mode in _PILOT_MODES))]
+                     or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
 
 
-#: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
-CHUNK: Final[int] = 50
-#: A text whose next chunk does not come within this, s, is taken as it is.
-CHUNK_TIMEOUT: Final[float] = 0.4
-#: A text of more chunks than this, and more unfinished texts than this, are taken as they are.
-MOST_CHUNKS: Final[int] = 20
-MOST_UNFINISHED: Final[int] = 5
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
-#: Replaces a lost chunk.
-GAP: Final[str] = '...'
 
 
 class AutopilotText(NamedTuple):
-    """One whole text."""
+    """One text, or one chunk of 50 characters of a longer one."""
 
     time: float
-    """Time of completion, s."""
+    """Time of reception, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str
 
 
-class _Unfinished(NamedTuple):
-    time: float
-    """Time of its newest chunk, s."""
-    severity: int
-    text: str
-    next_chunk: int
-
-
 class StatusTexts:
-    """
-    The recent texts; ``add`` takes messages, ``since`` and ``new`` return whole texts.
-
-    Every chunk that arrives is reported, with ``GAP`` if another one was lost. Nothing waits for
-    long: a text of just 50 characters, or a multiple, may come without a chunk that ends it.
-    """
+    """The recent texts; ``add`` takes messages, ``since`` and ``new`` return texts."""
 
     def __init__(self) -> None:
         self.checks = ArmingChecks()
         self._has_texts = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
-        self._unfinished: dict[int, _Unfinished] = {}
 
     def add(self, message: Any, now: float) -> None:
         """Take a STATUSTEXT."""
         self._has_texts = True
-        self._expire(now)
-        severity, text, number = message.severity, str(message.text), message.id
-        if not number:
-            self._finish(severity, text, now)
-            return
-        if number in self._unfinished and message.chunk_seq < self._unfinished[number].next_chunk:
-            self._give_up(number, now)  # its end was lost, another text begins
-        _, severity, before, due = self._unfinished.pop(number, (now, severity, '', 0))
-        whole = before + (GAP if message.chunk_seq != due else '') + text
-        if len(text) < CHUNK or message.chunk_seq + 1 >= MOST_CHUNKS:
-            self._finish(severity, whole, now)
-            return
-        self._unfinished[number] = _Unfinished(now, severity, whole, message.chunk_seq + 1)
-        if len(self._unfinished) > MOST_UNFINISHED:
-            self._give_up(next(iter(self._unfinished)), now)
+        self._take(message.severity, str(message.text), now)
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its text is used only if no STATUSTEXTs come."""
         text = self.checks.take(message)
         if text and not self._has_texts:
-            self._finish(message.log_levels & 0xF, text, now)
+            self._take(message.log_levels & 0xF, text, now)
+
+    def _take(self, severity: int, text: str, now: float) -> None:
+        # PX4 ends texts with a tab if it also sends them as events.
+        taken = AutopilotText(now, severity, text.strip('\x00\t\n '))
+        self._texts.append(taken)
+        self._new.append(taken)
 
     def why(self, time: float, mode: str) -> list[str]:
         """Return the texts since ``time``, and the newest failed checks for a mode."""
@@ -280,7 +194,7 @@ class StatusTexts:
     def unready(self, now: float, mode: str) -> str:
         """Return recent texts and the newest failed checks against arming in a mode, or ''."""
         reported = [text.text.partition(PREARM)[2] for text in list(self._texts)
-                if PREARM in text.text and now - text.time <= PREARM_PERIOD]
+                    if PREARM in text.text and now - text.time <= PREARM_PERIOD]
         return '; '.join(dict.fromkeys([*reported, *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
@@ -288,25 +202,8 @@ class StatusTexts:
         return list(dict.fromkeys(
             text for t, severity, text in self._texts if t >= time and severity <= worst))
 
-    def new(self, now: float) -> list[AutopilotText]:
-        """Return the texts that were completed, or given up, since the last call."""
-        self._expire(now)
+    def new(self) -> list[AutopilotText]:
+        """Return the texts since the last call."""
         texts = list(self._new)
         self._new.clear()
         return texts
-
-    def _expire(self, now: float) -> None:
-        for number in [number for number, unfinished in self._unfinished.items()
-                       if now - unfinished.time > CHUNK_TIMEOUT]:
-            self._give_up(number, now)
-
-    def _give_up(self, number: int, now: float) -> None:
-        """Take a text as it is; whether more was to come is not known."""
-        unfinished = self._unfinished.pop(number)
-        self._finish(unfinished.severity, unfinished.text + GAP, now)
-
-    def _finish(self, severity: int, text: str, now: float) -> None:
-        # PX4 ends texts with a tab if it also sends them as events.
-        whole = AutopilotText(now, severity, text.strip('\x00\t\n '))
-        self._texts.append(whole)
-        self._new.append(whole)

@@ -55,16 +55,12 @@ ESTIMATE_TIMEOUT: Final[float] = 1.0
 LANDED_OLDEST: Final[float] = 3.0
 #: An altitude above sea level older than this, s, is not used.
 SEA_LEVEL_TIMEOUT: Final[float] = 3.0
-#: The autopilot has rebooted if stamps of two consecutive messages go back by more than this, ms.
+#: The autopilot has rebooted if stamps of two consecutive attitudes go back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _FLYING: Final[dict[int, bool]] = {
     mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
     mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
-_UNKNOWN_CELL = 65535  # mV
-_UNKNOWN_TEMPERATURE = 32767  # 0.01 degC
-# What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
-_OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_', 'NAMED_VALUE_',
-                 'SET_', 'STORAGE_')
+_UNKNOWN_VOLTAGE = 65535  # mV
 
 
 class SensorAltitude(NamedTuple):
@@ -97,7 +93,7 @@ class Attitude(NamedTuple):
 
 
 class Battery(NamedTuple):
-    """BATTERY_STATUS or SYS_STATUS; NaN if unknown."""
+    """SYS_STATUS, in which PX4 reports its lowest battery; NaN if unknown."""
 
     time: float
     voltage: float
@@ -106,10 +102,6 @@ class Battery(NamedTuple):
     """A drawn, positive while discharging."""
     remaining: float
     """Fraction in [0, 1]."""
-    temperature: float
-    """Degrees Celsius"""
-    cell_voltages: tuple[float, ...]
-    """V, empty if the autopilot knows only the total."""
 
 
 class Telemetry:
@@ -133,13 +125,12 @@ class Telemetry:
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
-        self._cells_known = False  # a BATTERY_STATUS of the first battery has come
         self.estimator: EstimatorStatus | None = None
         self.gps: GpsFix | None = None
         self.arrivals = Arrivals()
         self._autopilot = autopilot
-        self._boot_times_ms: dict[str, int] = {}
-        self._fallen: set[str] = set()
+        self._boot_time_ms = 0
+        self._fallen = False
 
     def update(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
@@ -147,7 +138,6 @@ class Telemetry:
         self.arrivals.take(message.get_msgId(), now)
         kind = message.get_type()
         self.newest[kind] = now, message
-        self._notice_reboot(message)
         if kind == 'HEARTBEAT':
             self.dialect = dialect_of(message, self._autopilot) or self.dialect
             self.heartbeat_time = now
@@ -167,10 +157,7 @@ class Telemetry:
             self.estimator = estimator_status(message, now)
         elif kind == 'GPS_RAW_INT':
             self.gps = gps_fix(message, self.gps, now)
-        # SYS_STATUS has no cells: it counts only until a BATTERY_STATUS has come.
-        elif (kind == 'BATTERY_STATUS' and message.id == 0) or (
-                kind == 'SYS_STATUS' and not self._cells_known):
-            self._cells_known = kind == 'BATTERY_STATUS'
+        elif kind == 'SYS_STATUS':
             self.battery = _battery(message, now)
 
     def recent(self, kind: str, oldest: float, now: float) -> Any | None:
@@ -254,25 +241,15 @@ class Telemetry:
             self.sensor_altitude = SensorAltitude(
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
-    def _notice_reboot(self, message: Any) -> None:
-        """Compare the stamp, ms since boot, with that of the message of the same kind before."""
-        kind, stamp = message.get_type(), getattr(message, 'time_boot_ms', 0)
-        if not stamp or kind.startswith(_OTHER_CLOCKS):  # 0: not set
-            return
-        # Each kind for itself: they overtake one another, and some are stamped when measured.
-        fallen = stamp + REBOOT_STEP_MS < self._boot_times_ms.get(kind, 0)
-        if fallen and kind not in self._fallen:
-            # One alone may have come late by another way, and for a reboot the stream would end
-            # without braking.
-            self._fallen.add(kind)
-            return
-        self._fallen.discard(kind)
-        if fallen:
+    def _notice_reboot(self, stamp: int) -> None:
+        """Compare the stamp of an attitude, ms since boot, with the newest; 0: not set."""
+        fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
+        if fallen and self._fallen:  # one alone may have come late by another way
             self.reboots += 1
             self.newest.pop('GPS_GLOBAL_ORIGIN', None)
-            self._boot_times_ms.clear()  # the other kinds fall back for the same reason
-            self._fallen.clear()
-        self._boot_times_ms[kind] = stamp
+            fallen, self._boot_time_ms = False, stamp
+        self._fallen = fallen
+        self._boot_time_ms = max(self._boot_time_ms, stamp)
 
     def _local_position(self, message: Any, now: float) -> None:
         position = ned_to_enu([message.x, message.y, message.z])
@@ -281,6 +258,7 @@ class Telemetry:
             self.local_position = LocalPosition(now, position, velocity, message.time_boot_ms)
 
     def _attitude(self, message: Any, now: float) -> None:
+        self._notice_reboot(message.time_boot_ms)
         # MAVLink's quaternions are (w, x, y, z).
         wxyz = [message.q1, message.q2, message.q3, message.q4]
         rates = frd_to_flu([message.rollspeed, message.pitchspeed, message.yawspeed])
@@ -293,19 +271,12 @@ class Telemetry:
 
 
 def _battery(message: Any, now: float) -> Battery:
-    """Return the battery in a BATTERY_STATUS, or in a SYS_STATUS, which has no cells."""
-    whole = message.get_type() == 'SYS_STATUS'
-    millivolts = [message.voltage_battery] if whole else [
-        *message.voltages, *filter(None, message.voltages_ext)]
-    cells = [v * 1e-3 for v in millivolts if v != _UNKNOWN_CELL]
-    centidegrees = _UNKNOWN_TEMPERATURE if whole else message.temperature
-    return Battery(
-        now,
-        sum(cells) if cells else math.nan,
-        message.current_battery * 1e-2 if message.current_battery >= 0 else math.nan,
-        message.battery_remaining * 1e-2 if message.battery_remaining >= 0 else math.nan,
-        centidegrees * 1e-2 if centidegrees != _UNKNOWN_TEMPERATURE else math.nan,
-        tuple(cells) if len(cells) > 1 else ())
+    """Return the battery in a SYS_STATUS."""
+    voltage, current, remaining = (
+        message.voltage_battery, message.current_battery, message.battery_remaining)
+    return Battery(now, math.nan if voltage == _UNKNOWN_VOLTAGE else voltage * 1e-3,
+                   current * 1e-2 if current >= 0 else math.nan,
+                   remaining * 1e-2 if remaining >= 0 else math.nan)
 
 
 #: An attitude further than this, s, from a position is no part of the same estimate.

@@ -30,7 +30,6 @@ import fcntl
 import math
 import os
 import re
-import select
 import socket
 import struct
 import termios
@@ -56,8 +55,8 @@ BITS_PER_BYTE: Final[int] = 10
 #: The termios constant of each baud rate.
 BAUD_RATES: Final[Mapping[int, int]] = {
     int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r'B\d+', name)}
-#: Fault of a TCP connection that is being made.
-CONNECTING: Final[str] = 'connecting'
+#: A TCP connection is made within this time, s, or tried again.
+CONNECT_TIMEOUT: Final[float] = 0.2
 #: Errors of a serial port that another process uses: it is exclusive, or locked.
 IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
@@ -208,8 +207,7 @@ class TcpTransport(_Line):
     """
     A TCP connection to a listening autopilot or simulator, made again when it is closed.
 
-    Opening only begins the connection, without a wait for an answer that may take a minute. Until
-    it is made, the kernel takes and gives no bytes, as on a line that is busy.
+    ``reopen`` waits for at most CONNECT_TIMEOUT: without a connection there is nothing to send.
     """
 
     delivers_late = True
@@ -220,35 +218,20 @@ class TcpTransport(_Line):
         self._address = address
         self.fault = 'not connected yet'
 
-    def reopen(self, now: float) -> None:
-        """Begin to connect, at most every RETRY_PERIOD, and see whether it is connected."""
-        if self._fd < 0:
-            super().reopen(now)
-            self.fault = self.fault or CONNECTING
-        if self.fault == CONNECTING and select.select([], [self._fd], [], 0.0)[1]:
-            connection = socket.socket(fileno=self._fd)
-            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-            connection.detach()
-            self.fault = ''
-            if code:
-                self._lose(os.strerror(code))
-
     def _open(self) -> int:
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
+        with socket.create_connection(self._address, CONNECT_TIMEOUT) as connection:
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             # Drop data that is not delivered by then: a late setpoint is worse than none.
             connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
-            with contextlib.suppress(BlockingIOError):  # under way
-                connection.connect(self._address)
             return connection.detach()
 
 
 def reason_of(error: BaseException) -> str:
     """Return the reason of an OSError or termios.error in words."""
-    return str(error.strerror if isinstance(error, OSError) else error.args[-1])
+    return str(getattr(error, 'strerror', None) or error.args[-1])
 
 
 DEFAULT_BAUD: Final[int] = 115200

@@ -30,7 +30,6 @@ Vectors are ENU. Time is an argument; no clock is read.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 import math
 from typing import Final, NamedTuple
 
@@ -53,6 +52,7 @@ USUAL_AGE: Final[float] = 0.05
 LATE_FACTOR: Final[float] = math.e
 ODOM: Final[str] = 'odom'
 AUTOPILOT: Final[str] = 'autopilot'
+YAWS_DISAGREE: Final[str] = 'yaws of odom and of the autopilot disagree'
 VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
 
 
@@ -91,71 +91,66 @@ class Motion(NamedTuple):
         return self.yaw if usable else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownMotion:
-    """The vehicle's motion by both sources, and for how long each has been invalid."""
+class KnownMotion(NamedTuple):
+    """What is known of the vehicle's motion, and which velocity may be used."""
 
-    odom: Motion
-    """Motion by the odometry."""
-    autopilot: Motion
-    """Motion by the autopilot's own estimate."""
     source: str
     """'odom' or 'autopilot': source of the velocity that is required for commands."""
-    disagreeing_for: float = -math.inf
-    """How long ago the velocities began to disagree, s; negative: they agree."""
-    distrusted_for: float = -math.inf
-    """For how long the autopilot has sent a velocity without a valid sensor behind it, s."""
+    velocity: Velocity | None
+    """By the source; None if it is not fresh."""
+    never: bool
+    """Whether the source has not sent any yet."""
+    braking: Velocity | None
+    """The velocity to brake with; None if none is fresh, or if two disagree."""
+    contradiction: str
+    """What odom and the autopilot disagree about, or ''."""
+    blind: bool
+    """Whether no valid velocity has come for too long, after one had come."""
+    turned: float | None
+    """Yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
+    difference: Array | None
+    """By what (3,), m/s, odom, being the source, is faster; None unless both are fresh."""
 
-    @property
-    def source_first(self) -> tuple[Motion, Motion]:
-        """Return the motion by the source, then the one by the other."""
-        both = self.odom, self.autopilot
-        return both if self.source == ODOM else both[::-1]
 
-    def braking_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity to brake with; None if none is fresh, or if two disagree."""
-        first, second = self.source_first
-        if self.yaws_disagree(limits):
-            # The autopilot's own frame is the one in which it obeys.
-            first, second = self.autopilot, self.odom
-        elif self.disagreeing_for >= 0.0:
-            return None  # one of them is wrong: braking on that one would speed the vehicle up
-        return first.fresh_velocity(limits) or second.fresh_velocity(limits)
+def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
+                 disagreeing_for: float = -math.inf,
+                 distrusted_for: float = -math.inf) -> KnownMotion:
+    """
+    Return what is known of the motion by both sources.
 
-    def blind(self, limits: GateLimits) -> bool:
-        """Return whether no valid velocity has come for too long, after one had come."""
-        if self.braking_velocity(limits) is not None:
-            return False
-        if self.disagreeing_for > LOSS_TIMEOUT or self.distrusted_for > LOSS_TIMEOUT:
-            return True
-        ages = [age for age in (self.odom.velocity_age, self.autopilot.velocity_age)
-                if math.isfinite(age)]
-        # None was ever known where the vehicle is still on the ground.
-        return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
-
-    def contradiction(self, limits: GateLimits) -> str:
-        """Return what odom and the autopilot disagree about, or ''."""
-        return first_reason(
-            (self.yaws_disagree(limits), 'yaws of odom and of the autopilot disagree'),
-            (self.disagreeing_for >= 0.0, VELOCITIES_DISAGREE))
-
-    def yaws_disagree(self, limits: GateLimits) -> bool:
-        """Return whether the frames are turned against one another: braking would accelerate."""
-        turned = self.yaw_difference(limits)
-        return turned is not None and abs(turned) > limits.yaw_disagreement
-
-    def yaw_difference(self, limits: GateLimits) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
-        mine, own = self.odom.fresh_yaw(limits), self.autopilot.fresh_yaw(limits)
-        return None if mine is None or own is None else wrap_angle(mine - own)
-
-    def velocity_difference(self, limits: GateLimits) -> Array | None:
-        """Return by what (3,), m/s, odom, being the source, is faster; None unless both fresh."""
-        mine, own = self.odom.fresh_velocity(limits), self.autopilot.fresh_velocity(limits)
-        if self.source != ODOM or mine is None or own is None:
-            return None
+    :param source: 'odom' or 'autopilot'.
+    :param disagreeing_for: how long ago the velocities began to disagree, s; negative: they agree.
+    :param distrusted_for: for how long the autopilot has sent a velocity without a valid sensor
+        behind it, s.
+    """
+    by_odom, by_autopilot = odom.fresh_velocity(limits), autopilot.fresh_velocity(limits)
+    first, velocity, other = (odom, by_odom, by_autopilot) if source == ODOM else (
+        autopilot, by_autopilot, by_odom)
+    braking, contradiction = velocity or other, ''
+    turned = yaw_difference(odom.fresh_yaw(limits), autopilot.fresh_yaw(limits))
+    if turned is not None and abs(turned) > limits.yaw_disagreement:
+        # The frames are turned against one another: braking would accelerate. The autopilot's own
+        # frame is the one in which it obeys.
+        braking, contradiction = by_autopilot or by_odom, YAWS_DISAGREE
+    elif disagreeing_for >= 0.0:
+        # One of them is wrong: braking on that one would speed the vehicle up.
+        braking, contradiction = None, VELOCITIES_DISAGREE
+    difference = None
+    if source == ODOM and by_odom is not None and by_autopilot is not None:
         # Of finite velocities even the difference may be beyond every number.
-        return np.clip(mine.vector, -SANE, SANE) - np.clip(own.vector, -SANE, SANE)
+        difference = np.clip(by_odom.vector, -SANE, SANE) - np.clip(
+            by_autopilot.vector, -SANE, SANE)
+    # None was ever known where the vehicle is still on the ground.
+    ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
+    lost = bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
+    unusable = disagreeing_for > LOSS_TIMEOUT or distrusted_for > LOSS_TIMEOUT
+    return KnownMotion(source, velocity, math.isinf(first.velocity_age), braking, contradiction,
+                       braking is None and (lost or unusable), turned, difference)
+
+
+def yaw_difference(yaw: float | None, other: float | None) -> float | None:
+    """Return a yaw minus another one, rad; None if one is None."""
+    return None if yaw is None or other is None else wrap_angle(yaw - other)
 
 
 def fresh(age: float, timeout: float) -> bool:
@@ -249,7 +244,6 @@ class Path:
     """The positions (3,), m, of one source, without jumps; times are monotonic, s."""
 
     def __init__(self) -> None:
-        self.jumps = 0
         self.position: Array | None = None
         """The newest, m, in a frame that is the source's but for the jumps."""
         self._time = -math.inf
@@ -271,7 +265,6 @@ class Path:
         if self.position is not None and velocity is not None and elapsed <= LONGEST_GAP:
             surprise = shifted - self.position - velocity * elapsed
             if math.hypot(*surprise.tolist()) > POSITION_JUMP:
-                self.jumps += 1
                 self._shift = self._shift + surprise
                 shifted = position - self._shift
         self.position, self._time = shifted, now
@@ -292,17 +285,17 @@ class Path:
                          for column in zip(*places)])
 
 
-def difference(one: Path, other: Path, turn: float, now: float) -> Array | None:
+def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     """
     Return the displacement (3,) of ``one`` less that of ``other``, m, over the last WINDOW.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
-    :returns: None if they do not overlap, or one of them is not of now.
+    :returns: zeros if they do not overlap, or one of them is not of now.
     """
     (first, last), (other_first, other_last) = one.span, other.span
     start, end = max(first, other_first, now - WINDOW), min(last, other_last)
     if end <= start or now - end > LONGEST_GAP:
-        return None
+        return np.zeros(3)
     moved = one.between(start, end)
     cos, sin = math.cos(turn), math.sin(turn)
     moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
@@ -351,13 +344,16 @@ def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
-    compared = [(height, BAROMETER_STD, 0.0, slice(2, 3), 'barometer')]
+    reason = ''
     if autopilot is not None:
-        compared.insert(0, (autopilot.path, autopilot.std, -turn, slice(0, 2), 'autopilot'))
-    for path, std, turned, axes, other in compared:
-        off = difference(odom.path, path, turned, now)
-        far = 0.0 if off is None else float(np.linalg.norm(off[axes]))
-        if far > max(TOLERANCE, 3.0 * math.hypot(odom.std, std)):
-            return (f'displacements of odom and of the {other} differ by {far:.1f} m in '
-                    f'{WINDOW:g} s')
-    return ''
+        off = difference(odom.path, autopilot.path, -turn, now)[:2]
+        reason = _apart(off, math.hypot(odom.std, autopilot.std), 'autopilot')
+    off = difference(odom.path, height, 0.0, now)[2:]
+    return reason or _apart(off, math.hypot(odom.std, BAROMETER_STD), 'barometer')
+
+
+def _apart(off: Array, std: float, other: str) -> str:
+    """Return that displacements differ by ``off``, m, with a standard deviation, m, or ''."""
+    far = float(np.linalg.norm(off))
+    return '' if not far > max(TOLERANCE, 3.0 * std) else (
+        f'displacements of odom and of the {other} differ by {far:.1f} m in {WINDOW:g} s')

@@ -246,7 +246,7 @@ class BlackBox(FlockNode):
             if now < self._retry:
                 raise OSError(0, self._fault)
             if self._recording is None:
-                self._recording = FlightRecording(self._folder, self._limits, now, time.time())
+                self._recording = FlightRecording(self._folder, self._limits)
             while self._notes:
                 self._recording.note(*self._notes.popitem())
             self._recording.write(taken, now)

@@ -158,7 +158,7 @@ class MavlinkBridge(FlockNode):
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
-        self._report = BridgeReport(self, self._bridge, self._stream, self._publisher)
+        self._report = BridgeReport(self, self._bridge, self._publisher)
         self._connect(values)
         self._publisher.start()
         self._stream.start()

@@ -33,7 +33,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
@@ -60,7 +59,6 @@ from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
-from flock_follower.parameters.files import files_in, given, shared, unheeded
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
 
@@ -69,8 +67,8 @@ POLL_PERIOD = 0.25  # s between two searches for new topics
 PROCESSORS = Path('/proc/stat')
 ANSWER = 2.0  # s for the nodes to send their parameters at the end
 #: Topics that are decoded; of the others only the rate is measured.
-READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom', 'mavlink/odom')
-COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory')
+READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
+COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
 #: By which type of what relative_pose subscribes to our names are known.
 BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
 
@@ -80,14 +78,13 @@ class Observer(Node):
     Listens, and fills observations.
 
     :param remaps: of our topics; others have their names in relative_pose, if it runs.
-    :param config: a file of parameters to compare the running nodes with, or None.
     :param camera: the one of several to observe; '': the first.
     """
 
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
-                 config: Path | None, camera: str) -> None:
+                 camera: str) -> None:
         super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
-        self._seconds, self._remaps, self._config = seconds, remaps, config
+        self._seconds, self._remaps = seconds, remaps
         self._camera, self._fault = camera, ''
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
@@ -125,9 +122,7 @@ class Observer(Node):
         if self._fault:
             raise ValueError(self._fault)
         self.seen.machine = _machine(idle)
-        self._compare_with_files()
-        if self.seen.frames:
-            self.seen.static_child = self._static.transform(self.seen.frames[-1][1])
+        self.seen.static_child = self._static.transform(self.seen.child_frame)
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
@@ -211,53 +206,19 @@ class Observer(Node):
         for topic, _ in self.get_topic_names_and_types():
             known = seen.topics.setdefault(topic, TopicSeen())
             known.publishers = self._ends(self.get_publishers_info_by_topic(topic))
-            known.subscribers = self._ends(self.get_subscriptions_info_by_topic(topic))
-            if not known.publishers and not known.subscribers:
+            if not known.publishers:
                 del seen.topics[topic]
-        seen.clock = bool(self.count_publishers('/clock'))
 
     def _ends(self, infos: list[Any]) -> list[TopicEnd]:
         return [TopicEnd(
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type,
-            info.qos_profile.reliability == ReliabilityPolicy.RELIABLE,
-            info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
             for info in infos if info.node_name != self.get_name()]
-
-    def _compare_with_files(self) -> None:
-        """Note the parameters that files set for our nodes, and the nodes that they miss."""
-        own = {node: full for node in OURS
-               if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
-        problems = self.seen.file_problems
-        for process in processes():
-            for path in process.files if process.node in own else ():
-                if (problem := _misses(path, own[process.node])) and problem not in problems:
-                    problems.append(problem)
-        if self._config is None:
-            return
-        problem = ''
-        for node, full in own.items():
-            if problem := _misses(str(self._config), full):
-                problems += [problem] if 'but none for' in problem else []
-            elif values := {
-                    **shared([self._config], full), **given(self._config, full)}:
-                self.seen.file_parameters[node] = values
-        if problem and not self.seen.file_parameters and not problems:
-            problems.append(problem)
-
-
-def _misses(path: str, node: str) -> str:
-    """Return that a file holds parameters for no node, or for another node, or ''."""
-    try:
-        return unheeded(path, node)
-    except (ValueError, OSError) as problem:
-        return str(problem)
 
 
 class Process(NamedTuple):
-    """One of our nodes on this computer: its name, parameter files and environment."""
+    """One of our nodes on this computer: its name and environment."""
 
     node: str
-    files: list[str]
     environment: dict[str, str]
 
 
@@ -268,11 +229,9 @@ def processes() -> Iterator[Process]:
             words = _words(folder / 'cmdline')
             for node in OURS:
                 if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
-                    yield Process(
-                        node, [str(Path(os.readlink(folder / 'cwd'), path))
-                               for path in files_in(words)],
-                        dict(entry.split('=', 1) for entry in _words(folder / 'environ')
-                             if '=' in entry))
+                    yield Process(node, dict(
+                        entry.split('=', 1) for entry in _words(folder / 'environ')
+                        if '=' in entry))
 
 
 def _words(path: Path) -> list[str]:
@@ -286,8 +245,7 @@ def _machine(idle: float | None) -> Machine:
         free = room.f_bavail * room.f_frsize / 1e6
     return Machine(
         os.cpu_count() or 0, idle, free, shares_memory(), segment_size(os.environ),
-        os.environ.get('ROS_DOMAIN_ID', '0'),
-        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''), _open_nodes(),
+        os.environ.get('ROS_DOMAIN_ID', '0'), _open_nodes(),
         len(dead_segments()))
 
 
@@ -300,15 +258,15 @@ def _open_nodes() -> list[str]:
                   if far == NETWORK)
 
 
-def observe(seconds: float, namespace: str, remaps: dict[str, str], config: Path | None,
-            camera: str) -> Observations:
+def observe(seconds: float, namespace: str, remaps: dict[str, str], camera: str
+            ) -> Observations:
     """
     Listen for some seconds, and return the observations; the arguments are those of `Observer`.
 
     :raises ValueError: for a camera that does not exist. :raises KeyboardInterrupt: on Ctrl-C.
     """
     seen: list[Observations] = []
-    code = run(lambda: Observer(seconds, namespace, remaps, config, camera), ['check'],
+    code = run(lambda: Observer(seconds, namespace, remaps, camera), ['check'],
                lambda node: seen.append(node.observe()))
     signal.setitimer(signal.ITIMER_REAL, 0.0)  # the deadline of a node's exit: judging follows
     if code:

@@ -39,7 +39,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
-from flock_follower.bags.schedule import NANOSECONDS, section, Timeline
+from flock_follower.bags.schedule import NANOSECONDS, start_in, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
@@ -87,11 +87,11 @@ class Replay(FlockNode):
         self.bag = open_bag(values['bag'])
         if self.bag.incomplete:
             self.get_logger().warning(f'{self.bag.path} is incomplete: {self.bag.incomplete}')
-        self._section = section(self.bag.start_ns, self.bag.end_ns, values['start'], 0.0)
+        self._start_ns = start_in(self.bag.start_ns, self.bag.end_ns, values['start'])
         self._outputs = {
             topic: self._create_output(self.bag.topics[topic]) for topic in self._choose_topics()}
         self._clock_output = self.create_publisher(Clock, '/clock', 10)
-        self._timeline = Timeline(self._section.start_ns, values['rate'], time.monotonic())
+        self._timeline = Timeline(self._start_ns, values['rate'], time.monotonic())
         self._clock_ns = -1
         self._next_service = 0.0
         self._sent: Counter[str] = Counter()
@@ -168,8 +168,8 @@ class Replay(FlockNode):
             executor.spin_once(timeout_sec=SERVICE_PERIOD)
 
     def _begin(self) -> None:
-        """Go to the start of the section; publish the clock before any message."""
-        start_ns = self._section.start_ns
+        """Go to the start; publish the clock before any message."""
+        start_ns = self._start_ns
         self._timeline.jump(start_ns, time.monotonic() + LEAD_IN)
         self._clock_ns = -1  # the one place where the clock may go back
         self._publish_clock(start_ns)
@@ -179,9 +179,9 @@ class Replay(FlockNode):
                 self._outputs[message.topic].publish(message.data)
 
     def _messages(self) -> Iterator[BagMessage]:
-        if self._section.start_ns == self.bag.start_ns:
+        if self._start_ns == self.bag.start_ns:
             return self.bag.messages([*self._outputs])  # unbounded, so that losses are noticed
-        return self.bag.messages([*self._outputs], *self._section)
+        return self.bag.messages([*self._outputs], self._start_ns)
 
     def _wait_until_due(self, stamp_ns: int, executor: SingleThreadedExecutor) -> None:
         """Wait until a stamp is due; serve the clock and the services meanwhile."""
@@ -192,7 +192,7 @@ class Replay(FlockNode):
                 executor.spin_once(timeout_sec=0.0)
                 rate = self._settings.values['rate']
                 if rate != self._timeline.rate:
-                    self._timeline.set_rate(rate, now)
+                    self._timeline.change(now, rate, self._timeline.paused)
                 now = time.monotonic()
             due = self._timeline.due(stamp_ns)
             if now >= due:
@@ -216,10 +216,7 @@ class Replay(FlockNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         now = time.monotonic()
-        if request.data:
-            self._timeline.pause(now)
-        else:
-            self._timeline.resume(now)
+        self._timeline.change(now, self._timeline.rate, bool(request.data))
         response.success = True
         response.message = (f'{"paused" if request.data else "playing"} at '
                             f'{self._seconds(now):.2f} s')

@@ -22,14 +22,13 @@ below ``camera.NAME``; planner and relative_pose take the same ones.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any, Final, NamedTuple
 
 from flock_follower.parameters.spec import NAMES, Spec
+from flock_follower.perception.time_offset import MOST
 from flock_follower.ranges import Range
 
-#: Offsets of stamps, s, as ``perception.time_offset`` takes them at most; read-out of a shutter.
-MOST_OFFSET: Final = 0.2
-LONGEST_READOUT: Final = 0.2
 #: Default pose of a camera: in front of the middle of the vehicle, looking ahead.
 POSITION: Final = (0.10, 0.0, 0.0)
 AHEAD: Final = (0.0, 0.0, 0.0)
@@ -49,9 +48,9 @@ CAMERA_SPECS = [
          Range(unit='rad'), fixed_length=True),
     Spec('camera.NAME.rectified', False, 'whether the images are undistorted already'),
     Spec('camera.NAME.time_offset', 0.0, 'time_offset of this camera',
-         Range(-MOST_OFFSET, MOST_OFFSET, 's')),
+         Range(-MOST, MOST, 's')),
     Spec('camera.NAME.readout_time', 0.0, 'readout_time of this camera',
-         Range(0.0, LONGEST_READOUT, 's')),
+         Range(0.0, 0.2, 's')),
 ]
 #: The parameters of one camera that has no name: their key below camera.NAME, and the default.
 ALONE: Final[Mapping[str, tuple[str, Any]]] = {
@@ -95,9 +94,14 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
                              f'{names}: set camera.{names[0]}.{key}, and so on')
     found = [CameraValues(name, **{key: values[f'camera.{name}.{key}']
                                    for key in CameraValues._fields[1:]}) for name in names]
-    for k, camera in enumerate(found):
-        for other in found[:k]:
-            _refuse_alike(camera, other)
+    for other, camera in combinations(found, 2):
+        same = [key for key in ('image', 'camera_info')
+                if getattr(camera, key) == getattr(other, key)]
+        if (camera.position, camera.rpy) == (other.position, other.rpy):
+            same.append('rpy')
+        if same:
+            raise ValueError(f'camera.{camera.name}.{same[0]} = {getattr(camera, same[0])!r}: '
+                             f'that of {other.name}: must be its own')
     return found
 
 
@@ -114,14 +118,3 @@ def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict
         raise ValueError(f'camera {name}: must be {f"one of {names}" if names else "left out"}')
     return found, {**values, **{single: getattr(found, key) for single, (key, _) in ALONE.items()
                                 if single in values}}
-
-
-def _refuse_alike(camera: CameraValues, other: CameraValues) -> None:
-    where = f'camera.{camera.name}'
-    for key in ('image', 'camera_info'):
-        if getattr(camera, key) == getattr(other, key):
-            raise ValueError(f'{where}.{key} = {getattr(camera, key)!r}: that is the topic of '
-                             f'{other.name}: must be its own')
-    if (camera.position, camera.rpy) == (other.position, other.rpy):
-        raise ValueError(f'{where}.rpy = {camera.rpy}, {where}.position = {camera.position}: '
-                         f'those of {other.name}: must be where this one is')

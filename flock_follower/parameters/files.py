@@ -25,6 +25,7 @@ parameters that it has, unless its own section, ``/**`` or the command line sets
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import difflib
 from pathlib import Path
 import re
@@ -41,7 +42,6 @@ from flock_follower.parameters.spec import (
     refuse_unknown,
     Spec,
     specs_of,
-    unknown_parameter,
 )
 
 Table = Mapping[str, Sequence[Spec]]
@@ -71,18 +71,8 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
     :raises ValueError: naming the file, and the parameter, its value and the valid range.
     :raises OSError: if the file cannot be read.
     """
-    document = _read(path)
-    try:
-        return parse_parameters(document, table)
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
-
-
-def _read(path: str | Path) -> Any:
-    try:
-        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (yaml.YAMLError, ValueError) as error:
-        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    with _naming(path):
+        return parse_parameters(_read(path), table)
 
 
 def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | None:
@@ -109,34 +99,28 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
 
     :raises ValueError: naming the fault.
     """
-    if not isinstance(document, Mapping):
-        raise ValueError('must map names of nodes to ros__parameters')
     named: dict[str, dict[str, Any]] = {name: {} for name in (*table, SHARED, _ALL)}
     found: dict[str, dict[str, Any]] = {node: {} for node in table}
-    sections = {section: _ALL if _last(section) == '*' else _last(section)
-                for section in map(str, document)}
-    for (section, name), content in zip(sections.items(), document.values()):
+    matched = False
+    for section, parameters in _sections('', document):
+        name = _ALL if _last(section) == '*' else _last(section)
         if name in named:
-            parameters = _parameters(section, content)
+            matched = True
             named[name].update(parameters)
             for node in table if name == _ALL else table.keys() & {name}:
                 found[node].update(parameters)
         elif near := difflib.get_close_matches(name, [*table, SHARED], n=1):
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
-    if not named.keys() & set(sections.values()):
-        raise ValueError(f'holds parameters neither of /** nor of {", ".join(table)}')
+    if not matched:
+        raise ValueError(f'holds ros__parameters neither of /** nor of {", ".join(table)}')
     found = {node: {**named[SHARED], **values} for node, values in found.items()}
-    known = {node: {spec.name for spec in expanded(specs, found[node])}
-             for node, specs in table.items()}
-    refuse_unknown(named[_ALL], {name for names in known.values() for name in names}, '/**')
-    _check_shared(named[SHARED])
+    known = {node: _names(specs, found[node]) for node, specs in table.items()}
+    for name, parameters in named.items():
+        refuse_unknown(parameters, known.get(name) or set().union(*known.values()), name)
     values = {}
     for node, specs in table.items():
-        refuse_unknown(named[node], known[node], node)
-        try:
+        with _naming(node):
             values[node] = check_values(specs, found[node])
-        except ValueError as error:
-            raise ValueError(f'{node}: {error}') from None
     of_cameras = sorted({name for own in values.values() for name in own if '.' in name})
     for name in (*COMMON, *of_cameras):
         settings = {node: own[name] for node, own in values.items() if name in own}
@@ -144,14 +128,6 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             listed = ' and '.join(f'{value!r} for {node}' for node, value in settings.items())
             raise ValueError(f'{name} = {listed}: must be the same')
     return values
-
-
-def _check_shared(values: Mapping[str, Any]) -> None:
-    """Refuse a parameter of the section ``follower`` that no node has."""
-    known = {spec.name for specs in TABLE.values() for spec in expanded(specs, values)}
-    for name in values:
-        if name not in known:
-            raise ValueError(unknown_parameter(name, known, SHARED))
 
 
 def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
@@ -165,12 +141,12 @@ def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
     follower = f'{node.rpartition("/")[0]}/{SHARED}'
     found: dict[str, Any] = {}
     for path in paths:
-        values = given(path, follower, exact=True)
-        try:
-            _check_shared(values)
-        except ValueError as error:
-            raise ValueError(f'{path}: {error}') from None
-        found.update(values)
+        with _naming(path):
+            for section, values in _sections('', _read(path)):
+                if _means(section, follower) and _last(section) == SHARED:
+                    refuse_unknown(values, {name for specs in TABLE.values()
+                                            for name in _names(specs, values)}, SHARED)
+                    found.update(values)
     return found
 
 
@@ -187,58 +163,52 @@ def files_in(arguments: Sequence[str]) -> list[str]:
 
 def unheeded(path: str | Path, node: str) -> str:
     """
-    Return a warning if ROS takes nothing, or not all that was meant, from a file; or ''.
+    Return a warning if ROS takes nothing from a file for a node; or ''.
 
     :param node: the node's full name, as '/drone1/planner'.
     :raises ValueError: if no section is for the node, but one has its name in another namespace,
-        or nearly its name.
+        or nearly its name; or if the file is no YAML.
     :raises OSError: if the file cannot be read.
     """
-    try:
-        document = _read(path)
-    except ValueError:
-        return ''  # rcl has read it, and reports the fault
-    sections = [section for section, _ in _contents('', document)]
-    matching = [section for section in sections if _means(section, node)]
-    name = node.rsplit('/', 1)[-1]
-    if any(_last(section) == name for section in matching):
+    with _naming(path):
+        sections = [section for section, _ in _sections('', _read(path))]
+    if any(_means(section, node) for section in sections):
         return ''
-    misspelt = [section for section in sections if _misspelt(_last(section), name)]
-    if matching:  # by wildcards only
-        return (f'{path}: {misspelt[0]} is another node than {node}: did you mean that?'
-                if misspelt else '')
-    elsewhere = [section for section in sections if _last(section) == name]
-    if meant := [*elsewhere, *misspelt]:
+    meant = [section for section in sections if difflib.SequenceMatcher(
+        None, _last(section), _last(node)).ratio() >= _MISSPELT]
+    if meant:
         raise ValueError(f'{path}: holds parameters for {", ".join(meant)}, but none for {node}: '
-                         f'name the section {node}, or /**/{name}')
+                         f'name the section {node}, or /**/{_last(node)}')
     return f'{path}: holds no parameters for {node}, only for {", ".join(sections) or "no node"}'
 
 
-def given(path: str | Path, node: str, exact: bool = False) -> dict[str, Any]:
-    """
-    Return the values that a file sets for a node, unchecked; the last one wins, as in ROS.
-
-    :param node: the node's full name, as '/drone1/planner'.
-    :param exact: whether only sections that end in the node's own name count.
-    :raises ValueError: if it is not valid YAML.
-    :raises OSError: if the file cannot be read.
-    """
-    found: dict[str, Any] = {}
-    for section, parameters in _contents('', _read(path)):
-        if _means(section, node) and (not exact or _last(section) == _last(node)):
-            found.update(_flat('', parameters))
-    return found
+@contextmanager
+def _naming(place: str | Path) -> Iterator[None]:
+    """Put a file, or a node, before the text of an error."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f'{place}: {error}') from None
 
 
-def _contents(prefix: str, document: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _read(path: str | Path) -> Any:
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f'not valid YAML: {" ".join(str(error).split())}') from None
+
+
+def _names(specs: Sequence[Spec], values: Mapping[str, Any]) -> set[str]:
+    return {spec.name for spec in expanded(specs, values)}
+
+
+def _sections(prefix: str, document: Any) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the full names of the nodes, or their patterns, with their parameters."""
-    if not isinstance(document, Mapping):
-        return
-    for key, content in document.items():
+    for key, content in document.items() if isinstance(document, Mapping) else ():
         if key == 'ros__parameters' and isinstance(content, Mapping):
-            yield prefix or '/', content
+            yield prefix, _flat('', content)
         else:
-            yield from _contents(f'{prefix}/{str(key).strip("/")}', content)
+            yield from _sections(f'{prefix}/{str(key).strip("/")}', content)
 
 
 def _means(section: str, node: str) -> bool:
@@ -251,19 +221,6 @@ def _means(section: str, node: str) -> bool:
 
 def _last(section: str) -> str:
     return section.rsplit('/', 1)[-1]
-
-
-def _misspelt(name: str, meant: str) -> bool:
-    return name != meant and difflib.SequenceMatcher(None, name, meant).ratio() >= _MISSPELT
-
-
-def _parameters(section: Any, content: Any) -> dict[str, Any]:
-    if not isinstance(content, Mapping) or set(content) != {'ros__parameters'}:
-        raise ValueError(f'{section} must hold ros__parameters, and nothing else')
-    parameters = content['ros__parameters']
-    if not isinstance(parameters, Mapping):
-        raise ValueError(f'{section}: ros__parameters must map names to values')
-    return _flat('', parameters)
 
 
 def _flat(prefix: str, values: Mapping[Any, Any]) -> dict[str, Any]:

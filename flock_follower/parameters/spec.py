@@ -35,10 +35,9 @@ from flock_follower.ranges import Checked, Range
 NAMES, EACH = 'cameras', 'NAME'
 #: Parameters that every ROS node has.
 OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
-#: Parameters of earlier versions: those that took their place, and what to set them to.
-REPLACED = {'altitude_hold': 'altitude_mode: hold for true, or follow'}
-#: Parameters of earlier versions that nothing replaces, and why.
+#: Parameters of earlier versions, and the reason or the replacement.
 REMOVED = {
+    'altitude_hold': 'it is now altitude_mode: hold for true, or follow',
     'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
     'j_max': 'the jerk of setpoints is not limited: remove the line',
     'check_parameters': 'they are always compared: remove the line',
@@ -59,9 +58,6 @@ REMOVED = {
         'period', 'heard_timeout', 'brake_time_constant', 'response_time', 'altitude_frequency',
         'max_vertical_acceleration', 'jpeg_quality', 'file_size', 'kept'),
         'it is a constant now: remove the line')}
-#: Values of earlier versions, by parameter: what takes their place.
-REMOVED_VALUES = {
-    ('altitude_mode', 'law'): 'the law no longer acts vertically: set follow instead'}
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -97,29 +93,21 @@ class Spec:
         return replace(valid, whole=True) if isinstance(self.default, int) else valid
 
     @property
-    def choices(self) -> tuple[str, ...]:
-        """Return the values that a text may take; none: any."""
-        return self.valid if isinstance(self.valid, tuple) else ()
-
-    @property
     def constraint(self) -> str:
         """Return the valid values in words, as used in errors and descriptors."""
-        if self.choices:
-            return 'one of ' + ', '.join(self.choices)
-        if isinstance(self.default, bool):
-            return 'true or false'
-        if isinstance(self.default, (int, float)):
-            return str(self.range)
-        if isinstance(self.default, list):
-            size = f'{len(self.default)} ' if self.fixed_length else ''
-            kind = 'strings' if self._holds_strings() else re.sub(
-                'a (finite )?number', r'\1numbers', str(self.range))
-            return f'a list of {size}{kind}'
-        return 'a string'
+        if isinstance(self.valid, tuple):
+            return 'one of ' + ', '.join(self.valid)
+        one = {bool: 'true or false', str: 'a string'}.get(type(self._example), str(self.range))
+        if not isinstance(self.default, list):
+            return one
+        size = f'{len(self.default)} ' if self.fixed_length else ''
+        several = re.sub('a (finite )?(number|string)', r'\1\2s', one)
+        return f'a list of {size}{several}'
 
-    def _holds_strings(self) -> bool:
-        return bool(isinstance(self.default, list) and self.default
-                    and isinstance(self.default[0], str))
+    @property
+    def _example(self) -> bool | int | float | str:
+        """Return the default, of a list its first element."""
+        return self.default[0] if isinstance(self.default, list) else self.default
 
     def check(self, value: Any) -> Value:
         """
@@ -127,34 +115,25 @@ class Spec:
 
         :raises ValueError: naming the parameter, the value and the valid range.
         """
-        checked = self._convert(value)
-        if checked is None:
-            removed = REMOVED_VALUES.get((self.name, value)) if isinstance(value, str) else None
-            raise ValueError(f'{self.name} = {value!r}: must be {self.constraint}'
-                             + (f'; {removed}' if removed else ''))
-        return checked
+        kind: Any = type(self._example)
+        if not isinstance(self.default, list):
+            if self._holds(value):
+                return kind(value)
+        elif hasattr(value, '__iter__') and not isinstance(value, (str, bytes)):
+            items = list(value)
+            length = len(self.default) if self.fixed_length else len(items)
+            if len(items) == length and all(map(self._holds, items)):
+                return [kind(item) for item in items]
+        raise ValueError(f'{self.name} = {value!r}: must be {self.constraint}')
 
-    def _convert(self, value: Any) -> Value | None:
-        default = self.default
-        if isinstance(default, bool):
-            return value if isinstance(value, bool) else None
-        if isinstance(default, str):
-            valid = isinstance(value, str) and (not self.choices or value in self.choices)
-            return value if valid else None
-        if isinstance(default, list):
-            return self._convert_list(value)
-        return type(default)(value) if self.range.holds(value) else None
-
-    def _convert_list(self, value: Any) -> Value | None:
-        assert isinstance(self.default, list)
-        if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
-            return None
-        items = list(value)
-        if self.fixed_length and len(items) != len(self.default):
-            return None
-        if self._holds_strings():
-            return items if all(isinstance(i, str) for i in items) else None
-        return [float(i) for i in items] if all(map(self.range.holds, items)) else None
+    def _holds(self, value: Any) -> bool:
+        """Return whether a value, or an element of a list, is valid."""
+        if isinstance(self._example, bool):
+            return isinstance(value, bool)
+        if isinstance(self._example, str):
+            return isinstance(value, str) and (
+                not isinstance(self.valid, tuple) or value in self.valid)
+        return self.range.holds(value)
 
 
 def specs_of(params: Checked, prefix: str = '') -> list[Spec]:
@@ -217,33 +196,14 @@ def expanded(specs: Sequence[Spec], values: Mapping[str, Any]) -> list[Spec]:
     listed = next((spec for spec in specs if spec.name == NAMES), None)
     if listed is None:
         return list(specs)
-    value = listed.check(values.get(NAMES, listed.default))
-    assert isinstance(value, list)
-    names = [name for name in value if isinstance(name, str) and name]
+    value: Any = listed.check(values.get(NAMES, listed.default))
+    names = [name for name in value if name]
     for name in names:
-        if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name):
+        if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or names.count(name) > 1:
             raise ValueError(f'{NAMES} = {value}: {name!r} must be a letter, then letters, digits '
-                             'and _')
-        if names.count(name) > 1:
-            raise ValueError(f'{NAMES} = {value}: {name!r} is there twice: must all be different')
+                             'and _, different from the others')
     return [spec if name is None else spec.named(name) for spec in specs
             for name in (names if EACH in spec.name else [None])]
-
-
-def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
-    """Return the error for a name that is no parameter of a node."""
-    if name in REPLACED and REPLACED[name].split(':')[0] in known:
-        return f'unknown parameter {name} for node {node}: it is now {REPLACED[name]}'
-    if name in REMOVED:
-        return f'unknown parameter {name} for node {node}: it was removed, {REMOVED[name]}'
-    parts = name.split('.')
-    listed = sorted({one.split('.')[1] for one in known if one.startswith('camera.')})
-    if len(parts) == 3 and parts[0] == 'camera' and NAMES in known and parts[1] not in listed:
-        return (f'unknown parameter {name} for node {node}: {NAMES} = {listed}: must list '
-                f'{parts[1]}')
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known))
-    return f'unknown parameter {name} for node {node}: {hint}'
 
 
 def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> None:
@@ -253,6 +213,9 @@ def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> N
     :raises ValueError: naming the parameter, and the one that is nearest to it.
     """
     for name in sorted(names):
-        if name not in known and name not in OF_EVERY_NODE and (
-                not name.startswith('qos_overrides.')):
-            raise ValueError(unknown_parameter(name, known, node))
+        if name in known or name in OF_EVERY_NODE or name.startswith('qos_overrides.'):
+            continue
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = (f'it was removed, {REMOVED[name]}' if name in REMOVED else
+                f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known)))
+        raise ValueError(f'unknown parameter {name} for node {node}: {hint}')

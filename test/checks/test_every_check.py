@@ -25,22 +25,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from observed import FOCAL, healthy, Observed, odometry_rows, shift_rows, sighting_rows, START
+from observed import FOCAL, healthy, Observed, odometry_rows, shift_rows, sighting_rows
 import pytest
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
-from flock_follower.checks.observations import NodeStatus, Observations, OURS, TopicEnd
-from flock_follower.checks.resting_marker import HOW
+from flock_follower.checks.marker_size import HOW
+from flock_follower.checks.observations import (
+    NodeStatus,
+    Observations,
+    OURS,
+    TopicEnd,
+    TopicSeen,
+)
 from flock_follower.checks.system import dead_segments, idle_share
-from flock_follower.checks.topic_names import COMPRESSED, TYPES
+from flock_follower.checks.topic_names import TYPES
 from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_multiply,
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.messages import ODOMETRY
 
 LIVE, BAG, BOTH = (True,), (False,), (True, False)
 CAMERA = '/camera/camera/infra1/image_rect_raw'
@@ -154,8 +159,23 @@ def positions(columns: list[int], signs: list[float], twist_in_odom: bool) -> Ch
     return make
 
 
+def level_flight(seen: Observed) -> None:
+    """Have the vehicle stay at a height, and see no marker."""
+    seen.sightings = []
+    for row in seen.rows:
+        up = quaternion_to_matrix(row[5:9])
+        row[4], row[9:12] = 1.5, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
+
+
+def at_rest(seen: Observed) -> None:
+    """Have the vehicle stand still."""
+    seen.rows = [row[:2] + seen.rows[0][2:9] + [0.0] * 3 + [1e-3] * 3 + row[15:]
+                 for row in seen.rows]
+    seen.shifts = [[*row[:2], *[0.1, -0.1, 0.9] * 6] for row in seen.shifts]
+
+
 NO_CALIBRATION = together(moved('camera_info', CAMERA_INFO), change(calibration=None))
-OTHER_ODOMETRY = together(moved('odom', '/ov_msckf/odomimu'), change(rows=[], frames=[]))
+OTHER_ODOMETRY = together(moved('odom', '/ov_msckf/odomimu'), change(rows=[]))
 FAULTS: list[Fault] = [
     *(Fault(f'positions {axes}, twist in {"odom" if in_odom else "child"}', BOTH, ERROR,
             'odom positions', f'move as {axes} of', 'REP-103', positions(columns, signs, in_odom))
@@ -166,26 +186,21 @@ FAULTS: list[Fault] = [
     Fault('positions turned', BOTH, ERROR, 'odom positions', 'turned by 40 deg', 'REP-103',
           lambda seen: [row.__setitem__(slice(2, 5), (quaternion_to_matrix(quaternion_from_rpy(
               0.0, 0.0, math.radians(40.0))) @ row[2:5]).tolist()) for row in seen.rows]),
-    Fault('a state that is not latched', LIVE, ERROR, 'mavlink_bridge/state QoS',
-          '/planner receives nothing: /mavlink_bridge sends volatile', 'change the QoS',
-          change(lambda seen: seen.topic('mavlink_bridge/state').publishers[0], latched=False)),
     Fault('a camera at 2 Hz', BOTH, ERROR, 'images rate', '2.0 Hz', 'raise the frame rate',
           kept('image_raw', slice(None, None, 15))),
     Fault('odometry at 2 Hz', BOTH, ERROR, 'odom rate', '2.0 Hz', 'raise the output rate',
           kept('odom', slice(None, None, 25))),
     Fault('odometry 0.4 s late', BOTH, ERROR, 'odom latency', '410 ms', 'processor time',
           delayed('odom', 0.4)),
-    Fault('use_sim_time without a clock', LIVE, ERROR, 'clock', 'nobody publishes /clock',
+    Fault('use_sim_time without a clock', LIVE, ERROR, 'clock',
+          'use_sim_time is true in planner, but nobody publishes /clock',
           'without use_sim_time',
           parameter('planner', 'use_sim_time', True)),
     Fault('stamps ahead', BOTH, ERROR, 'images latency', '80 ms in the future',
           'synchronise the clocks',
           stamped('image_raw', 0.1)),
-    Fault('a camera on a clock of its own', BOTH, ERROR, 'camera and odometry',
-          'stamps are 54 years apart', 'stamp by the clock of ROS',
-          stamped('image_raw', 100.0 - START)),
-    Fault('stamps that are zero', BOTH, ERROR, 'odom stamps', '250 of 250 are zero',
-          'fill header.stamp',
+    Fault('stamps that are zero', BOTH, ERROR, 'odom latency', 'no stamp, or another clock',
+          'by the clock of ROS',
           change(lambda seen: seen.topic('odom'), stamps=[0.0] * 250)),
     Fault('a calibration of another size', BOTH, ERROR, 'calibration',
           'for 1280x720, images are 640x480', 'calibrate the camera at this size',
@@ -212,10 +227,6 @@ FAULTS: list[Fault] = [
     Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
           columns(slice(9, 12), [1.5, 1.5, 0.0])),
-    Fault('no angular rates', BOTH, WARNING, 'odom angular rate', 'always zero', 'derived from',
-          columns(slice(12, 15), [0.0] * 3)),
-    Fault('no covariances', BOTH, WARNING, 'odom covariances', 'pose and twist', 'odom_std',
-          columns(slice(15, 27), [0.0] * 12)),
     Fault('a source that is lost', BOTH, ERROR, 'odom', '250 of 250 say nothing: quaternion = 0',
           'publish_null_when_lost',
           columns(slice(5, 9), [0.0] * 4)),
@@ -223,7 +234,7 @@ FAULTS: list[Fault] = [
           'middle of the exposure, by one clock; else set time_offset:=-0.05',
           change(shifts=shift_rows(offset=0.05))),
     Fault('a marker printed larger than configured', BOTH, ERROR, 'marker size',
-          'moves 0.80 ± 0.01 times as far', '0.200 m would fit',
+          'moves 0.80 ± 0.00 times as far', '0.200 m would fit',
           change(sightings=sighting_rows(scale=0.8))),
     Fault('a marker printed a little smaller than configured', BOTH, WARNING, 'marker size',
           'moves 1.07 ± 0.0', '0.150 m would fit',
@@ -236,13 +247,6 @@ FAULTS: list[Fault] = [
           mounted(0.0, 0.0, 7.0)),
     Fault('a marker too small', BOTH, ERROR, 'marker', '9 px wide', 'print it larger',
           pictures(markers={0: 9.0})),
-    Fault('a second print of the marker', LIVE, ERROR, 'marker id',
-          'marker 0 twice in 12 of 12 images',
-          'cover the print that is not on leader, or give leader another id',
-          pictures(repeated=[0])),
-    Fault('a second print of the marker in a bag', BAG, WARNING, 'marker id', 'marker 0 twice',
-          'cover the print',
-          pictures(repeated=[0])),
     Fault('no marker in sight', BOTH, WARNING, 'marker', 'not in sight in 12 images',
           'hold the leader before the camera',
           pictures(markers={})),
@@ -266,6 +270,8 @@ FAULTS: list[Fault] = [
           delayed('odom', 0.3)),
     Fault('little processor time left', LIVE, WARNING, 'processor', '20% of 4 cores left',
           'end programs', machine(idle=0.2)),
+    Fault('a source without rates and covariances', BOTH, WARNING, 'odom lacks',
+          'angular velocity', 'odom_std', columns(slice(12, 27), [0.0] * 15)),
     Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end programs',
           machine(idle=0.02)),
     Fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_',
@@ -273,9 +279,6 @@ FAULTS: list[Fault] = [
     Fault('segments of killed processes', LIVE, WARNING, 'shared memory', '180 segments',
           'fastdds shm clean',
           machine(dead_segments=180)),
-    Fault('images that are dropped', LIVE, WARNING, 'images processed', '33% of the images',
-          'processor',
-          kept('neighbors/frames', slice(None, None, 3))),
     Fault('a node missing', LIVE, ERROR, 'nodes', 'not running: planner', 'ros2 launch',
           lambda seen: seen.nodes.remove('/planner')),
     Fault('a node twice', LIVE, ERROR, 'nodes', 'twice: planner', 'end one of each',
@@ -283,23 +286,11 @@ FAULTS: list[Fault] = [
     Fault('two planners', LIVE, ERROR, 'command/trajectory',
           '2 publishers on /command/trajectory: /joystick, /planner', 'end all but one',
           publisher('command/trajectory', '/joystick')),
-    Fault('a stranger that commands', LIVE, WARNING, 'command/trajectory', '/joystick commands',
-          'end it, if it is not yours',
-          change(lambda seen: seen.topic('command/trajectory').publishers[0], node='/joystick')),
     Fault('ROS open to the network', LIVE, WARNING, 'network', 'mavlink_bridge, planner started '
           'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'docs/deploy.md',
           machine(open_nodes=['mavlink_bridge', 'planner'])),
-    Fault('two that see the neighbours', LIVE, ERROR, 'neighbors', '2 publishers on /neighbors',
-          'end all but one',
-          publisher('neighbors', '/laptop/relative_pose')),
     Fault('two odometries', LIVE, ERROR, 'odom', '2 publishers on /odom', 'end all but one',
           publisher('odom', '/wheels')),
-    Fault('a file of parameters that matches nobody', LIVE, ERROR, 'parameter file',
-          'none for /planner', 'name each section',
-          change(file_problems=['mine.yaml: holds parameters for /planers, none for /planner'])),
-    Fault('a file of parameters that was not taken', LIVE, ERROR, 'parameter file',
-          'planner has not taken it: v_max is 0.5, the file says 0.3', '--params-file',
-          change(file_parameters={'planner': {'v_max': 0.3}})),
     Fault('odometry read differently', LIVE, ERROR, 'odom_child_rpy',
           '[-1.5708, 0.0, -1.5708] in planner', '/**',
           parameter('planner', 'odom_child_rpy', [-1.5708, 0.0, -1.5708])),
@@ -313,28 +304,15 @@ FAULTS: list[Fault] = [
           f'--remap camera_info:={CAMERA_INFO}', NO_CALIBRATION),
     Fault('odometry under the name of its source', BOTH, ERROR, 'odom', '/odom',
           '/ov_msckf/odomimu holds odometry: --remap odom:=/ov_msckf/odomimu', OTHER_ODOMETRY),
-    Fault('poses instead of odometry', BOTH, ERROR, 'odom', f'/odom holds {POSE}',
-          f'have its source send {ODOMETRY}',
-          together(kept('odom', slice(0)), change(lambda seen: seen.topic('odom'), publishers=[
-              TopicEnd('/vio', POSE)]))),
     Fault('a source that sends nothing', LIVE, ERROR, 'odom',
           '/vio publishes /odom, and sends nothing', 'initialised?', kept('odom', slice(0))),
     Fault('a topic that cannot be read', BAG, ERROR, 'odom', 'other fields', 'record it anew',
           together(lambda seen: seen.topics.pop('/odom'), change(rows=[], unreadable={
               '/odom': 'type nav_msgs/Odometry has other fields in ROS 2 Jazzy'}))),
-    Fault('best effort where reliable is wanted', LIVE, ERROR, 'command/trajectory QoS',
-          '/mavlink_bridge receives nothing: /planner sends best effort', 'change the QoS',
-          together(*(change(lambda seen, end=end: getattr(seen.topic('command/trajectory'), end)[
-              0], reliable=end == 'subscribers') for end in ('publishers', 'subscribers')))),
     Fault('use_sim_time forgotten', LIVE, ERROR, 'clock',
           '/clock is published, but use_sim_time is false in planner', 'use_sim_time:=true',
-          together(change(clock=True), *(parameter(node, 'use_sim_time', node != 'planner')
-                                         for node in OURS))),
-    Fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
-          'but the topic is marked as rectified', 'rectified:=true',
-          together(moved('image_raw', '/image_rect'),
-                   lambda seen: seen.names.update(image_raw='/image_rect'),
-                   change(lambda seen: seen.calibration, d=[0.1, 0.0, 0.0, 0.0, 0.0]))),
+          together(lambda seen: seen.topics.update({'/clock': TopicSeen()}),
+                   *(parameter(node, 'use_sim_time', node != 'planner') for node in OURS))),
     Fault('twist in odom, told as child', BOTH, ERROR, 'odom velocity',
           'read in child, the positions say odom', 'odom_twist_frame:=auto',
           together(positions([0, 1, 2], [1.0] * 3, True),
@@ -343,44 +321,49 @@ FAULTS: list[Fault] = [
           'odom_child_rpy:=[-1.5708,0.0,-1.5708]', child_axes(*OPTICAL)),
     Fault('ahead is left', BOTH, ERROR, 'odom ahead', 'with other axes',
           'odom_child_rpy:=[0.0,0.0,1.5708]',
-          together(child_axes(0.0, 0.0, math.pi / 2.0), change(autopilot=[]))),
+          child_axes(0.0, 0.0, math.pi / 2.0)),
     # Position, attitude, velocity, rates: half a turn about x.
     Fault('north, east, down', BOTH, ERROR, 'odom up', 'z of base_link is down',
-          'instead of NED and FRD', together(change(autopilot=[]), lambda seen: [
+          'instead of NED and FRD', lambda seen: [
               row.__setitem__(slice(y, y + 2), [-row[y], -row[y + 1]])
-              for row in seen.rows for y in (3, 6, 10, 13)])),
-    Fault('compressed images, and raw ones wanted', LIVE, ERROR, 'images wiring',
-          'relative_pose does not subscribe', 'image_transport:=compressed',
-          together(moved('image_raw', '/image_raw/compressed'),
-                   change(lambda seen: seen.topic('image_raw/compressed'), subscribers=[],
-                          publishers=[TopicEnd('/camera', COMPRESSED)]))),
+              for row in seen.rows for y in (3, 6, 10, 13)]),
     Fault('loop closures', BOTH, WARNING, 'odom jumps', '1 in 250', 'turn off loop closure',
           lambda seen: [row.__setitem__(2, row[2] + 1.0) for row in seen.rows[125:]]),
-    Fault('two sources that take turns', BOTH, ERROR, 'odom frames', 'changed 3 times',
-          'two sources', change(frames=[['odom', 'base_link'], ['map', 'base_link']] * 2)),
-    Fault('a marker of another id', BOTH, ERROR, 'marker', 'marker 7 of DICT_5X5_1000 in sight',
-          'config/neighbors.yaml',
-          together(pictures(markers={}), change(strangers={'DICT_5X5_1000': [7]}))),
-    Fault('odometry and autopilot face differently', BOTH, ERROR, 'odom and autopilot',
-          'yaws differ by -40 deg', 'forward_odometry:=true',
-          lambda seen: vars(seen).update(autopilot=[
-              (stamp, quaternion_multiply(quaternion_from_rpy(0.0, 0.0, math.radians(40.0)), q))
-              for stamp, q in seen.autopilot])),
     Fault('images that stop', LIVE, ERROR, 'images', 'stopped: none in the last 3', 'is it still',
           kept('image_raw', slice(60))),
-    Fault('images above the shared memory', LIVE, ERROR, 'shared memory',
-          'images of 2700 kB, 50% are lost', 'fastdds.xml',
-          together(pictures(bytes=1280 * 720 * 3), kept('image_raw', slice(None, None, 2)))),
+    Fault('images above the shared memory', LIVE, WARNING, 'shared memory',
+          'images of 2700 kB, of which some may be lost', 'fastdds.xml',
+          pictures(bytes=1280 * 720 * 3)),
     Fault('nodes in another namespace', LIVE, ERROR, 'nodes', '/drone1/planner',
-          'check --namespace drone1',
+          'check --namespace',
           lambda seen: vars(seen).update(nodes=[f'/drone1{node}' for node in seen.nodes])),
-    Fault('odom that a node does not listen to', LIVE, ERROR, 'odom wiring',
-          'planner does not subscribe to /odom', '-r odom:=/odom',
-          lambda seen: seen.topic('odom').subscribers.pop(OURS.index('planner'))),
+    # Measured as it should be, or not at all.
+    Fault('an offset that relative_pose has as a parameter', LIVE, OK, 'camera time offset',
+          'as time_offset says', '', together(change(shifts=shift_rows(offset=0.05)), parameter(
+              'relative_pose', 'time_offset', -0.05))),
+    Fault('the pose by tf_static is used', LIVE, OK, 'odom up', 'leans', '', together(
+        child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
+            np.zeros(3), quaternion_from_rpy(*OPTICAL))))),
+    Fault('a leader that moves', LIVE, UNMEASURED, 'marker size', 'the leader moves', '',
+          lambda seen: [row.__setitem__(2, row[2] + 0.3 * math.sin(0.4 * n))
+                        for n, row in enumerate(seen.sightings)]),
+    Fault('an axis that does not move', LIVE, UNMEASURED, 'odom positions',
+          'z moved too little', '', level_flight),
+    *(Fault('a vehicle at rest', LIVE, UNMEASURED, what, measured, '', at_rest)
+      for what, measured in (('odom velocity', 'moved too little'), ('marker size', HOW),
+                             *((name, 'turned too little') for name in (
+                                 'odom ahead', 'camera time offset', 'focal length',
+                                 'camera mounting')))),
+    Fault('odometry at ten hertz', LIVE, UNMEASURED, 'camera time offset', 'odometry comes only',
+          '', together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)))),
+    Fault('odometry at ten hertz', LIVE, WARNING, 'odom rate', '10.0 Hz', 'raise the output rate',
+          together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)))),
+    Fault('a node without diagnostics', LIVE, UNMEASURED, 'planner says', 'nothing received', '',
+          lambda seen: seen.statuses.pop('planner')),
 ]
 
 
-CASES = [pytest.param(one, live, id=f'{one.name}, {"live" if live else "bag"}')
+CASES = [pytest.param(one, live, id=f'{one.name}: {one.what}, {"live" if live else "bag"}')
          for one in FAULTS for live in one.where]
 
 
@@ -394,7 +377,7 @@ def test_what_is_well_raises_no_alarm(live: bool) -> None:
     assert said['odom velocity'] == 'in the child frame'
     assert said['odom ahead'] == 'turning explains 100% of it'
     assert said['camera time offset'] in ('about 0 ms', 'about 1 ms')
-    assert said['marker size'] == 'moves 1.00 ± 0.01 times as far'
+    assert said['marker size'] == 'moves 1.00 ± 0.00 times as far'
     assert said['camera mounting'] == 'off by 0 deg'
 
 
@@ -409,7 +392,10 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
     assert one.advice in named[0].advice
     assert '\n' not in named[0].line
     assert all(bool(finding.advice) is (finding.level in (WARNING, ERROR)) for finding in findings)
-    assert ready(findings) is all(finding.level != ERROR for finding in findings)
+    assert ready(findings) is (not still_needed(findings) and all(
+        finding.level != ERROR for finding in findings))
+    if one.level in (OK, WARNING, UNMEASURED):
+        assert all(finding.level != ERROR for finding in findings)
 
 
 def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:
@@ -444,13 +430,12 @@ def test_one_cause_has_one_row() -> None:
     seen = healthy()
     NO_CALIBRATION(seen)
     seen.sightings = []  # without a calibration a marker has no place
-    seen.topic('neighbors/frames').arrivals = []
     seen.statuses['relative_pose'] = NodeStatus(
         2, 'no image processed for 4 s: no usable camera_info')
     seen.statuses['planner'] = NodeStatus(1, 'no neighbor: relative_pose processes no image')
     left = rows(healthy()).keys() - rows(seen).keys()
     assert left == {'calibration', 'odom ahead', 'camera time offset', 'focal length',
-                    'marker size', 'camera mounting', 'images processed', 'relative_pose says',
+                    'marker size', 'camera mounting', 'relative_pose says',
                     'planner says'}
     assert [what for what, level in rows(seen).items() if level != OK] == ['camera_info']
 
@@ -458,64 +443,6 @@ def test_one_cause_has_one_row() -> None:
     OTHER_ODOMETRY(seen)
     assert [what for what in rows(seen) if 'odom' in what] == ['odom']
     assert not {'marker size', 'camera mounting', 'camera time offset'} & rows(seen).keys()
-
-
-def level(height: float) -> Change:
-    """Return a change to a vehicle that stays at a height, m, and sees no marker."""
-    def make(seen: Observed) -> None:
-        seen.sightings = []
-        for row in seen.rows:
-            up = quaternion_to_matrix(row[5:9])
-            row[4], row[9:12] = height, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
-    return make
-
-
-#: Changes of a live system: the level of each row that is not OK then, and what was measured.
-ROWS: dict[str, tuple[Change, dict[str, tuple[str, str]]]] = {
-    'an offset that relative_pose is told is none': (
-        together(change(shifts=shift_rows(offset=0.05)),
-                 parameter('relative_pose', 'time_offset', -0.05)), {}),
-    'the pose that tf_static tells is used': (
-        together(child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
-            np.zeros(3), quaternion_from_rpy(*OPTICAL)))), {}),
-    # The mounting is known by the motion of the images.
-    'of a leader that moves no size is told': (
-        lambda seen: [row.__setitem__(2, row[2] + 0.3 * math.sin(0.4 * n))
-                      for n, row in enumerate(seen.sightings)],
-        {'marker size': (UNMEASURED, 'the leader moves')}),
-    'an axis that does not move is named': (level(1.5), {
-        'odom positions': (UNMEASURED, 'z moved too little')}),
-    'a height below the ground may be an axis': (level(-1.5), {
-        'odom positions': (WARNING, 'z moved too little: carry it, and lift it; z is -1.5 m')}),
-    'at rest nothing is guessed': (
-        lambda seen: vars(seen).update(
-            rows=[row[:2] + seen.rows[0][2:9] + [0.0] * 3 + [1e-3] * 3 + row[15:]
-                  for row in seen.rows],
-            shifts=[[*row[:2], *[0.1, -0.1, 0.9] * 6] for row in seen.shifts]),
-        {'odom velocity': (UNMEASURED, 'moved too little'),
-         'odom ahead': (UNMEASURED, 'turned too little'),
-         'camera time offset': (UNMEASURED, 'turned too little'),
-         'focal length': (UNMEASURED, 'turned too little'), 'marker size': (UNMEASURED, HOW),
-         'camera mounting': (UNMEASURED, HOW)}),
-    'ten hertz is told and flies': (
-        together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0))),
-        {'odom rate': (WARNING, '10.0 Hz'), 'camera time offset': (UNMEASURED, 'odometry')}),
-    'a status is essential': (lambda seen: seen.statuses.pop('planner'), {
-        'planner says': (UNMEASURED, 'nothing received')}),
-}
-
-
-@pytest.mark.parametrize(('make', 'expected'), ROWS.values(), ids=ROWS)
-def test_of_a_live_system_these_rows_are_not_ok(
-        make: Change, expected: dict[str, tuple[str, str]]) -> None:
-    seen = healthy()
-    make(seen)
-    findings = seen.judged()
-    assert {finding.what: finding.level for finding in findings if finding.level != OK} == {
-        what: level for what, (level, _) in expected.items()}
-    for finding in findings:
-        assert finding.measured.startswith(expected.get(finding.what, ('', ''))[1])
-    assert ready(findings) is ('planner says' not in expected)
 
 
 def test_faults_of_the_recorded_nodes_do_not_spoil_a_bag_but_too_few_messages_do() -> None:

@@ -33,15 +33,8 @@ from flock_follower.checks.mounting import check_mounting
 def test_an_axis_beyond_its_margin_is_named_and_an_open_one_is_unknown(
         turn: tuple[float, ...], deviations: tuple[float, ...], level: str, named: str,
         unknown: str) -> None:
-    estimate = np.radians(turn), np.radians(deviations)
-    found = check_mounting([estimate], [0.0, 0.0, 0.0], '')
+    found = check_mounting(np.radians(turn), np.radians(deviations), [0.0, 0.0, 0.0])
     assert found.level == level
     assert named in found.measured and unknown in found.measured
     assert found.measured.count(' deg than ') == bool(named)
     assert ('unknown' in found.measured) is bool(unknown)
-
-
-def test_measurements_count_by_their_deviations() -> None:
-    found = check_mounting([(np.array([0.3, 0.0, 0.0]), np.full(3, 0.3)),
-                            (np.zeros(3), np.full(3, 0.01))], [0.0, 0.0, 0.0], '')
-    assert found.level == OK

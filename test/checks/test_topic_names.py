@@ -52,18 +52,14 @@ def test_compressed_images_are_offered_under_their_name_and_depth_never() -> Non
     assert offer('image_raw', {'/cam/image/compressed': COMPRESSED}).endswith(
         ': --remap image_raw/compressed:=/cam/image/compressed')
     assert offer('image_raw', {'/camera/depth/image': IMAGE}) == ''
-    assert 'poses only' in offer('odom', {'/orb/pose': 'geometry_msgs/msg/PoseStamped'})
 
 
 def test_remaps_are_ours_first_as_in_ros() -> None:
     assert parse_remaps(['/odom:=/vio/odom', 'camera_info := info ']) == {
         'odom': '/vio/odom', 'camera_info': 'info'}
-    for wrong, reported in (('odom', 'must be from:=to'), ('odom:=', 'must be from:=to'),
-                        ('/vio/odom:=odom', 'did you mean odom:=/vio/odom?'),
-                        ('imu:=/imu', 'must be one of image_raw, ')):
-        with pytest.raises(ValueError, match=r'--remap') as error:
+    for wrong in ('odom', 'odom:=', '/vio/odom:=odom', 'imu:=/imu'):
+        with pytest.raises(ValueError, match=r'--remap .*: must be NAME:=TOPIC, .* image_raw, '):
             parse_remaps([wrong])
-        assert reported in str(error.value)
 
 
 def test_names_are_those_of_the_namespace_but_where_they_are_absolute() -> None:

@@ -58,23 +58,6 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
     assert flight.mode == flight.modes.hold and flight.speed < 0.05
 
 
-@pytest.mark.parametrize(('flies', 'kind', 'setpoints'), [
-    (True, 'brake', 1), (True, 'none', 0), (False, 'brake', 0)])
-def test_the_last_setpoint_is_one_that_the_gate_permits(flies, kind, setpoints, monkeypatch):
-    flight = Flight()
-    flight.fly(2.0)
-    if flies:
-        flight.engage()
-    decide = flight.bridge.gate.decide
-    monkeypatch.setattr(flight.bridge.gate, 'decide', lambda *arguments, **options: (
-        decide(*arguments, **options)[0]._replace(kind=kind), None))
-    flight.bridge.stop(flight.now)
-    flight.wire.written = []
-    flight.bridge.finish(flight.now)
-    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.written]
-    assert sent.count('SET_POSITION_TARGET_LOCAL_NED') == setpoints and bool(sent) == flies
-
-
 @BOTH
 def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
     flight = Flight(personality)

@@ -17,11 +17,10 @@
 import math
 
 from captured import captured, decoded, link
-from embedded_flight import Flight, odometry, setpoint
 import pytest
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.commands import arm, HOLD, OFFBOARD, Request, Vehicle
+from flock_follower.mavlink.commands import arm, hold, offboard, Request, Vehicle
 from flock_follower.mavlink.dialects import PX4, VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -60,51 +59,11 @@ def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, r
 
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
     bridge = received('px4_refusals', 60.8)
-    assert bridge.texts.since(60.0) == ['failsafe: Position']
+    assert bridge.texts.since(60.0) == ['failsafe: action 2 of PX4']
     modes = [bridge.telemetry.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
     assert [b for a, b in zip(['', *modes], modes) if a != b] == [
         'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']
-
-
-def flags(name, kind, end):
-    """Return the changes of an estimator's flags, and s since the vision ended."""
-    changes, known = [], None
-    for time, message in decoded(name):
-        if message.get_type() == kind and message.flags != known:
-            known = message.flags
-            changes.append((time - end, known))
-    return changes
-
-
-def lost(personality, seconds):
-    """Return a flight that was flown by vision, in the air, and s after it ended."""
-    flight = Flight(personality, parameters=BLIND[personality])
-    flight.fly(1.5, lambda: odometry(
-        flight.vehicle.position, flight.vehicle.rotation.T @ flight.vehicle.velocity), setpoint(),
-        rate=30.0)
-    flight.mode('OFFBOARD' if personality == 'px4' else 'GUIDED')
-    flight.messages.clear()
-    flight.fly(seconds, setpoint())
-    return flight
-
-
-@pytest.mark.parametrize(('personality', 'name', 'kind', 'end', 'seconds'), [
-    ('px4', 'px4_vision_lost', 'ESTIMATOR_STATUS', 63.63, 7.0),
-    ('arducopter', 'ardupilot_vision_lost', 'EKF_STATUS_REPORT', 41.06, 16.0)])
-def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
-        personality, name, kind, end, seconds):
-    real = flags(name, kind, end)
-    flight, states, known = lost(personality, 0.01), [], None
-    for step in range(round(seconds / 0.1)):
-        now = flight.autopilot.estimator_flags(flight.now)
-        if now != known:
-            states.append((step * 0.1, now))
-            known = now
-        flight.fly(0.1, setpoint())
-    assert [value for _, value in states] == [value for _, value in real]
-    for (ours, _), (theirs, _) in zip(states[1:], real[1:]):
-        assert ours == pytest.approx(theirs, abs=0.6)
 
 
 def test_ardupilots_words_say_why():
@@ -114,19 +73,19 @@ def test_ardupilots_words_say_why():
 
 
 @pytest.mark.parametrize(('goal', 'mode', 'since', 'message'), [
-    (arm(True), 'AUTO.LOITER', 2.0,
+    (arm(PX4, True), 'AUTO.LOITER', 2.0,
      'arm refused: temporarily rejected: no valid position estimate; no global position (neither '
      'GPS nor an origin)'),
-    (OFFBOARD, 'AUTO.LOITER', 60.6, 'offboard refused: temporarily rejected: failsafe: Position; '
-                                    'no setpoint stream'),
-    (HOLD, 'OFFBOARD', 58.0,
+    (offboard(PX4), 'AUTO.LOITER', 60.6,
+     'offboard refused: temporarily rejected: failsafe: action 2 of PX4; no setpoint stream'),
+    (hold(PX4), 'OFFBOARD', 58.0,
      'hold refused: temporarily rejected; POSCTL refused: temporarily rejected: no transmitter; '
-     'AUTO.LAND refused: temporarily rejected; PX4 sends the cause only to a ground station: look '
+     'AUTO.LAND refused: temporarily rejected: PX4 sends the cause only to a ground station: look '
      'there, or set announce_as_gcs')])
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
     status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')
-    request, texts = Request(goal, since), StatusTexts()
-    vehicle = Vehicle(PX4, status, None, since)
+    request, texts = Request(PX4, goal, since), StatusTexts()
+    vehicle = Vehicle(status, None, since)
     now = since
     while request.outcome is None:
         for time, event in decoded('px4_refusals'):

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flock_follower.mavlink.flight_end import CommandSources, FELL_SILENT_AFTER
@@ -55,16 +55,6 @@ def test_a_planner_that_starts_again_is_no_second_one(lives):
         begin = commands[-1][0] + pause + 1e-6 if commands else 0.0
         commands += publisher(first, begin, late)
     assert not noticed(commands)
-
-
-@given(numbers=st.tuples(FIRST, FIRST), late=st.tuples(JITTER, JITTER),
-       begin=st.floats(0.2, 1.0))
-@settings(max_examples=100)
-def test_two_at_ten_hertz_are_noticed_within_300_ms_of_the_second_ones_first_command(
-        numbers, late, begin):
-    first = publisher(numbers[0], 0.0, late[0])
-    second = publisher(numbers[1], begin, late[1])
-    assert any(second[0][0] <= time < second[0][0] + 0.3 for time in noticed(first + second))
 
 
 @given(number=FIRST, own=FIRST, late=JITTER, at=st.floats(0.1, 1.5))

@@ -25,10 +25,8 @@ import pytest
 from flock_follower.geometry import wrap_angle
 from flock_follower.mavlink.dialects import (
     ARDUPILOT,
-    describe,
     dialect_of,
     DIALECTS,
-    is_autopilot,
     PX4,
 )
 from flock_follower.mavlink.setpoint_rules import encode_setpoint
@@ -49,21 +47,17 @@ def heartbeat(autopilot=PX4.firmware, kind=QUADROTOR, base=1, custom=0,
     # A firmware that does not say which it is, is what the parameter says.
     ('px4', GENERIC, QUADROTOR, PX4), ('ardupilot', GENERIC, QUADROTOR, ARDUPILOT),
     ('auto', GENERIC, QUADROTOR, None), ('px4', ARDUPILOT.firmware, QUADROTOR, None),
-    ('ardupilot', ARDUPILOT.firmware, ROVER, None)])
+    ('ardupilot', ARDUPILOT.firmware, ROVER, None),
+    ('px4', mavlink.MAV_AUTOPILOT_INVALID, mavlink.MAV_TYPE_GCS, None)])
 def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, kind, dialect):
     assert dialect_of(heartbeat(firmware, kind), autopilot) is dialect
-
-
-def test_what_is_unknown_is_named():
-    assert describe(heartbeat(ARDUPILOT.firmware, ROVER)) == 'ARDUPILOTMEGA GROUND_ROVER'
-    assert describe(heartbeat(200, 201)) == 'MAV_AUTOPILOT 200 MAV_TYPE 201'
-    assert (PX4.mode_name(0), ARDUPILOT.mode_name(99)) == ('mode 0.0', 'mode 99')
 
 
 def test_modes_have_the_numbers_of_each_autopilot():
     assert {name: mavutil.mode_mapping_acm[number] for name, number in ARDUPILOT.modes.items()
             } == {name: name for name in ARDUPILOT.modes}
     assert (PX4.modes['OFFBOARD'], PX4.modes['AUTO.LOITER']) == (6 << 16, 4 << 16 | 3 << 24)
+    assert (PX4.mode_name(0), ARDUPILOT.mode_name(99)) == ('mode 0.0', 'mode 99')
     assert PX4.set_mode_parameters('AUTO.LAND') == (1.0, 4.0, 6.0)
     assert ARDUPILOT.set_mode_parameters('LAND') == (1.0, 9.0)
     for dialect in DIALECTS.values():
@@ -78,13 +72,6 @@ def test_modes_have_the_numbers_of_each_autopilot():
     (ARDUPILOT, 1, 5, mavlink.MAV_STATE_ACTIVE, (False, 'LOITER', 'active', False))])
 def test_a_heartbeat_tells_arming_mode_and_failsafe(dialect, base, custom, state, status):
     assert dialect.status(heartbeat(dialect.firmware, QUADROTOR, base, custom, state)) == status
-
-
-def test_gimbals_stations_and_companions_are_no_autopilot():
-    assert is_autopilot(heartbeat())
-    assert not any(map(is_autopilot, (
-        heartbeat(kind=mavlink.MAV_TYPE_GIMBAL), heartbeat(kind=mavlink.MAV_TYPE_GCS),
-        heartbeat(mavlink.MAV_AUTOPILOT_INVALID))))
 
 
 def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():

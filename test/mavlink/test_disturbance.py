@@ -33,26 +33,6 @@ WIND = np.array([7.5, 0.0, 0.0])
 """m/s; the embedded vehicle's drag, 0.1 1/s, makes 0.75 m/s^2 of it."""
 
 
-def observed(commands, disturbance=(0.0, 0.0, 0.0), response_time=0.25):
-    """Return the estimates while a vehicle with a lag of its own flies commands (k, 3)."""
-    observer, velocity, response = DisturbanceObserver(), np.zeros(3), np.zeros(3)
-    estimates, sent = [], None
-    for k, command in enumerate(commands):
-        observer.step(sent, velocity, k * STEP)
-        estimates.append(observer.acceleration)
-        sent = np.asarray(command, dtype=float)
-        for _ in range(10):
-            response = response + (sent - response) * STEP / 10 / response_time
-            velocity = velocity + (response + disturbance) * STEP / 10
-    return np.array(estimates)
-
-
-def test_a_steady_disturbance_is_found_within_seconds():
-    estimates = observed(np.zeros((120, 3)), (0.6, -0.4, 0.3))
-    assert np.linalg.norm(estimates[60] - [0.6, -0.4, 0.3]) < 0.15  # after 3 s
-    assert np.linalg.norm(estimates[-1] - [0.6, -0.4, 0.3]) < 0.02  # after 6 s
-
-
 def test_without_a_velocity_the_estimate_stays_and_without_our_setpoints_it_is_forgotten():
     observer = DisturbanceObserver()
     for k in range(120):

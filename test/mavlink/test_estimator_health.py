@@ -26,8 +26,6 @@ from flock_follower.mavlink.estimator_health import (
     explained,
     gps_fix,
     GpsFix,
-    UNALIGNED,
-    WITHOUT_COMPASS,
 )
 
 # What PX4 1.16 sent while vision was fused in flight, then 0.6 s and 5 s after it was lost.
@@ -70,13 +68,6 @@ def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
         f'arm refused; its estimator lacks {", ".join(missing)}' if missing else 'arm refused')
     assert explained('arm refused', status, 8.1) == explained('arm refused', None, 5.0) == (
         'arm refused')
-
-
-def test_no_global_position_though_no_flag_is_missing_is_px4s_yaw_alignment():
-    refusal = 'arm refused: temporarily rejected: no global position (neither GPS nor an origin)'
-    assert explained(refusal, GOOD, 9.0).endswith(f'{UNALIGNED}{WITHOUT_COMPASS}')
-    assert explained(refusal, GOOD, 9.0, {'EKF2_MAG_TYPE': 5.0}).endswith(UNALIGNED)
-    assert 'lacks VELOCITY_HORIZ' in explained(refusal, BAD, 9.0)
 
 
 def fixes(*types):

@@ -20,7 +20,7 @@ from fuzz_mavlink import frame
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.link import Codec, Framer, MOST_FALSE_STARTS
+from flock_follower.mavlink.link import BAD_SIGNATURE, Codec, Framer, MOST_FALSE_STARTS
 
 
 def framer():
@@ -79,7 +79,7 @@ def test_no_more_messages_are_taken_than_were_asked_for():
     several, data = framer(), b''.join(messages(100))
     assert len(several.feed(data, 30)[0]) == 30 and not several.feed(b'')[0]
     signed = Framer(signing(Codec(None)))
-    assert signed.feed(data, 30) == ([], {'wrong signature': 30})
+    assert signed.feed(data, 30) == ([], {BAD_SIGNATURE: 30})
     unending = framer()
     unending.feed(b'\xfd\xff\x01' * 93)
     for _ in range(20):
@@ -92,4 +92,4 @@ def test_an_unsigned_message_is_refused_by_a_signed_parser_and_costs_no_other():
     assert hashlib.sha256(bytes(32) + signed[:-6]).digest()[:6] == signed[-6:]
     parser = Framer(signing(Codec(None)))
     parser.codec.latest = 2**48
-    assert fed(parser, messages(1)[0] + signed) == ([0], {'wrong signature': 1})
+    assert fed(parser, messages(1)[0] + signed) == ([0], {BAD_SIGNATURE: 1})

@@ -22,6 +22,8 @@ from fuzz_mavlink import (
 )
 import pytest
 
+from flock_follower.mavlink.link import BAD_SIGNATURE, UNDECODABLE
+
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
@@ -35,15 +37,16 @@ def test_no_byte_stops_the_bridge_or_gets_a_bad_setpoint_out_of_it(personality):
     assert min(under_fire.sent[kind] for kind in (
         'COMMAND_LONG', 'ODOMETRY', 'PARAM_REQUEST_READ', 'TIMESYNC')) > 0
     assert min(under_fire.link.ignored[reason] for reason in (
-        'undecodable', 'other system', 'other component', 'second sender')) > 20
+        UNDECODABLE, 'of system id 2, not target_system 1',
+        'of component 191, not of an autopilot', 'second sender')) > 20
 
 
 def test_with_signing_nothing_forged_is_heard():
     under_fire = fuzz_bridge(100_000, 2, signing_key=b'0123456789abcdef' * 2)
-    assert under_fire.link.ignored['wrong signature'] > 200
+    assert under_fire.link.ignored[BAD_SIGNATURE] > 200
     autopilot = under_fire.traffic.autopilot
     assert under_fire.link.telemetry.status.mode in autopilot.controller.PROFILE.modes
-    assert not under_fire.link.other_autopilots
+    assert not any('system id' in reason for reason in under_fire.link.ignored)
 
 
 @BOTH

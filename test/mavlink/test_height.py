@@ -47,7 +47,7 @@ def test_pressures_are_altitudes_of_the_standard_atmosphere():
 
 def test_the_noise_of_a_real_barometer_is_bridged_and_no_jump():
     heights, found = flown(3600.0)
-    assert np.std(found[100:]) < 0.03 and heights.steps == 0
+    assert np.std(found[100:]) < 0.03 and heights.stepped == -math.inf
 
 
 def climb(t):
@@ -58,7 +58,7 @@ def climb(t):
     lambda t: 0.5 * (4.0 < t < 14.0), lambda t: 0.0, lambda t: 0.3, lambda t: None])
 def test_a_climb_is_followed_whatever_the_odometry_says_of_it(rate):
     heights, found = flown(30.0, climb, rate)
-    assert found[-1] == pytest.approx(5.0, abs=0.15) and heights.steps == 0
+    assert found[-1] == pytest.approx(5.0, abs=0.15) and heights.stepped == -math.inf
     assert heights.climb_rate == pytest.approx(0.0, abs=0.08)
     if rate(10.0) == 0.5:  # not late, where the rate is right
         assert found[200] == pytest.approx(climb(10.0), abs=0.1)
@@ -74,7 +74,7 @@ def test_the_other_source_is_corrected_within_seconds_and_hardly_disturbed(lacks
 @pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
 def test_a_jump_without_matching_velocity_shifts_the_reference_and_is_counted(jump):
     heights, found = flown(20.0, lambda t: jump * (t > 10.0))
-    assert heights.steps == 1 and abs(found[-1]) < 0.2
+    assert 10.0 < heights.stepped < 10.3 and abs(found[-1]) < 0.2
     assert max(abs(h) for h in found[60:]) < 0.35 * max(1.0, abs(jump) / 2.0)
 
 
@@ -96,6 +96,32 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     heights.take(52.0, None, 9.0)  # it comes back
     assert heights.height(9.0) == 3.5
     heights.refer(None, 9.0)
+    assert not heights.referenced
+
+
+@pytest.mark.parametrize('referenced', [False, True])
+@pytest.mark.parametrize('first', [1, 4, 12])
+def test_another_sensor_takes_over_without_a_jump_of_height_or_climb_rate(first, referenced):
+    # A bridge restarted in flight: the rangefinder's messages come before the barometer's.
+    heights = HeightEstimator()
+    for k in range(200):
+        now, barometer = k * PERIOD, k >= first
+        rate = -0.7 if k > 2 else None  # the first odometry comes later than the first height
+        heights.take((490.0 if barometer else 0.0) + 2.0 - 0.7 * now, rate, now,
+                     'SCALED_PRESSURE' if barometer else 'DISTANCE_SENSOR')
+        if k == 0 and referenced:
+            heights.refer(2.0, now)
+        assert heights.corrected(-0.7, now) == pytest.approx(-0.7, abs=0.1)
+        if referenced:
+            assert heights.height(now) == pytest.approx(2.0 - 0.7 * now, abs=0.15)
+    assert heights.steps == 0
+
+
+def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
+    heights = HeightEstimator()
+    heights.take(2.0, None, 0.0, 'DISTANCE_SENSOR')
+    heights.refer(2.0, 0.0)
+    heights.take(492.0, None, 0.1 + TIMEOUT, 'SCALED_PRESSURE')
     assert not heights.referenced
 
 

@@ -18,8 +18,7 @@ from fuzz_mavlink import FuzzedLine
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.setpoint_rules import encode_setpoint
+from flock_follower.mavlink.link import BAD_SIGNATURE, Link, Signing
 
 KEY = bytes(range(32))
 UNIX = 1.8e9
@@ -64,29 +63,26 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
     answer = bench.written()
     assert (answer.type, answer.autopilot, answer.get_srcSystem(), answer.get_srcComponent()) == (
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 1, 191)
-    link.send(encode_setpoint([1.0, 2.0, 3.0], 0.0, 1234, 1, 1))
-    message = bench.written()
-    assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
-    assert (message.target_system, message.time_boot_ms, message.type_mask) == (1, 1234, 0x83F)
-    assert (message.afx, message.afy, message.afz) == (2.0, 1.0, -3.0)
     sent = link.bytes_sent
     assert link.request_parameter('EKF2_EV_CTRL')
     message = bench.written()
-    assert (message.param_id, message.param_index) == ('EKF2_EV_CTRL', -1)
+    assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
+    assert (message.target_system, message.param_id, message.param_index) == (
+        1, 'EKF2_EV_CTRL', -1)
     assert link.bytes_sent == sent + len(message.get_msgbuf())
 
 
 @pytest.mark.parametrize(('who', 'autopilot', 'silence'), [
-    ({'system': 7}, PX4, 'received system id 7, not target_system 1'),
-    ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4, 'no autopilot with system id 1'),
+    ({'system': 7}, PX4, '1 of system id 7, not target_system 1'),
+    ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4, '1 of component 154, not of an autopilot'),
     ({}, mavlink.MAV_AUTOPILOT_GENERIC,
-     "received GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
+     "1 of GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
 def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_answered(
         who, autopilot, silence):
     bench = Bench()
     assert bench.beats('other', autopilot, **who) == []
     assert bench.link.telemetry.dialect is None and not bench.link.send_heartbeat()
-    assert silence in bench.link.silence()
+    assert bench.link.silence() == f'received, but not used: {silence}'
 
 
 def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent():
@@ -110,19 +106,15 @@ def test_garbage_and_floods_of_another_sender_cost_the_vehicle_nothing():
 
 # Signing.
 
-@pytest.mark.parametrize(('key', 'at', 'reason', 'reported'), [
-    (None, UNIX, 'wrong signature', 'signed with another key'),
-    (bytes(32), UNIX + 1e8, 'wrong signature', 'signed with another key'),
-    (KEY, UNIX - 30.0, '', ''), (KEY, UNIX - 120.0, 'older timestamp', 'older timestamp'),
-    (KEY, UNIX + 59.0, '', ''), (KEY, UNIX + 86400.0, 'future timestamp', 'ahead of this')])
-def test_signed_links_hear_only_their_key_and_time(key, at, reason, reported):
+@pytest.mark.parametrize(('key', 'at', 'received'), [
+    (None, UNIX, False), (bytes(32), UNIX + 1e8, False), (KEY, UNIX - 30.0, True),
+    (KEY, UNIX - 120.0, False), (KEY, UNIX + 59.0, True), (KEY, UNIX + 86400.0, False)])
+def test_signed_links_hear_only_their_key_and_time(key, at, received):
     bench = Bench(signing=Signing(KEY, UNIX))
     ours = bench.link._sender.signing.timestamp
-    assert bench.beats('vehicle', signing=key and Signing(key, at)) == (
-        [] if reason else ['HEARTBEAT'])
-    assert dict(bench.link.ignored) == ({reason: 1} if reason else {})
-    assert reported in bench.link.silence()
-    if reason:
+    assert bench.beats('vehicle', signing=key and Signing(key, at)) == ['HEARTBEAT'] * received
+    assert dict(bench.link.ignored) == ({} if received else {BAD_SIGNATURE: 1})
+    if not received:
         assert bench.link._sender.signing.timestamp == ours  # nor is what we send of that time
     else:
         bench.link.send_heartbeat()
@@ -140,10 +132,8 @@ def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
 
 
 @pytest.mark.parametrize(('content', 'mode', 'reported'), [
-    (KEY, 0o400, ''), (KEY.hex().encode() + b'\n', 0o600, ''),
-    *((content, 0o600, 'must hold 32 bytes') for content in (b'', b'short', b'z' * 64, b'a' * 63)),
-    *((KEY, mode, f'mode {mode:03o} gives others access: chmod 600')
-      for mode in (0o640, 0o604, 0o620, 0o601)),
+    (KEY, 0o400, ''), *((content, 0o600, 'must hold 32 bytes') for content in (b'', b'z' * 64)),
+    *((KEY, mode, f'mode {mode:03o} gives others access: chmod 600') for mode in (0o640, 0o601)),
     (None, 0, 'No such file')])
 def test_a_bad_key_file_is_named_and_its_content_is_not(content, mode, reported, tmp_path):
     path = tmp_path / 'key'

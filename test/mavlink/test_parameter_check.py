@@ -28,7 +28,6 @@ from flock_follower.mavlink.parameter_check import (
     read_recommendations,
     Recommendation,
     RULES,
-    unread,
 )
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
@@ -105,13 +104,13 @@ def test_px4_puts_the_bytes_of_an_integer_where_the_float_belongs(form, kind, va
     assert parameter_value(answer('A', float(value), kind), bytewise=False) == value
 
 
-def test_parameters_are_asked_for_two_at_a_time_and_compared_once_all_are_answered():
+def test_parameters_are_asked_for_one_at_a_time_and_compared_once_all_are_answered():
     check = ParameterCheck([A, B, C], bytewise=False)
-    assert check.step(0.0) == ['A', 'B'] and check.step(0.1) == []
+    assert [check.step(now) for now in (0.0, 0.1, 0.2, 0.3)] == ['A', 'B', 'C', '']
     check.take(answer('A', 2.0))
-    assert check.step(0.2) == ['C']
     check.take(answer('B', 0.5 + 1e-7))
     assert check.result() is None
+    assert check.step(2.3) == 'C'  # again, until it is answered
     check.take(answer('C', -3.0))
     check.take(answer('Z', 9.0))  # was not asked for
     assert check.result() == (3, 1, 0, ('A = 2, recommended 1: why A',))
@@ -119,28 +118,16 @@ def test_parameters_are_asked_for_two_at_a_time_and_compared_once_all_are_answer
     assert [checked(fence, FENCE=value).result().differing for value in (37.0, 0.0)] == [0, 1]
 
 
-def test_a_silent_autopilot_is_asked_three_times_then_given_up_and_once_more_if_it_matters():
+def test_a_parameter_without_answer_does_not_hide_those_that_differ():
     check, asked = ParameterCheck([A], bytewise=False, needed=['GUID_TIMEOUT']), []
-    for tenth in range(45):
-        asked += [tenth / 10 for name in check.step(tenth / 10) if name == 'A']
-    assert asked == [0.0, 1.0, 2.0] and check.result().unanswered == 2
-    unread(ARDUPILOT, check, False)
-    assert check.step(5.0) == ['GUID_TIMEOUT']
-    for name in ('A', 'GUID_TIMEOUT'):
-        check.take(answer(name, 1.0))  # late, but received
-    assert check.result() == (2, 0, 0, ())
-
-
-def test_a_needed_parameter_without_answer_does_not_hide_those_that_differ():
-    check, results = ParameterCheck([A], bytewise=False, needed=['GUID_TIMEOUT']), []
-    for tenth in range(100):
-        check.step(tenth / 10)
-        if tenth == 0:
-            check.take(answer('A', 7.0))
-        if tenth % 10 == 5:
-            results.append(check.result())
-            unread(ARDUPILOT, check, False)
-    assert any(result is not None and result.differing == 1 for result in results)
+    for tenth in range(51):
+        asked += filter(None, [check.step(tenth / 10)])
+        check.take(answer('A', 7.0))
+        assert (check.result() is None) == (tenth < 50)
+    assert asked == ['GUID_TIMEOUT'] * 3 and check.result()[:3] == (1, 1, 1)
+    assert obstacle(ARDUPILOT, check, False).startswith('GUID_TIMEOUT could not be read')
+    check.take(answer('GUID_TIMEOUT', 1.0))  # late, but received
+    assert check.result()[:3] == (2, 1, 0) and obstacle(ARDUPILOT, check, False) == ''
 
 
 # What forbids offboard.

@@ -35,11 +35,11 @@ from flock_follower.mavlink.setpoint_rules import (
     LEVEL,
     NONE,
 )
-from flock_follower.mavlink.velocity_check import KnownMotion, Motion, ODOM
+from flock_follower.mavlink.velocity_check import known_motion, Motion, ODOM
 from flock_follower.messages import Command
 
 LIMITS = GateLimits(relative_flight=True)
-LOST = KnownMotion(odom=Motion((0.3, 0.0, 0.0), 9.0), autopilot=Motion(), source=ODOM)
+LOST = Motion((0.3, 0.0, 0.0), 9.0), Motion(), ODOM
 FORWARD = Command((0.6, 0.0, 0.0), 1.0, relative=True)
 OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active', True)
 MANUAL = VehicleStatus(True, 'POSCTL', 'active', False)
@@ -47,10 +47,11 @@ MANUAL = VehicleStatus(True, 'POSCTL', 'active', False)
 
 def judge(limits=LIMITS, **changes):
     """Return the setpoint for a command on the marker alone, with some arguments changed."""
-    arguments = {'known': LOST, 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
-                 'armed': True, 'place': Location(2.0), 'full': limits,
-                 'relative': Relative(5.0, False, 0.2), 'airborne': True, 'withheld': '',
-                 'unplaced': '', 'held': Held(), 'wind': (0.0, 0.0, 0.0), 'offset': 0.0}
+    arguments = {'known': known_motion(limits, *LOST), 'command': FORWARD,
+                 'command_age': 0.05, 'link_age': 0.1, 'armed': True, 'place': Location(2.0),
+                 'full': limits, 'relative': Relative(5.0, False, 0.2), 'airborne': True,
+                 'withheld': '', 'unplaced': '', 'held': Held(), 'wind': (0.0, 0.0, 0.0),
+                 'offset': 0.0}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -59,8 +60,7 @@ def test_a_command_on_the_marker_alone_passes_as_it_is():
     assert (setpoint.kind, setpoint.yaw, setpoint.limited) == (COMMAND, 1.0, '')
     np.testing.assert_array_equal(setpoint.acceleration, FORWARD.acceleration)
     # In spite of velocities that contradict each other: neither is used.
-    assert judge(known=KnownMotion(odom=LOST.odom, autopilot=LOST.autopilot, source=ODOM,
-                                   disagreeing_for=9.0)).kind == COMMAND
+    assert judge(known=known_motion(LIMITS, *LOST, disagreeing_for=9.0)).kind == COMMAND
 
 
 @pytest.mark.parametrize(('change', 'reason'), [

@@ -14,6 +14,7 @@
 
 """The stream's thread: cycles on time, actions at once, and errors that stop neither."""
 
+from functools import partial
 import socket
 import threading
 import time
@@ -36,6 +37,8 @@ class Bridge:
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.fault, self.broken, self.new_command = '', False, False
         self.calls = []
+        self.send_odometry, self.stop, self.finish = (
+            partial(self.note, name) for name in ('odometry', 'stop', 'finish'))
 
     def fileno(self):
         return -1 if self.fault else self.ours.fileno()
@@ -44,10 +47,7 @@ class Bridge:
         return [now for called, now in self.calls if called == name]
 
     def wait_for(self, name, more):
-        self.wait_until(name, len(self.times(name)) + more)
-
-    def wait_until(self, name, count):
-        end = time.monotonic() + DEADLINE
+        count, end = len(self.times(name)) + more, time.monotonic() + DEADLINE
         while len(self.times(name)) < count:
             assert time.monotonic() < end, self.calls
             time.sleep(0.001)
@@ -61,9 +61,6 @@ class Bridge:
         self.note('receive', now)
         return ['a message']
 
-    def send_odometry(self, now):
-        self.note('odometry', now)
-
     def take_command(self):
         self.new_command = True
         self.note('command', time.monotonic())
@@ -75,14 +72,8 @@ class Bridge:
             raise RuntimeError('broken')
         return 'a cycle'
 
-    def stop(self, now):
-        self.note('stop', now)
-
     def stopped(self, now):
         return True
-
-    def finish(self, now):
-        self.note('finish', now)
 
 
 @pytest.fixture
@@ -108,7 +99,7 @@ def make_stream():
 def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream):
     bridge, stream, passed = make_stream(NEVER)
     bridge.theirs.send(b'x')
-    bridge.wait_until('receive', 1)
+    bridge.wait_for('receive', 1 - len(bridge.times('receive')))
     threads = []
     for action in (lambda: threads.append(threading.current_thread().name), lambda: 1 / 0,
                    lambda: bridge.note('forward')):

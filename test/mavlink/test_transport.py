@@ -31,38 +31,24 @@ from flock_follower.mavlink.transport import (
 TIOCGEXCL = 0x80045440  # of Linux; the termios module names it from Python 3.13 on
 
 
-class Terminal:
-    """A pseudo terminal whose device is a link that can be pulled."""
-
-    def __init__(self, path):
-        self.path = str(path)
-        self.plug()
-
-    def plug(self):
-        self.main, replica = os.openpty()
-        os.symlink(os.ttyname(replica), self.path)
-        self.replica = replica
-
-    def unplug(self):
-        os.unlink(self.path)
-        os.close(self.replica)
-        os.close(self.main)
-
-
 @pytest.fixture
 def terminal(tmp_path, monkeypatch):
+    """Give a function that plugs a pseudo terminal in, and one that opens it."""
+    path, opened, real = tmp_path / 'ttyACM0', [], os.open
     # The URL wants /dev; the device itself may be anywhere.
-    terminal = Terminal(tmp_path / 'ttyACM0')
-    opened, real = [], os.open
-    monkeypatch.setattr(os, 'open', lambda path, *rest: real(
-        terminal.path if path == '/dev/ttyTEST' else path, *rest))
+    monkeypatch.setattr(os, 'open', lambda name, *rest: real(
+        path if name == '/dev/ttyTEST' else name, *rest))
 
-    def make(baud=57600, unplugged=False):
-        if unplugged:
-            terminal.unplug()
-        opened.append(open_transport(f'/dev/ttyTEST,{baud}'))
-        return terminal, opened[-1]
-    yield make
+    def plug():
+        path.unlink(missing_ok=True)
+        ends = os.openpty()
+        path.symlink_to(os.ttyname(ends[1]))
+        return ends
+
+    def make():
+        opened.append(open_transport('/dev/ttyTEST,57600'))
+        return opened[-1]
+    yield plug, make, path.unlink
     for transport in opened:
         transport.close()
 
@@ -78,120 +64,93 @@ def carries(transport, far_end):
     assert transport.write(b'back') and os.read(far_end, 10) == b'back'
 
 
-@pytest.mark.parametrize('there', [True, False])
-def test_a_serial_device_that_is_away_is_told_and_opened_when_it_comes(terminal, there):
-    device, transport = terminal(unplugged=not there)
-    if there:
-        carries(transport, device.main)
-        device.unplug()
+def test_a_serial_device_that_is_away_is_reported_and_opened_when_it_comes(terminal):
+    plug, make, unlink = terminal
+    transport = make()
+    for lost_at in (1.0, 10.0):
+        assert (transport.fileno(), transport.fault) == (-1, 'No such file or directory')
+        assert not transport.write(b'lost') and list(transport.read()) == []
+        assert not transport.congested()
+        transport.reopen(lost_at)
+        main, replica = plug()
+        transport.reopen(lost_at + 0.9 * RETRY_PERIOD)
+        assert transport.fileno() == -1  # not too often
+        transport.reopen(lost_at + RETRY_PERIOD)
+        carries(transport, main)
+        unlink()
+        os.close(main)
+        os.close(replica)
         assert wait(transport) == b'' and transport.fault
-        transport.reopen(1.0)
-    assert (transport.fileno(), transport.fault) == (-1, 'No such file or directory')
-    assert not transport.write(b'lost') and list(transport.read()) == []
-    assert not transport.congested()
-    transport.reopen(1.0)
-    device.plug()
-    transport.reopen(1.0 + 0.9 * RETRY_PERIOD)
-    assert transport.fileno() == -1  # not too often
-    transport.reopen(1.0 + RETRY_PERIOD)
-    carries(transport, device.main)
+        transport.reopen(lost_at + 5.0)
 
 
 def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(terminal):
-    device, transport = terminal()
-    sent, message = 0, bytes(range(256)) * 4
+    plug, make, _ = terminal
+    main, _ = plug()
+    transport, sent, message = make(), 0, bytes(range(256)) * 4
     while transport.write(message):
         sent += 1
         assert sent < 1000
     received = b''
     while len(received) < sent * len(message):
-        received += os.read(device.main, 65536)
+        received += os.read(main, 65536)
         transport.congested()  # which sends what waits
     assert received == sent * message
     assert not transport.congested() and transport.write(b'x')
 
 
 def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
-    ends, transport = terminal()
-    transport.close()
-    left = termios.tcgetattr(ends.replica)
+    plug, make, _ = terminal
+    main, replica = plug()
+    left = termios.tcgetattr(replica)
     left[0] |= termios.IXON | termios.IXOFF | termios.IGNCR | termios.INLCR | termios.PARMRK
     left[2] |= termios.CRTSCTS | termios.CSTOPB
-    termios.tcsetattr(ends.replica, termios.TCSANOW, left)
-    transport.reopen(10.0)
+    termios.tcsetattr(replica, termios.TCSANOW, left)
+    transport = make()
     now = termios.tcgetattr(transport.fileno())
-    assert not now[0]
+    assert not now[0] and now[2] & termios.CSIZE == termios.CS8
     assert not now[2] & (termios.CRTSCTS | termios.CSTOPB | termios.PARENB)
-    assert now[2] & termios.CSIZE == termios.CS8
-    everything = bytes(range(256))
-    os.write(ends.main, everything)
-    assert wait(transport) == everything
-
-
-def exclusive(device):
-    return struct.unpack('i', fcntl.ioctl(device.replica, TIOCGEXCL, b'\0' * 4))[0] == 1
+    os.write(main, bytes(range(256)))
+    assert wait(transport) == bytes(range(256))
 
 
 def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
-    device, first = terminal()
-    _, second = terminal()
+    plug, make, _ = terminal
+    main, replica = plug()
+    first, second = make(), make()
     assert first.capacity == 5760.0  # a tenth of its baud rate
     assert (first.fault, second.fault) == ('', 'another process uses /dev/ttyTEST')
-    assert second.fileno() == -1 and exclusive(device)  # nor opens it who does not ask
-    carries(first, device.main)
+    # Nor does another program open it.
+    assert struct.unpack('i', fcntl.ioctl(replica, TIOCGEXCL, b'\0' * 4))[0] == 1
+    carries(first, main)
     first.close()
-    assert not exclusive(device)
     second.reopen(1.0)
-    carries(second, device.main)
+    carries(second, main)
 
 
-@pytest.fixture
-def tcp():
-    """Give a transport to a server that does not listen yet, and what lets it accept."""
+def test_tcp_connects_when_somebody_listens_again_after_a_close_and_holds_odometry_back():
     server = socket.socket()
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2304)
     server.bind(('127.0.0.1', 0))
-    transport, ends = open_transport(f'tcp:127.0.0.1:{server.getsockname()[1]}'), []
-
-    def accept(now):
-        server.listen()
-        for step in range(100):
-            transport.reopen(now + step)
-            if not transport.fault:
-                break
-        assert not transport.fault
-        ends.append(server.accept()[0])
-        return ends[-1]
-    yield transport, accept
-    for end in (transport, server, *ends):
-        end.close()
-
-
-def test_tcp_connects_when_somebody_listens_and_again_after_a_close(tcp):
-    transport, accept = tcp
+    transport = open_transport(f'tcp:127.0.0.1:{server.getsockname()[1]}')
     assert transport.fault == 'not connected yet' and transport.fileno() == -1
-    for now in (0.0, 0.1):
-        transport.reopen(now)
+    transport.reopen(0.0)
     assert transport.fault == 'Connection refused' and not transport.write(b'x')
-    peer = accept(1.0)
-    carries(transport, peer.fileno())
-    peer.close()
-    assert wait(transport) == b'' and transport.fault == 'closed by the other end'
-    peer = accept(200.0)
-    carries(transport, peer.fileno())
-    peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b'\1\0\0\0\0\0\0\0')
-    peer.close()  # with a reset
-    assert not all(transport.write(b'x') for _ in range(1000))
-    assert transport.fault and transport.fileno() == -1
-
-
-def test_odometry_is_held_back_while_tcp_waits_for_the_other_end(tcp):
-    transport, accept = tcp
-    accept(0.0)
-    assert not transport.congested()
+    server.listen()
+    for now in (1.0, 2.0):
+        transport.reopen(now)
+        peer, _ = server.accept()
+        carries(transport, peer.fileno())
+        assert not transport.congested()
+        peer.close()
+        assert wait(transport) == b'' and transport.fault == 'closed by the other end'
+    transport.reopen(3.0)
+    peer, _ = server.accept()
     while not transport.congested():  # nobody reads
         assert transport.write(bytes(70))
     assert transport.write(bytes(70))  # there is room for setpoints
+    for end in (transport, peer, server):
+        end.close()
 
 
 @pytest.mark.parametrize(('url', 'reason'), [

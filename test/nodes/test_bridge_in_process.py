@@ -301,7 +301,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     assert 'nothing arrives' in bench.problems(ahead=4.0)
     bench.codec.srcSystem = 7
     bench.beat()
-    bench.wait(lambda: 'received system id 7, not target_system 1' in bench.problems(ahead=4.0))
+    bench.wait(lambda: 'of system id 7, not target_system 1' in bench.problems(ahead=4.0))
     bench.codec.srcSystem = 1
     bench.beat()
     bench.wait(lambda: bench.bridge.alive(time.monotonic()))

@@ -86,7 +86,7 @@ def refused(capfd: pytest.CaptureFixture[str], node: str, *arguments: str) -> st
     ('replay', '', 'no bag given; usage: replay BAG'),
     ('replay', '/nowhere/none', 'none: no such bag'),
     ('replay', f'{SAMPLE} --ros-args -p topics:=[vio]', 'holds no topic /vio, only /'),
-    ('replay', f'{SAMPLE} --ros-args -p start:=5000.0', 'start = 5000.0: must be a number in [0'),
+    ('replay', f'{SAMPLE} --ros-args -p start:=5000.0', 'start = 5000: must be in [0'),
     ('replay', f'{SAMPLE} --ros-args -p remap:=[odom]', 'remap as ROS does: -r odom:=vio'),
     ('flock_desk.recorder_node', '{tmp} words:zoo_msgs/msg/Animal', "'zoo_msgs/msg/Animal': not"),
     ('flock_desk.recorder_node', '{tmp} words:std_msgs/String', "type 'std_msgs/String': not"),

@@ -59,13 +59,13 @@ sys.exit({name}.main(sys.argv[1:]))
 SLOW = f"""
 import time
 from flock_follower.bags import writer
-describe = writer.describe
+finish = writer.finish
 
 def slow(folder, files):
     time.sleep({SHUTDOWN_TIMEOUT} + 0.5)
-    describe(folder, files)
+    finish(folder, files)
 
-writer.describe = slow
+writer.finish = slow
 """
 PIXELS = (np.add.outer(np.arange(480), np.arange(640)) // 5 % 256).astype(np.uint8)
 

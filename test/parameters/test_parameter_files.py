@@ -26,7 +26,6 @@ import yaml
 from flock_follower.files import resource
 from flock_follower.parameters.files import (
     files_in,
-    given,
     parse_parameters,
     read_parameters,
     SHARED,
@@ -43,16 +42,13 @@ def of(node: str, **values: Any) -> dict[str, Any]:
     return {node: {'ros__parameters': values}}
 
 
-def test_what_is_not_in_the_file_has_its_default() -> None:
-    values = parse_parameters(of('planner', v_max=1), TABLE)
+@pytest.mark.parametrize('section', ['planner', '/planner', '/drone1/planner', '/**/planner'])
+def test_a_section_sets_its_parameters_and_the_others_have_their_defaults(section: str) -> None:
+    values = parse_parameters(of(section, v_max=1, use_sim_time=True, qos_overrides={
+        '/odom': {'depth': 5}}), TABLE)
     assert values['planner']['v_max'] == 1.0 and values['planner']['a_max'] == 2.5
     assert set(values) == {'relative_pose', 'planner', 'mavlink_bridge'}
     assert values['relative_pose']['camera_position'] == [0.1, 0.0, 0.0]
-
-
-@pytest.mark.parametrize('section', ['planner', '/planner', '/drone1/planner', '/**/planner'])
-def test_the_name_of_a_node_may_have_a_namespace(section: str) -> None:
-    assert parse_parameters(of(section, K=3.0), TABLE)['planner']['K'] == 3.0
 
 
 def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
@@ -83,24 +79,22 @@ def test_a_node_takes_what_the_section_follower_of_its_namespace_sets(tmp_path: 
         shared([first, second], '/planner')
 
 
-def test_what_every_node_has_is_let_through() -> None:
-    parse_parameters(of('/**', use_sim_time=True), TABLE)
-    nested = {'qos_overrides': {'/odom': {'depth': 5}}}
-    parse_parameters({'planner': {'ros__parameters': nested}}, TABLE)
-
-
 @pytest.mark.parametrize(('document', 'message'), [
     (of('planner', vmax=1.0), 'unknown parameter vmax for node planner: did you mean v_max?'),
     (of('/**', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
     (of('follower', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
-    (of('folower', a_max=1.0), 'unknown node folower: did you mean follower?'),
+    (of('folower', a_max=1.0), 'unknown node /folower: did you mean follower?'),
     (of('planner', v_max='fast'), "planner: v_max = 'fast': must be a number in "),
     (of('planner', connection='x'), 'unknown parameter connection for node planner'),
-    (of('planer', v_max=1.0), 'unknown node planer: did you mean planner?'),
-    (of('camera_driver', fps=30), 'holds parameters neither of /[*][*] nor of relative_pose'),
-    ({'planner': {'v_max': 1.0}}, 'planner must hold ros__parameters'),
-    ({'planner': {'ros__parameters': 3}}, 'planner: ros__parameters must map names'),
-    ('text', 'must map names of nodes'), (None, 'must map names of nodes')])
+    (of('planer', v_max=1.0), 'unknown node /planer: did you mean planner?'),
+    ({**of('relative_pose', cameras=['a']), **of('planner', cameras=['b'])},
+     r"cameras = \['a'\] for relative_pose and \['b'\] for planner: must be the same$"),
+    (of('planner', odom_twist_frame='odom'), "^odom_twist_frame = .*'odom' for planner.*same$"),
+    *((of('/**', **{name: 0.1}), f'unknown parameter {name} .*: it was removed, ')
+      for name in ('period', 'check_parameters', 'altitude_hold', 'j_max')),
+    *((document, 'holds ros__parameters neither of /[*][*] nor of relative_pose') for document in (
+        of('camera_driver', fps=30), {'planner': {'v_max': 1.0}},
+        {'planner': {'ros__parameters': 3}}, 'text', None))])
 def test_what_is_wrong_is_named(document: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_parameters(document, TABLE)
@@ -115,27 +109,6 @@ def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
         assert len(str(error.value).splitlines()) == 1
 
 
-def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
-    with pytest.raises(ValueError, match=r"^cameras = \['a'\] for relative_pose and "
-                                         r"\['b'\] for planner: must be the same$"):
-        parse_parameters({**of('relative_pose', cameras=['a']), **of('planner', cameras=['b'])},
-                         TABLE)
-    with pytest.raises(ValueError, match=r"^odom_twist_frame = .*'odom' for planner.*same$"):
-        parse_parameters(of('planner', odom_twist_frame='odom'), TABLE)
-
-
-@pytest.mark.parametrize('name', ['period', 'response_time', 'check_parameters', 'j_max'])
-def test_a_parameter_that_was_removed_is_refused_with_the_reason(name: str) -> None:
-    with pytest.raises(ValueError, match=f'unknown parameter {name} .*: it was removed, .* line$'):
-        parse_parameters(of('/**', **{name: 0.1}), TABLE)
-
-
-def test_a_value_that_was_removed_is_refused_with_what_replaces_it() -> None:
-    with pytest.raises(ValueError, match="altitude_mode = 'law': must be one of follow, hold; "
-                                         'the law no longer acts vertically: set follow instead$'):
-        parse_parameters(of('/**', altitude_mode='law'), TABLE)
-
-
 def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -> None:
     assert files_in(['planner', '--params-file', 'no.yaml', '--ros-args', '-p', 'v_max:=1.0',
                      '--params-file', 'a.yaml', '--', '--params-file', 'no.yaml', '--ros-args',
@@ -146,61 +119,31 @@ def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -
 PARAMETERS = {'ros__parameters': {'v_max': 0.4}}
 
 
-def reported(path: Path, node: str, document: Any) -> str:
-    """Return '' for silence, else how it is told and the text."""
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
-    try:
-        warning = unheeded(path, node)
-    except ValueError as error:
-        return str(error).replace(str(path), 'error')
-    return warning.replace(str(path), 'warning')
-
-
-def test_namespaces_may_nest(tmp_path: Path) -> None:
-    nested = {'drone1': {'planner': PARAMETERS, 'camera': PARAMETERS}}
-    assert reported(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
-    assert 'for /drone1/planner, but none for /planner' in reported(
-        tmp_path / 'x.yaml', '/planner', nested)
-
-
 @pytest.mark.parametrize(('sections', 'node', 'said'), [
-    (['plannner'], '/planner', 'error: holds parameters for /plannner, but none for /planner: '
+    (['plannner'], '/planner', 'error holds parameters for /plannner, but none for /planner: '
                                'name the section /planner, or /**/planner'),
-    (['planner'], '/planner1', 'error: holds parameters for /planner, but none for /planner1: '
+    (['planner'], '/planner1', 'error holds parameters for /planner, but none for /planner1: '
                                'name the section /planner1, or /**/planner1'),
     (['planner', 'camera'], '/drone1/planner',
-     'error: holds parameters for /planner, but none for /drone1/planner: name the section '
+     'error holds parameters for /planner, but none for /drone1/planner: name the section '
      '/drone1/planner, or /**/planner'),
     (['/drone1/planner', '/drone2/planner'], '/drone2/planner', ''),
     (['/drone1/planner', '/**'], '/drone2/planner', ''),
-    (['/**', 'plannner'], '/planner',
-     'warning: /plannner is another node than /planner: did you mean that?'),
     (['relative_pose', 'planner_server', 'camera'], '/planner',
-     'warning: holds no parameters for /planner, only for /relative_pose, /planner_server, '
-     '/camera'),
+     'holds no parameters for /planner, only for /camera, /drone3/camera, '
+     '/planner_server, /relative_pose'),
     (['relative_pose', 'planner', 'camera', 'plannner'], '/planner', ''),
-    ([], '/planner', 'warning: holds no parameters for /planner, only for no node')])
-def test_a_file_that_means_another_node_is_told(
+    ([], '/planner', 'holds no parameters for /planner, only for no node')])
+def test_a_file_that_means_another_node_is_reported(
         tmp_path: Path, sections: list[str], node: str, said: str) -> None:
-    assert reported(tmp_path / 'x.yaml', node, dict.fromkeys(sections, PARAMETERS)) == said
-
-
-@pytest.mark.parametrize('node', ['/relative_pose', '/planner', '/mavlink_bridge'])
-def test_the_files_of_the_package_pass_in_silence(node: str) -> None:
-    assert unheeded(resource('config/follower.yaml'), node) == ''
-
-
-def test_of_what_a_file_gives_a_node_the_last_counts(tmp_path: Path) -> None:
-    path = tmp_path / 'mine.yaml'
-    path.write_text('/drone1/planner: {ros__parameters: {v_max: 0.3}}\n'
-                    'drone1: {relative_pose: {ros__parameters: {max_wait: 0.1}}}\n'
-                    '/**: {ros__parameters: {v_max: 0.4, a_max: 1.0, qos: {depth: 1}}}\n')
-    assert given(path, '/drone1/planner') == {'v_max': 0.4, 'a_max': 1.0, 'qos.depth': 1}
-    assert given(path, '/planner') == {'v_max': 0.4, 'a_max': 1.0, 'qos.depth': 1}
-    assert given(path, '/drone1/relative_pose')['max_wait'] == 0.1
-    path.write_text('[')
-    with pytest.raises(ValueError, match='not valid YAML'):
-        given(path, '/planner')
+    path = tmp_path / 'x.yaml'
+    nested = {'drone3': {'camera': PARAMETERS}} if sections else {}
+    path.write_text(yaml.safe_dump({**dict.fromkeys(sections, PARAMETERS), **nested}))
+    try:
+        reported = unheeded(path, node)
+    except ValueError as error:
+        reported = f'error {error}'
+    assert reported.replace(f'{path}: ', '') == said
 
 
 def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Path) -> None:

@@ -12,22 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The tables of the black box and of the bridge."""
+"""The table of the black box."""
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.parameters import black_box_table, mavlink_bridge_table
-from flock_follower.parameters.spec import check_values, filled, Spec
-
-BRIDGE = mavlink_bridge_table.SPECS
-OF_THE_GATE = [spec for spec in BRIDGE if spec.name in {
-    field.name for field in fields(GateLimits)}]
+from flock_follower.parameters import black_box_table
+from flock_follower.parameters.spec import check_values
 
 
 @pytest.mark.parametrize(('folder', 'home', 'namespace', 'expected'), [
@@ -39,16 +33,3 @@ def test_recordings_go_to_the_given_folder_or_that_of_ros(
     values = black_box_table.build(
         check_values(black_box_table.SPECS, {'record_folder': folder}))
     assert black_box_table.folder(values, home, namespace) == expected
-
-
-@pytest.mark.parametrize('spec', OF_THE_GATE, ids=lambda spec: spec.name)
-def test_a_value_that_is_set_is_the_limit_of_the_gate(spec: Spec) -> None:
-    assert isinstance(spec.default, (bool, float))
-    other = not spec.default if isinstance(spec.default, bool) else 0.9 * spec.default or 0.5
-    values = {each.name: each.default for each in BRIDGE} | {spec.name: other}
-    assert getattr(filled(GateLimits(), values), spec.name) == other
-
-
-def test_constants_of_the_gate_are_no_parameters() -> None:
-    missing = {field.name for field in fields(GateLimits)} - {spec.name for spec in OF_THE_GATE}
-    assert missing == {'brake_time', 'speed_horizon', 'blind_timeout'}

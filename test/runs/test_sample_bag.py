@@ -21,10 +21,9 @@ import pytest
 
 from flock_desk import sample_bag as sample
 from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Sensor, SIDE_LENGTH, T_BODY_MARKER
+from flock_desk.camera.renderer import Sensor
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.files import resource
-from flock_follower.perception import markers as neighbors
 from flock_follower.perception.markers import detect
 
 pytestmark = pytest.mark.slow
@@ -51,16 +50,6 @@ def test_the_bag_is_small_and_holds_what_it_should(bag):
     size = sum(file.stat().st_size for file in resource('bags/sample').iterdir())
     assert size <= 12_000_000
     assert {topic: len(messages) for topic, messages in bag.items()} == TOPICS
-    assert {bag[topic][0].msgtype for topic in TOPICS if 'odom' in topic or 'truth' in topic} == {
-        'nav_msgs/msg/Odometry'}
-
-
-def test_the_marker_is_mounted_as_the_default_configuration_says():
-    [leader] = neighbors.load(resource('config/neighbors.yaml')).neighbors
-    [marker] = leader.markers
-    assert marker.side_length == SIDE_LENGTH
-    np.testing.assert_allclose(marker.T_body_marker.translation, T_BODY_MARKER.translation)
-    np.testing.assert_allclose(marker.T_body_marker.rotation, T_BODY_MARKER.rotation, atol=1e-7)
 
 
 @pytest.mark.parametrize('k', [0, 181])

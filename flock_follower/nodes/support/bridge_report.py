@@ -41,7 +41,6 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
-from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
@@ -63,10 +62,9 @@ LIMITS = ('a_max', 'v_max')
 class BridgeReport:
     """Publishes and reports what the bridge does."""
 
-    def __init__(self, node: FlockNode, bridge: Bridge, stream: SetpointThread,
-                 publisher: PublisherThread) -> None:
+    def __init__(self, node: FlockNode, bridge: Bridge, publisher: PublisherThread) -> None:
         self._node, self._diagnostics = node, node.diagnostics
-        self._bridge, self._stream, self._publisher = bridge, stream, publisher
+        self._bridge, self._publisher = bridge, publisher
         self._start = time.monotonic()
         self.place: tuple[OdometryState, float] | None = None
         """The newest odometry, and when it came by the monotonic clock, s."""
@@ -91,10 +89,10 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, self._unreceived), (ERROR, self._ended),
+                (ERROR, self._link_fault), (ERROR, self._ended),
                 (ERROR, self._forwarding_fault),
-                (WARN, self._estimate_fault), (WARN, self._too_slow),
-                (WARN, bridge.gate.misaligned), (WARN, bridge.gate.thrust_error),
+                (WARN, self._estimate_fault), (WARN, bridge.gate.misaligned),
+                (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
 
     # From any thread.
@@ -148,7 +146,7 @@ class BridgeReport:
             self._publish(self._states, lambda: String(data=state))
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
-        for text in self._bridge.texts.new(now):
+        for text in self._bridge.texts.new():
             log = (self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info)
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
@@ -261,11 +259,10 @@ class BridgeReport:
         before, came, went = self._bytes
         self._bytes = now, link.bytes_received, link.bytes_sent
         values: dict[str, object] = {
-            'late_cycles': self._stream.late,
             'dropped: publishing took too long': self._publisher.dropped,
             'longest_pause_s': f'{bridge.telemetry.arrivals.longest_pause(now):.2f}',
             **{f'{name}_hz': f'{hertz:.1f}'
-               for name, (hertz, _) in bridge.housekeeping.rates(now).items()},
+               for name, hertz in bridge.housekeeping.rates(now).items()},
             **{f'ignored: {kind}': count for kind, count in link.ignored.copy().items()}}
         if link.transport.capacity:
             full = link.transport.capacity * max(now - before, 1e-3)
@@ -287,12 +284,6 @@ class BridgeReport:
             return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
         return '' if now - self._start < SILENCE else (
             f'no autopilot on {transport.url}: {self._bridge.link.silence()}')
-
-    def _unreceived(self, now: float) -> str:
-        return self._bridge.housekeeping.unreceived(now) if self._bridge.alive(now) else ''
-
-    def _too_slow(self, now: float) -> str:
-        return self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
 
     def _estimate_fault(self, now: float) -> str:
         telemetry = self._bridge.telemetry
@@ -343,8 +334,7 @@ class BridgeReport:
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard and not (
-            bridge.requests.takeoff_explains_mode(now))
+        unserved = status is not None and status.offboard
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):

@@ -1,0 +1,125 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The size of a marker at rest, by one ratio: the change of the distance seen to the way moved.
+
+By odometry and image the marker must stay in place. If it approaches by more, or less, than the
+camera moves towards it, its size (or the focal length) is wrong. Both are taken along the mean
+line of sight, where an error of the mounting has no effect of first order.
+
+A leader that moves can look the same: if it goes ahead by half of the follower's way, it looks
+like a marker whose configured size is too small. So a ratio counts only if it explains nearly all
+changes of the distance.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
+from flock_follower.checks.image_motion import OwnPath
+from flock_follower.checks.mounting import SURE
+from flock_follower.checks.observations import Observations
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    R_FLU_OPTICAL,
+)
+
+#: Least number of sightings; least RMS way of the camera along the line of sight, m.
+FEW, MOVED = 12, 0.1
+#: A marker is at rest if this share of the changes is left at most. Ratios of a marker.
+LEFT, RATIOS = 0.15, (0.4, 2.5)
+#: Lasting errors of odometry are partly fitted as motion: errors of the size of tags on walls, in
+#: 34 visits, were up to 6.3 plain deviations.
+WIDENED: Final = 3.0
+_CORRELATED = 0.9  # of neighbouring residuals, at most
+#: Relative errors of the size: of a warning, of an error.
+SIZE, BAD_SIZE = 0.05, 0.1
+HOW: Final = 'stand the leader on the ground, and carry the camera towards it by 1 m, to and fro'
+
+
+class Ratio(NamedTuple):
+    """
+    The changes of the distance seen, in those of the true one, and the deviation of this ratio.
+
+    ``moved``: RMS way of the camera, m; ``left``: RMS of the changes that remain, m.
+    """
+
+    ratio: float
+    deviation: float
+    moved: float
+    left: float
+
+    @property
+    def at_rest(self) -> bool:
+        """Return whether the marker was at rest, and the camera moved."""
+        return (self.moved >= MOVED and RATIOS[0] <= self.ratio <= RATIOS[1]
+                and self.left <= LEFT * min(self.ratio, 1.0) * self.moved)
+
+
+def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
+    """Check the size of the neighbour's marker that was seen most often."""
+    what, wanted = 'marker size', 'as far as odometry moves'
+    number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
+    rows = np.array(sorted(row for row in seen.sightings if row[1] == number))
+    quaternions, known = path.attitude(rows[:, 0])
+    rotations = np.array([quaternion_to_matrix(q) for q in quaternions[known]])
+    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
+    R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
+    found = distance_ratio(
+        rows[known, 2:] @ R_base_optical.T, path.position(rows[known, 0]), rotations,
+        np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0])))
+    if found is None or not found.at_rest or SURE * found.deviation > 3.0 * SIZE:
+        moves = found is not None and found.moved >= MOVED and not found.at_rest
+        return Finding(UNMEASURED, what, 'the leader moves' if moves else HOW, wanted)
+    off, side = abs(found.ratio - 1.0), seen.marker_sides.get(number, 0.0)
+    wrong = off > max(SIZE, SURE * found.deviation)
+    measured = f'moves {found.ratio:.2f} ± {found.deviation:.2f} times as far'
+    advice = (
+        f'measure marker {number}, its black square from edge to edge: {side / found.ratio:.3f} m '
+        f'would fit, config/neighbors.yaml says {side:g}. If that is right: is the calibration '
+        'of this lens, and the scale of the odometry right?')
+    return first(what, wanted, (wrong and off > BAD_SIZE, ERROR, measured, advice),
+                 (wrong, WARNING, measured, advice), (True, OK, measured, ''))
+
+
+def distance_ratio(arms: Array, positions: Array, rotations: Array, camera: Array
+                   ) -> Ratio | None:
+    """
+    Return the ratio of the changes of the distance to the way moved, None of too few sightings.
+
+    :param arms: (n, 3), m, from the camera to the marker as seen, along base_link's axes.
+    :param positions: (n, 3), m, and :param rotations: (n, 3, 3) of base_link in odom.
+    :param camera: (3,), m, position of the camera on base_link.
+    """
+    if len(arms) < FEW:
+        return None
+    seen = (rotations @ arms[:, :, None])[:, :, 0]
+    sight = seen.mean(axis=0) / max(float(np.linalg.norm(seen.mean(axis=0))), 1e-9)
+    distance, way = seen @ sight, -(positions + rotations @ camera) @ sight
+    distance, way = distance - distance.mean(), way - way.mean()
+    squares = max(float(way @ way), 1e-12)
+    ratio = float(distance @ way) / squares
+    left = distance - ratio * way
+    lasting = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-12)
+    lasting = min(max(lasting, 0.0), _CORRELATED)
+    variance = float(left @ left) / (len(left) - 2) * (1.0 + lasting) / (1.0 - lasting)
+    return Ratio(ratio, WIDENED * float(np.sqrt(variance / squares)),
+                 float(np.sqrt(np.mean(way**2))), float(np.sqrt(np.mean(left**2))))

@@ -1,0 +1,195 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Nodes and topics: who publishes, at which rate and latency, by which clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flock_follower.checks.findings import (
+    ERROR,
+    Finding,
+    first,
+    judged,
+    OK,
+    UNMEASURED,
+    WARNING,
+)
+from flock_follower.checks.observations import Observations, OURS, TopicSeen
+from flock_follower.checks.topic_names import (
+    COMPRESSED_IMAGES,
+    full_name,
+    offer,
+    RAW_IMAGES,
+    TYPES,
+)
+
+#: Only one node may publish these.
+ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',
+                        'command/trajectory', 'mavlink_bridge/state', 'neighbors')
+START: Final = 'ros2 launch flock_follower follower.launch.py'
+#: s: stamps that differ by more from the arrival are of another clock.
+OTHER_CLOCK: Final = 10.0
+#: s: stamps in the future: from which on there is a warning, and an error.
+AHEAD: Final = (0.003, 0.03)
+#: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
+#: before the newest message of any topic.
+STOPPED: Final = (1.0, 3.0)
+
+
+class _Limits(NamedTuple):
+    """Limits of a topic: a warning and an error beyond each pair, Hz and s; the advice."""
+
+    rate: tuple[float, float]
+    latency: tuple[float, float]
+    faster: str
+    sooner: str
+
+
+def check_topics(seen: Observations) -> Iterator[Finding]:
+    """Check nodes and topics; of a bag, its content."""
+    if seen.live:
+        yield check_nodes(seen)
+        yield from _clocks(seen)
+    elif seen.incomplete:
+        yield Finding(WARNING, 'bag', f'incomplete: {seen.incomplete}', 'finished',
+                      'the part that exists can be used; record again for the rest')
+    for name in (seen.image_name, 'camera_info', 'odom'):
+        yield _needed(seen, name)
+    late = float(seen.value('planner', 'odom_timeout', 0.3))
+    yield from _stream(seen, 'images', seen.topic(seen.image_name), _Limits(
+        (10.0, 3.0), (0.2, 0.4),
+        'raise the frame rate of the camera; less exposure time where it is dark',
+        'send smaller images, or grey ones; have the camera on this computer'))
+    yield from _stream(seen, 'odom', seen.topic('odom'), _Limits(
+        (18.0, 8.0), (0.5 * late, 0.8 * late),
+        'raise the output rate of the odometry (IMU rate, where its driver offers that)',
+        'give its source more processor time, or smaller images; have it publish per IMU '
+        'message where it can'))
+    if seen.live:
+        yield from _publishers(seen)
+
+
+def check_nodes(seen: Observations) -> Finding:
+    """Check that each of our nodes runs once."""
+    count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
+    missing = ', '.join(name for name, number in count.items() if number == 0)
+    twice = ', '.join(name for name, number in count.items() if number > 1)
+    other = ', '.join(full for full in seen.nodes if full.rsplit('/', 1)[-1] in missing)
+    return first(
+        'nodes', 'each of our three, once',
+        (not seen.nodes, ERROR, f'no node is seen on domain {seen.machine.domain}', 'start them; '
+         'set ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE alike here and there'),
+        (twice, ERROR, f'twice: {twice}', 'end one of each: both command the vehicle'),
+        (missing and other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
+         'check --namespace NAME; or start all in one namespace'),
+        (missing, ERROR, f'not running: {missing}', f'start: {START}'),
+        (True, OK, 'all three are running', ''))
+
+
+def _clocks(seen: Observations) -> Iterator[Finding]:
+    """Check that every node runs on simulated time if there is a /clock, and only then."""
+    simulated = {node: bool(own['use_sim_time']) for node, own in seen.parameters.items()
+                 if 'use_sim_time' in own}
+    clock = '/clock' in seen.topics
+    wrong = ', '.join(node for node, value in simulated.items() if value != clock)
+    if simulated:
+        yield first(
+            'clock', 'use_sim_time where /clock is',
+            (wrong and clock, ERROR,
+             f'/clock is published, but use_sim_time is false in {wrong}',
+             'start with -p use_sim_time:=true; or end the publisher of /clock'),
+            (wrong, ERROR, f'use_sim_time is true in {wrong}, but nobody publishes /clock',
+             'start without use_sim_time; or replay with /clock'),
+            (True, OK, 'the same for all our nodes', ''))
+
+
+def _needed(seen: Observations, name: str) -> Finding:
+    """Check that a topic is published, and that messages arrive."""
+    topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
+    what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
+    published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
+    connect = offer(RAW_IMAGES if what == 'images' else name, published, [
+        other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)])
+    nodes = ', '.join(sorted({end.node for end in topic.publishers}))
+    return first(
+        what, msgtype.replace('/msg/', '/'),
+        (full in seen.unreadable, ERROR, f'{full} cannot be read: {seen.unreadable.get(full)}',
+         'record it anew'),
+        (not topic.publishers and seen.live, ERROR, f'nobody publishes {full}',
+         connect or 'start its driver'),
+        (not topic.publishers, ERROR, f'the bag lacks {full}',
+         connect or 'record it; evaluate needs it'),
+        (msgtype not in topic.types, ERROR, f'{full} holds {", ".join(topic.types)}',
+         connect or f'have its source send {msgtype}'),
+        (not topic.arrivals, ERROR, f'{nodes} publishes {full}, and sends nothing',
+         "see the node's log; is the sensor connected, calibrated and initialised?"),
+        (True, OK, f'{full}, {len(topic.arrivals)} messages', ''))
+
+
+def _stream(seen: Observations, name: str, topic: TopicSeen, limits: _Limits
+            ) -> Iterator[Finding]:
+    """Check rate, stamps and latency of a topic, and whether it has stopped."""
+    if not topic.arrivals:
+        return
+    gap = float(np.max(np.diff(topic.arrivals), initial=0.0))
+    newest = max(other.arrivals[-1] for other in seen.topics.values() if other.arrivals)
+    silence = newest - topic.arrivals[-1]
+    if seen.live and silence > max(STOPPED[0], STOPPED[1] * gap):
+        yield Finding(ERROR, name, f'stopped: none in the last {silence:.1f} s',
+                      'messages to the end', 'see the log of its driver; is it still running?')
+    wanted, rate = f'{limits.rate[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
+    yield first(
+        f'{name} rate', wanted,
+        (len(topic.arrivals) <= 2, UNMEASURED, f'{len(topic.arrivals)} messages are too few', ''),
+        (topic.rate < limits.rate[1], ERROR, rate, limits.faster),
+        (topic.rate < limits.rate[0], WARNING, rate, limits.faster),
+        (True, OK, rate, ''))
+    late = np.array(topic.arrivals) - np.array(topic.stamps)
+    middle, most = float(np.median(late)), float(np.percentile(late, 95))
+    ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
+    synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
+    measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
+    yield first(
+        f'{name} latency', f'below {limits.latency[0]:g} s after its stamp',
+        (abs(middle) > OTHER_CLOCK, ERROR,
+         f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
+         'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
+         'computers; have the driver stamp by the clock of ROS (a replayed bag: ros2 bag record '
+         '--use-sim-time)'),
+        (middle < -AHEAD[1], ERROR, ahead, synchronise),
+        (middle < -AHEAD[0], WARNING, ahead, synchronise),
+        (middle > limits.latency[1], ERROR, measured, limits.sooner),
+        (middle > limits.latency[0] or most > limits.latency[1], WARNING, measured,
+         limits.sooner),
+        (True, OK, measured, ''))
+
+
+def _publishers(seen: Observations) -> Iterator[Finding]:
+    """Report topics with several publishers that may have only one; nodes open to the network."""
+    for name in ONE_PUBLISHER:
+        nodes = sorted(end.node for end in seen.topic(name).publishers)
+        if len(nodes) > 1:
+            yield Finding(ERROR, name, f'{len(nodes)} publishers on {seen.names[name]}: '
+                          f'{", ".join(nodes)}', 'one', 'end all but one, or remap them')
+    nodes = seen.machine.open_nodes
+    yield judged(False, bool(nodes), 'network', f'everybody on it can command: {", ".join(nodes)} '
+                 'started without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' if nodes else
+                 'ROS stays on this computer, or with named peers',
+                 'the network does not reach the nodes',
+                 'start every node with it, see docs/deploy.md')
