@@ -257,8 +257,9 @@ class SimulatedFollower(Listener):
 
     def fail(self, now: float) -> None:
         """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
-        self.failed, self.decision = True, Decision(State.IDLE)
-        self._follower.bridge_died(to_nanoseconds(now))
+        if not self.failed:
+            self.failed, self.decision = True, Decision(State.IDLE)
+            self._follower.bridge_died(to_nanoseconds(now))
 
     def send(self, time: int, messages: list[OdometryState]) -> None:
         if not self.failed:
