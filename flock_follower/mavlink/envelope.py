@@ -213,6 +213,8 @@ def outside(limits: GateLimits, height: float | None) -> str:
 BANDWIDTH: Final[float] = 1.0
 #: s: until then the observer does not know the vertical velocity by the sensor alone.
 SETTLING: Final[float] = 3.0
+#: m/s: a larger error of a vertical velocity is not corrected: the sensor may be the wrong one.
+MAX_CORRECTION: Final[float] = 1.0
 #: A height older than this, s, is not known any more.
 TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
@@ -319,9 +321,10 @@ class HeightEstimator:
         return (self._reported or 0.0) + self._velocity_error
 
     def corrected(self, climb_rate: float, now: float) -> float:
-        """Return a vertical velocity by the other source, m/s, with its error taken out."""
+        """Return a vertical velocity by the other source, m/s, less at most MAX_CORRECTION."""
         known = self._reported is not None and now - self._time <= TIMEOUT
-        return climb_rate + (self._velocity_error if known else 0.0)
+        error = min(max(self._velocity_error, -MAX_CORRECTION), MAX_CORRECTION)
+        return climb_rate + (error if known else 0.0)
 
     def altitude(self, now: float) -> float | None:
         """Return the altitude by the sensor, m, at ``now``; None if none is known."""
