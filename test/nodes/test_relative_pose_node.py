@@ -40,6 +40,7 @@ from flock_follower.messages import (
     MOTION_TOPIC,
     RELATIVE,
     set_quaternion,
+    set_vector,
     stamp_to_nanoseconds,
 )
 from flock_follower.nodes import relative_pose
@@ -298,21 +299,20 @@ def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..
     assert not r.found
 
 
-def test_the_child_frame_of_odom_is_placed_by_tf_static_and_wrong_axes_are_reported(
-        rig: Callable[..., Rig]) -> None:
+def test_the_child_frame_of_odom_is_placed_by_tf_static(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
     r, imu = rig(), TransformStamped(child_frame_id='imu')
-    rolled = quaternion_from_rpy(np.pi / 2.0, 0.0, 0.0)
-    for k in range(20):
-        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
-                                   OWN.translation, rolled, np.zeros(3)))
-    assert 'axes of odom: base_link has y up instead of z' in r.problems()
+    T_base_imu = Transform.from_quaternion([0.1, 0.0, -0.05], quaternion_from_rpy(
+        np.pi / 2.0, 0.0, 0.0))
     imu.header.frame_id = 'base_link'
-    set_quaternion(imu.transform.rotation, rolled)
+    set_vector(imu.transform.translation, T_base_imu.translation)
+    set_quaternion(imu.transform.rotation, T_base_imu.quaternion)
     r.node._own._static.take(SimpleNamespace(transforms=[imu]))
-    for k in range(20, 60):
-        r.give('odom', to_odometry(nanoseconds_to_stamp(START + k * 10**8), 'odom', 'imu',
-                                   OWN.translation, rolled, np.zeros(3)))
-    assert 'axes of odom' not in r.problems()
+    T_odom_imu = OWN @ T_base_imu
+    r.give('odom', to_odometry(nanoseconds_to_stamp(START), 'odom', 'imu', T_odom_imu.translation,
+                               T_odom_imu.quaternion, np.zeros(3)))
+    r.image(0.0, image)
+    np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
 
 
 def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
