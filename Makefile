@@ -2,7 +2,7 @@
 #   make demo      replay the sample bag through the real nodes into an embedded autopilot, and report (build/demo)
 #   make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
 #   make flights   fly every scenario 200 times in lock step, with five controllers (build/flights; many minutes)
-#   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
+#   make figures   redraw the paper's simulations into build/figures, and the controllers that `make flights` compared
 # Change it
 #   make test      run the test suite (about six minutes on two cores)
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)

@@ -43,7 +43,7 @@ from flock_desk.camera.renderer import (
     T_BODY_MARKER,
     T_BODY_OPTICAL,
 )
-from flock_desk.marker import entry, layout, panel_entry, SIZES
+from flock_desk.marker import layout, neighbors_file, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -173,8 +173,9 @@ def main() -> None:
     """Print the detections."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
     cv2.setNumThreads(1)
-    carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),
-               'panel': parse(yaml.safe_load(panel_entry(layout(DICTIONARY, [0, 1], SIZES))))}
+    one, two = layout(DICTIONARY, [0], [0.16]), layout(DICTIONARY, [0, 1], SIZES)
+    carried = {'0.16 m': parse(yaml.safe_load(neighbors_file(DICTIONARY, [one]))),
+               'panel': parse(yaml.safe_load(neighbors_file(DICTIONARY, [two])))}
     renderers = {name: Renderer(CAMERA, Sensor(), printed(config.neighbors[0].markers))
                  for name, config in carried.items()}
     print('hovering: share of images, RMS of the distance, its mean error, NEES of the place')

@@ -343,15 +343,14 @@ class Flight:
         # The truth of the last images may come after the end of a short run.
         found = np.isfinite(table['distance'] - table['true_distance'])
         off = (table['distance'] - table['true_distance'])[found]
-        velocity, sigma = (np.stack([table[f'velocity_{kind}{axis}'] for axis in 'xyz'])[:, found]
-                           for kind in ('', 'sigma_'))
+        velocity, sigma = table['velocity'][found], table['velocity_sigma'][found]
         # A detector has no deviation, but no velocity either from its first sighting.
-        usable = np.isfinite(velocity[0]) & ~(np.sum(sigma**2, axis=0) > VELOCITY_STD**2)
+        usable = np.isfinite(velocity[:, 0]) & ~(np.sum(sigma**2, axis=1) > VELOCITY_STD**2)
         ms = np.array(self.milliseconds[method])
         return Figures(
             float(ms.mean()), *(float(np.percentile(ms, p)) for p in (50, 99)),
             recall, float(off.mean()), float(np.sqrt(np.mean(off**2))),
-            float(np.sqrt(np.mean(np.sum(velocity[:, usable]**2, axis=0)))),
+            float(np.sqrt(np.mean(np.sum(velocity[usable]**2, axis=1)))),
             float(np.mean(table['turned'][found] > WRONG)),
             *(float(np.mean(table[f'nees_{kind}'][found])) for kind in ('position', 'velocity')))
 

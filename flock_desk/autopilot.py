@@ -32,41 +32,43 @@ import signal
 import socket
 import sys
 import time
-from typing import Any, Final
+from typing import Any
 
-from flock_desk.runs.console import guarded, Options, parsed
+from flock_desk.runs.console import guarded, within
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
 
-OPTIONS: Final[Options] = {
-    '--connect': {'default': '127.0.0.1:14540', 'metavar': 'HOST:PORT',
-                  'help': 'where a bridge listens; loopback only (%(default)s)'},
-    '--personality': {'choices': tuple(PROFILES), 'default': 'px4',
-                      'help': 'whose modes, masks and answers (%(default)s)'},
-    '--start': {'choices': STARTS, 'default': 'airborne',
-                'help': 'hovering, or on the ground armed or disarmed (%(default)s)'},
-    '--altitude': {'type': float, 'default': 2.0, 'metavar': 'M',
-                   'help': 'of a hovering start, m (%(default)s)'},
-    '--yaw': {'type': float, 'default': 0.0, 'metavar': 'DEG',
-              'help': 'at the start, degrees anticlockwise from east (%(default)s)'},
-    '--param-file': {'default': '', 'metavar': 'FILE',
-                     'help': 'set the parameters of a file such as config/px4.params, but those '
-                             'for forwarded odometry'},
-    '--param': {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
-                'help': 'set a parameter of the autopilot; may be repeated'},
-    '--log': {'default': '', 'metavar': 'FILE.npz',
-              'help': 'write the true state and every setpoint received'}}
-_VALID: Final = {'altitude': Range(0.1, 1000.0, 'm'), 'yaw': Range(-360.0, 360.0, 'degrees')}
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the options."""
+    new = argparse.ArgumentParser(
+        prog='autopilot', description='An embedded autopilot for tests and the demo.')
+    new.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
+                     help='where a bridge listens; loopback only (%(default)s)')
+    new.add_argument('--personality', choices=tuple(PROFILES), default='px4',
+                     help='whose modes, masks and answers (%(default)s)')
+    new.add_argument('--start', choices=STARTS, default='airborne',
+                     help='hovering, or on the ground armed or disarmed (%(default)s)')
+    new.add_argument('--altitude', type=within(Range(0.1, 1000.0, 'm')), default=2.0, metavar='M',
+                     help='of a hovering start, m (%(default)s)')
+    new.add_argument('--yaw', type=within(Range(-360.0, 360.0, 'degrees')), default=0.0,
+                     metavar='DEG', help='at the start, anticlockwise from east (%(default)s)')
+    new.add_argument('--param-file', default='', metavar='FILE',
+                     help='set the parameters of a file such as config/px4.params, but those '
+                     'for forwarded odometry')
+    new.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
+                     help='set a parameter of the autopilot; may be repeated')
+    new.add_argument('--log', default='', metavar='FILE.npz',
+                     help='write the true state and every setpoint received')
+    return new
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the embedded autopilot until SIGINT or SIGTERM; return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog='autopilot', description='An embedded autopilot for tests and the demo.')
-    return guarded(partial(_fly, parsed(parser, args, OPTIONS, valid=_VALID)))
+    return guarded(partial(_fly, parser().parse_args(args)))
 
 
 def _fly(options: argparse.Namespace) -> int:

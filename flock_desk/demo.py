@@ -33,20 +33,21 @@ import time
 
 import numpy as np
 
-from flock_desk.runs.console import guarded, parsed
+from flock_desk.runs.console import guarded
+from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import COMMANDS, COUNTED, RECORDED, start
-from flock_desk.runs.judge import FigureBound
+from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     SchedulingDelay,
 )
-from flock_desk.runs.record import FlightRecord, read_replayed
-from flock_desk.runs.report import announce, Chapter, report
+from flock_desk.runs.record import read_replayed
+from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.files import resource, whole_file
+from flock_follower.files import resource
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
@@ -62,34 +63,18 @@ INTRODUCTION = (
     'The bag is replayed through the nodes, and an embedded autopilot flies their commands. '
     'The camera in the bag does not move with that vehicle: its speed is shown, its path would '
     'mean nothing. Distance, path and errors are those of the recorded flight.')
-BOUNDS = (
-    FigureBound('processed_share', least=0.9),
-    FigureBound('recall_of_processed', least=0.99),
-    FigureBound('true_distance_m.min', least=round(PARAMS.law.d0**0.5, 2)),
-    FigureBound('true_distance_m.max', most=round(PARAMS.law.d1**0.5, 2)),
-    FigureBound('position_rms_m', most=0.05),
-    FigureBound('velocity_rms_m_s', most=0.15),
-    FigureBound('velocity_rms_of_all_m_s', most=0.15),
-    FigureBound('planner.rate_hz', 9.9, 10.1),
-    # A shared machine may stall for a tick or two; the bridge brakes meanwhile, as it should.
-    FigureBound('planner.missed_ticks', most=3),
-    FigureBound('setpoints.sent', least=1),
-    FigureBound('setpoints.rate_hz', 19.5, 30.5),
-    FigureBound('setpoints.acceleration_max_m_s2', most=PARAMS.a_max),
-    FigureBound('speed_max_m_s', most=PARAMS.v_max),
-    FigureBound('latency_ms.p50', most=120),
-    FigureBound('latency_ms.p95', most=180),
-    FigureBound('latency_ms.p99', most=200),
-    FigureBound('failed_processes', most=0))
+BOUNDS = [*bounds('demo', {
+    'near': round(PARAMS.law.d0**0.5, 2), 'far': round(PARAMS.law.d1**0.5, 2),
+    'a_max': PARAMS.a_max, 'speed': PARAMS.v_max}).values()]
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demonstration and return the exit code."""
     parser = argparse.ArgumentParser(prog='demo', description='Replay a bag into an autopilot.')
-    out: Path = parsed(parser, args, {'--output': {
-        'type': Path, 'default': Path('build/demo'),
-        'help': 'folder for report and logs (%(default)s)'}}).output
-    return guarded(partial(_demonstrate, out), hint=f'\nthe logs of every process are in {out}')
+    parser.add_argument('--output', type=Path, default='build/demo',
+                        help='folder for report and logs (%(default)s)')
+    out = parser.parse_args(args).output
+    return guarded(partial(_demonstrate, out), hint=f'; the logs of every process are in {out}')
 
 
 def _demonstrate(out: Path) -> int:
@@ -98,19 +83,9 @@ def _demonstrate(out: Path) -> int:
     exit_codes = fly(bag, out)
     flight = read_replayed(bag, out, PARAMS)
     summary = replay_figures(flight, exit_codes)
-    picture = out / 'report.png'
-    judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS,
-                        partial(_pictures, flight, picture))
+    judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS, chapters(flight))
     print()
-    return announce(summary, judgements, [
-        page for page in (out / 'report.html', picture) if page.exists()], out)
-
-
-def _pictures(flight: FlightRecord, picture: Path) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import chapters, flight_picture
-    with whole_file(picture) as file:
-        file.write(flight_picture(flight, TITLE))
-    return chapters(flight)
+    return announce(summary, judgements, [out / 'report.html'], out)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:

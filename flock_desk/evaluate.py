@@ -16,8 +16,7 @@
 Run perception, planner and setpoint gate over a bag, and report their errors.
 
 ``python -m flock_desk.evaluate BAG --config config/follower.yaml --output OUT`` needs no
-ROS and runs in the bag's own time, as fast as the machine allows; the order of events is that
-of ``flock_desk.runs.recorded_flight``. It writes
+ROS and runs in the bag's own time, as fast as the machine allows. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
   them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
@@ -47,68 +46,17 @@ from typing import Any, NamedTuple
 
 import cv2
 
-from flock_desk.runs.console import explained, guarded, Options, parsed
-from flock_desk.runs.evaluation import evaluate, Evaluation
+from flock_desk.runs.console import explained, guarded
+from flock_desk.runs.evaluation import evaluate
 from flock_desk.runs.judge import check_names, Judgement, load_bounds
-from flock_desk.runs.processes import mapped
-from flock_desk.runs.report import announce, Chapter, report
+from flock_desk.runs.plots import evaluation_chapters
+from flock_desk.runs.processes import computed
+from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import evaluation_figures
 from flock_follower.checks.findings import ERROR, ready, WARNING
 from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.files import resource
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
-
-_OPTIONS: Options = {
-    'bag': {'type': Path, 'nargs': '+', 'help': '.mcap, .db3, .bag or ROS 2 bag folder'},
-    '--config': {'type': Path, 'help': 'ROS 2 parameter file (default: those flown, of a '
-                 'recording of the black box, else config/follower.yaml of this package)'},
-    '--output': {'type': Path, 'default': Path('build/evaluate'),
-                 'help': 'folder for the results (default: %(default)s)'},
-    '--expect': {'type': Path, 'metavar': 'FILE',
-                 'help': 'YAML file of bounds; exit code 1 where one is broken'},
-    '--check': {'choices': ('fail', 'report', 'skip'), 'default': 'fail',
-                'help': 'errors that the rules of check find in the bag: exit code 1, only '
-                'reported, or not looked for (default: %(default)s)'},
-    '--namespace': {'default': '', 'help': 'of the topics in the bag'},
-    '--remap': {'action': 'append', 'default': [], 'metavar': 'FROM:=TO',
-                'help': 'one of our topics by its name in the bag, as '
-                'odom:=/camera/odom/sample; may be repeated'},
-    '--scheduler': {'default': '', 'metavar': 'ADDRESS',
-                    'help': 'of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
-                    'same files'}}
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command and return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
-    options = parsed(parser, args, _OPTIONS)
-    names = [bag.expanduser().resolve().name for bag in options.bag]
-    if twice := {name for name in names if names.count(name) > 1}:
-        parser.error(f'{", ".join(sorted(twice))}: bags of one name would share a folder')
-    each = [argparse.Namespace(**{
-        **vars(options), 'bag': bag,
-        'output': options.output / name if len(names) > 1 else options.output})
-        for bag, name in zip(options.bag, names)]
-    if options.scheduler:  # its workers run in other folders
-        for one in each:
-            vars(one).update({key: value.expanduser().absolute()
-                              for key, value in vars(one).items() if isinstance(value, Path)})
-    return guarded(partial(_evaluate_all, each, options.scheduler), refused=2)
-
-
-def _evaluate_all(each: Sequence[argparse.Namespace], scheduler: str) -> int:
-    """Evaluate bags, here or on a cluster, print the outcomes and return the exit code."""
-    codes = []
-    for options, outcome in zip(each, mapped(scheduler, evaluated, each) if scheduler
-                                else map(evaluated, each)):
-        if len(each) > 1:
-            print(f'\n{options.bag}')
-        for line in outcome.problems:
-            print(line, file=sys.stderr)
-        codes.append(outcome.code if outcome.code == 2 else max(outcome.code, announce(
-            outcome.summary, outcome.judgements, [options.output / 'report.html'])))
-    return max(codes)
 
 
 class BagOutcome(NamedTuple):
@@ -120,66 +68,100 @@ class BagOutcome(NamedTuple):
     judgements: Sequence[Judgement] = ()
 
 
-def evaluated(options: argparse.Namespace) -> BagOutcome:
-    """Evaluate one bag, write its files, and return the outcome."""
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
+    parser.add_argument('bag', type=Path, nargs='+', help='.mcap, .db3, .bag or ROS 2 bag folder')
+    parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: those flown, '
+                        'of a recording of the black box, else config/follower.yaml)')
+    parser.add_argument('--output', type=Path, default='build/evaluate',
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--expect', type=Path, metavar='FILE',
+                        help='YAML file of bounds; exit code 1 where one is broken')
+    parser.add_argument('--check', choices=('fail', 'report', 'skip'), default='fail',
+                        help='errors that the rules of check find in the bag: exit code 1, only '
+                        'reported, or not looked for (default: %(default)s)')
+    parser.add_argument('--namespace', default='', help='of the topics in the bag')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
+                        help='one of our topics by its name in the bag, as '
+                        'odom:=/camera/odom/sample; may be repeated')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
+                        'same files')
+    options = parser.parse_args(args)
+    bags = {bag.resolve().name: bag.absolute() for bag in options.bag}
+    if len(bags) < len(options.bag):
+        parser.error(f'{", ".join(map(str, options.bag))}: bags of one name would share a folder')
+    for name in ('config', 'output', 'expect'):  # workers of a cluster run in other folders
+        if getattr(options, name):
+            setattr(options, name, getattr(options, name).absolute())
+    return guarded(partial(_evaluate_all, bags, options), refused=2)
+
+
+def _evaluate_all(bags: Mapping[str, Path], options: argparse.Namespace) -> int:
+    """Evaluate bags, here or on a cluster, print the outcomes and return the exit code."""
+    folders = [options.output / name if len(bags) > 1 else options.output for name in bags]
+    tasks = [partial(evaluated, bag, folder, options) for bag, folder in zip(
+        bags.values(), folders)]
+    codes = []
+    for folder, outcome in zip(folders, computed(_run, tasks, 1, options.scheduler)):
+        if len(bags) > 1:
+            print(f'\n{folder.name}')
+        for line in outcome.problems:
+            print(line, file=sys.stderr)
+        codes.append(outcome.code if outcome.code == 2 else max(outcome.code, announce(
+            outcome.summary, outcome.judgements, [folder / 'report.html'])))
+    return max(codes)
+
+
+def _run(task: partial[BagOutcome]) -> BagOutcome:
     cv2.setNumThreads(1)  # the cost measured is that of one core
     try:
-        return run(options)
+        return task()
     except (OSError, ValueError) as error:
         return BagOutcome(2, [f'error: {explained(error)}'])
 
 
-def run(options: argparse.Namespace) -> BagOutcome:
+def evaluated(bag: Path, folder: Path, options: argparse.Namespace) -> BagOutcome:
     """
     Evaluate one bag and write its files.
 
     :raises ValueError: for a bag, parameter or bound that is wrong.
     :raises OSError: for a file that cannot be read or written.
     """
-    flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
+    flown = None if options.config else parameters_flown(bag, TABLE)
     values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     remaps = parse_remaps(options.remap)
     bounds = load_bounds(options.expect) if options.expect else []
-    options.output.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     evaluation = evaluate(
-        options.bag, values, options.output / 'result.mcap', options.namespace, remaps,
-        options.check != 'skip')
+        bag, values, folder / 'result.mcap', options.namespace, remaps, options.check != 'skip')
     summary = evaluation_figures(evaluation)
     check_names(bounds, summary)
     # Errors first; that the bag is incomplete is a warning of its own.
     findings = [finding for level in (ERROR, WARNING) for finding in evaluation.findings
                 if finding.level == level and finding.what != 'bag']
-    fast = too_fast(summary, evaluation.flight.planner_params.v_max)
-    flown_with = ', with the parameters flown' if flown else ''
     lines = [finding.line for finding in findings]
+    incomplete = evaluation.bag.incomplete
+    warnings = [f'{bag} is incomplete: {incomplete}'] if incomplete else []
+    warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
+                 for stranger in sorted(evaluation.errors.strangers)]
+    if share := summary['faster_than_v_max_share']:
+        warnings.append(
+            f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
+            f'{100 * share:.0f} % of the time above '
+            f'v_max = {evaluation.params.v_max:g} m/s: there the setpoints '
+            'brake; set v_max (--config) to the recorded speed')
+    flown_with = ', with the parameters flown' if flown else ''
     judgements = report(
-        options.output, f'Evaluation of {evaluation.bag}',
+        folder, f'Evaluation of {bag.name}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
-        'setpoints.', summary, bounds, partial(_pictures, evaluation),
-        warnings=[*lines, *fast])
-    warnings = [f'the truth of {stranger!r} is not used: no neighbor has that name'
-                for stranger in sorted(evaluation.errors.strangers)]
-    if evaluation.incomplete:
-        warnings.insert(0, f'{options.bag} is incomplete: {evaluation.incomplete}')
+        'setpoints.', summary, bounds, evaluation_chapters(evaluation), [*lines, *warnings])
     failed = options.check == 'fail' and not ready(findings)
-    return BagOutcome(int(failed), [*lines, *(f'warning: {each}' for each in (*warnings, *fast))],
+    return BagOutcome(int(failed), [*lines, *(f'warning: {each}' for each in warnings)],
                       summary, judgements)
-
-
-def _pictures(evaluation: Evaluation) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import evaluation_chapters
-    return evaluation_chapters(evaluation)
-
-
-def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
-    """Return the warning of a bag whose follower was faster than allowed, if it was."""
-    share = summary['faster_than_v_max_share']
-    if not share:
-        return []
-    return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
-            f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
-            'brake; set v_max (--config) to the recorded speed']
 
 
 if __name__ == '__main__':

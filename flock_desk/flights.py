@@ -25,7 +25,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import groupby
 import os
 from pathlib import Path
 import sys
@@ -41,23 +40,16 @@ from flock_desk.closed_loop.metrics import (
     of_runs,
     summary,
 )
-from flock_desk.runs.console import aligned, guarded, Options, parsed, Progress
-from flock_desk.runs.processes import mapped, pooled
+from flock_desk.runs.console import aligned, guarded, progress, within
+from flock_desk.runs.processes import computed
 from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.scenario_file import (
-    key_tables,
-    load,
-    names,
-    ScenarioError,
-)
+from flock_desk.scenarios.scenario_file import key_tables, load, names, ScenarioError
 from flock_follower.ranges import Range
 
 CHUNK = 50  # followers flown together; fixed, so that --jobs does not change the results
 LONGEST_NAME = 21
 MOST_EXITS = 5  # of a scenario that are named
-_COUNTS = Range(1, whole=True)
-_SEEDS = Range(0, whole=True)
 COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
            'time_in_band': ('in band', '% time', 100.0, 2),
            'time_in_sight': ('in sight', '% time', 100.0, 2),
@@ -98,32 +90,30 @@ class Flown(NamedTuple):
     """Which runs left the band, when and why, one line each."""
 
 
-_OPTIONS: Options = {
-    '--controllers': {'nargs': '+', 'choices': CONTROLLERS, 'default': list(CONTROLLERS),
-                      'metavar': 'NAME', 'help': f'{", ".join(CONTROLLERS)}; a flock flies '
-                      f'{" and ".join(IN_FLOCKS)} only (all)'},
-    '--keys': {'action': 'store_true',
-               'help': 'print every key of a scenario file with its default and range'},
-    '--runs': {'type': int, 'default': 200, 'help': 'of each (%(default)s)'},
-    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
-               'help': 'processes (one per processor)'},
-    '--scheduler': {'default': '', 'metavar': 'ADDRESS',
-                    'help': 'of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead of '
-                    '--jobs processes here; it has the same results'},
-    '--seed': {'type': int, 'default': 0, 'help': '%(default)s'},
-    '--output': {'type': Path, 'default': Path('build/flights'), 'metavar': 'FOLDER',
-                 'help': '%(default)s'}}
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Fly, print the table, write the file and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='flights', description='Fly scenarios many times, with several controllers.')
-    scenario = {'nargs': '+', 'default': ['all'], 'metavar': 'NAME',
-                'help': f'{", ".join(names())}; a .yaml file of your own; or all, which is the '
-                'default'}
-    options = parsed(parser, args, {'--scenario': scenario, **_OPTIONS},
-                     valid={'runs': _COUNTS, 'jobs': _COUNTS, 'seed': _SEEDS})
+    parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
+                        help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
+                        'the default')
+    parser.add_argument('--controllers', nargs='+', choices=CONTROLLERS, metavar='NAME',
+                        default=list(CONTROLLERS), help=f'{", ".join(CONTROLLERS)}; a flock flies '
+                        f'{" and ".join(IN_FLOCKS)} only (all)')
+    parser.add_argument('--keys', action='store_true',
+                        help='print every key of a scenario file with its default and range')
+    parser.add_argument('--runs', type=within(Range(1, whole=True)), default=200,
+                        help='of each (%(default)s)')
+    parser.add_argument('--jobs', type=within(Range(1, whole=True)), default=os.cpu_count() or 1,
+                        help='processes (one per processor)')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead of '
+                        '--jobs processes here; it has the same results')
+    parser.add_argument('--seed', type=within(Range(0, whole=True)), default=0,
+                        help='%(default)s')
+    parser.add_argument('--output', type=Path, default='build/flights', metavar='FOLDER',
+                        help='%(default)s')
+    options = parser.parse_args(args)
     if options.keys:
         print(key_tables())
         return 0
@@ -133,22 +123,24 @@ def main(args: Sequence[str] | None = None) -> int:
 def _campaign(options: argparse.Namespace) -> int:
     scenarios = chosen(options.scenario)
     options.output.mkdir(parents=True, exist_ok=True)
-    results, exits = fly_all(scenarios, options.controllers, options.runs, options.jobs,
-                                  options.seed, options.scheduler)
+    flown = fly_all(scenarios, options.controllers, options.runs, options.jobs, options.seed,
+                    options.scheduler)
+    results = {name: {controller: summary(joined([part.runs for part in parts]))
+                      for controller, parts in of_scenario.items()}
+               for name, of_scenario in flown.items()}
     path = options.output / 'flights.json'
     write_summary(results, path)
-    print(table(results))
-    print(COLUMN_NOTES)
-    flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
+    print(f'{table(results)}\n{COLUMN_NOTES}')
+    flocks = [scenario.name for scenario in scenarios if scenario.flock is not None]
     if flocks:
-        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCK_NOTES}\n')
-    if any(exits.values()):
-        print('\nleft the band with law and guard:')
-    for name, lines in exits.items():
-        shown = lines if len(lines) <= MOST_EXITS else [
-            *lines[:MOST_EXITS], f'and {len(lines) - MOST_EXITS} more']
-        for line in shown:
-            print(f'  {shorten(name):<22}{line}')
+        print(f'\n{table({name: results[name] for name in flocks}, FLOCK_COLUMNS)}\n{FLOCK_NOTES}')
+    for name, of_scenario in flown.items():
+        parts = of_scenario.get('guard', next(iter(of_scenario.values())))
+        exits = [line for part in parts for line in part.exits]
+        for line in exits[:MOST_EXITS]:
+            print(f'{name}: left the band: {line}')
+        if len(exits) > MOST_EXITS:
+            print(f'{name}: left the band: {len(exits) - MOST_EXITS} more')
     print(f'\n{options.runs} runs each; written to {path}')
     return 0
 
@@ -169,38 +161,31 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
 
 
 def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int, jobs: int,
-            seed: int, scheduler: str = ''
-            ) -> tuple[Results, dict[str, list[str]]]:
+            seed: int, scheduler: str = '') -> dict[str, dict[str, list[Flown]]]:
     """
     Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
-    Return ``{scenario: {controller: {measure: value}}}``, and of each scenario, with law and guard
-    (without it, with the first controller), the runs that left the band.
+    Return what each task gave, by scenario and controller.
     """
-    def of_scenario(scenario: Scenario) -> list[str]:
-        return [name for name in controllers if scenario.flock is None or name in IN_FLOCKS
-                ] or [*IN_FLOCKS]
-
     first = seed * 1_000_000
     tasks = [Task(scenario, controller, range(first + k, first + min(k + size, runs)))
              for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
-             for controller in of_scenario(scenario) for k in range(0, runs, size)]
-    parts: dict[tuple[str, str], list[Flown]] = {}
-    flown = mapped(scheduler, _fly, tasks) if scheduler else pooled(jobs, _fly, tasks)
-    with Progress(len(scenarios)) as progress:
-        for name, group in groupby(tasks, lambda task: task.scenario.name):
-            progress.start(name)
-            its_tasks = list(group)
-            for number, task in enumerate(its_tasks, start=1):
-                parts.setdefault((name, task.controller), []).append(next(flown))
-                progress.share(number / len(its_tasks))
-    list(flown)  # ends the generator
-    shown = {s.name: parts[s.name, max(of_scenario(s), key=lambda name: name == 'guard')]
-             for s in scenarios}
-    return ({s.name: {name: summary(joined([part.runs for part in parts[s.name, name]]))
-                      for name in of_scenario(s)} for s in scenarios},
-            {name: [line for part in flown for line in part.exits]
-             for name, flown in shown.items()})
+             for controller in _controllers_of(scenario, controllers)
+             for k in range(0, runs, size)]
+    flown: dict[str, dict[str, list[Flown]]] = {}
+    with progress(len(tasks)) as bar:
+        for task, result in zip(tasks, computed(_fly, tasks, jobs, scheduler)):
+            bar.set_description_str(task.scenario.name)
+            bar.update()
+            of_scenario = flown.setdefault(task.scenario.name, {})
+            of_scenario.setdefault(task.controller, []).append(result)
+    return flown
+
+
+def _controllers_of(scenario: Scenario, controllers: Sequence[str]) -> list[str]:
+    """Return the controllers that fly a scenario: those of ``IN_FLOCKS`` only in a flock."""
+    return [name for name in controllers
+            if scenario.flock is None or name in IN_FLOCKS] or [*IN_FLOCKS]
 
 
 def table(results: Results,
@@ -209,16 +194,11 @@ def table(results: Results,
     rows = [['scenario', '', *(title for title, *_ in columns.values())],
             ['', '', *(f'[{unit}]' for _, unit, *_ in columns.values())]]
     for name, controllers in results.items():
-        for number, (controller, values) in enumerate(controllers.items()):
-            rows.append(['' if number else shorten(name), controller, *(
-                f'{values[key] * factor:.{digits}f}'
-                for key, (_, _, factor, digits) in columns.items())])
-    return '\n'.join(aligned(rows))
-
-
-def shorten(name: str) -> str:
-    """Return a name that leaves the table within 100 columns."""
-    return name if len(name) <= LONGEST_NAME else f'{name[:LONGEST_NAME - 1]}…'
+        rows += [[name[:LONGEST_NAME], controller, *(
+            f'{values[key] * factor:.{digits}f}'
+            for key, (_, _, factor, digits) in columns.items())]
+            for controller, values in controllers.items()]
+    return aligned(rows)
 
 
 def _fly(task: Task) -> Flown:

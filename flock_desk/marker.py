@@ -16,21 +16,21 @@
 ``ros2 run flock_follower marker --id 0 --dictionary DICT_4X4_50 --size 0.16 --output marker.pdf``.
 
 Draws markers to scale, one to a page, each with the white border that detection needs and a ruler,
-and prints the entry for the neighbours file. With ``--panel`` all are on one page, for one leader
-that is to be seen from near and from far: the largest on top, the others side by side below it.
-The panel's origin is the middle of the smallest: nearby, the camera sees little else, so it
-belongs at the height of the camera. Two runs write the same bytes.
+and prints the neighbours file. With ``--panel`` all are on one page, for one leader that is seen
+from near and from far: the largest on top, the smaller ones below it. The panel's origin is the
+middle of the smallest: nearby, the camera sees little else, so it belongs at the height of the
+camera. Two runs write the same bytes.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from io import BytesIO
-import math
 import pathlib
 import sys
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from matplotlib import style
 from matplotlib.backends.backend_pdf import Name, PdfPages
@@ -40,22 +40,15 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 import numpy as np
 
-from flock_desk.runs.console import guarded, Options, parsed
+from flock_desk.runs.console import guarded
 from flock_follower.files import whole_file
-from flock_follower.perception.markers import (
-    dictionary_size,
-    draw_marker,
-    marker_cells,
-    SIDE_LENGTHS,
-)
+from flock_follower.perception.markers import draw_marker, marker_cells, SIDE_LENGTHS
 
 #: Width and height, mm.
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}
 #: Sides of a panel, m: the first is seen from 1 to 8 m, the second from 0.3 to 2 m (640x480,
 #: 611 px).
 SIZES = (0.3, 0.06)
-TAIL = -0.2  # m on the leader's body: where the print is in config/neighbors.yaml
-
 # White around the black border is a cell wide, and no less than this share of the side: OpenCV 4.6
 # drops a square with another, here the paper's edge, within 0.05 of its perimeter.
 MIN_QUIET = 0.16
@@ -63,64 +56,24 @@ MARGIN = 5.0  # mm, along a page's edge where printers do not print
 LINE = 0.2  # mm
 CAPTION = (100.0, 30.0)  # mm, with the ruler, whose length is the caption's width
 INCH = 25.4  # mm
-POINTS = 72.0 / INCH  # the unit of text sizes, in a millimetre
 
 #: Left, top, width, height, mm, from the page's top-left corner.
 Box = tuple[float, float, float, float]
 _ENTRY = """\
-  - name: {name}
-    marker_id: {marker_id}
-    side_length: {side_length:g}  # m; measure the print
-    position: [-0.20, 0.0, 0.0]  # m, the marker's centre on the body: forward, left, up
-    rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
-_PANEL = """\
-  - name: leader
-    # Middles on the body, m: forward, left, up. Upright on the tail, facing backwards;
-    # the smallest at [-0.2, 0, 0], where the follower's camera looks when it is near.
-    markers:"""
-_PANEL_ENTRY = """\
-      - marker_id: {marker_id}
-        side_length: {side_length:g}  # m; measure the print
-        position: [{forward:.4f}, {left:.4f}, {up:.4f}]
-        rpy: [1.5707963, 0.0, -1.5707963]"""
-_OPTIONS: Options = {
-    '--id': {'type': int, 'nargs': '+', 'metavar': 'N',
-             'help': 'of the marker; several make several pages'},
-    '--panel': {'action': 'store_true',
-                'help': 'all markers on one page, for one leader: seen from far by the large '
-                'one, from near by the small (sizes 0.3 0.06, ids 0 1)'},
-    '--dictionary': {'default': 'DICT_4X4_50', 'help': 'one of OpenCV; %(default)s'},
-    '--size': {'type': float, 'nargs': '+', 'metavar': 'M',
-               'help': 'side of the black square, m; of a panel one for each id'},
-    '--output': {'type': pathlib.Path, 'default': pathlib.Path('marker.pdf'), 'metavar': 'FILE',
-                 'help': '.pdf; %(default)s'},
-    '--page': {'default': 'auto', 'metavar': 'NAME',
-               'help': f'{", ".join(PAGES)}, exact (as large as needed), or auto: the first of '
-               'them that holds it; %(default)s'}}
+{first}marker_id: {marker_id}
+{next}side_length: {side_length:g}  # m; measure the print
+{next}position: [-0.20, 0.0, {up:.4f}]  # m, the centre on the body: forward, left, up
+{next}rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
 
 
 class Placed(NamedTuple):
-    """A marker on a print: its side, m, and its middle from the print's top left corner, mm."""
+    """A marker on a print: its side, m, that with the white border and its middle's place, mm."""
 
     marker_id: int
     side_length: float
-    x: float
+    outer: float
     y: float
-
-
-class Print(NamedTuple):
-    """One marker or a panel, to be cut out: its size, mm, with white borders and corner marks."""
-
-    dictionary: str
-    width: float
-    height: float
-    markers: tuple[Placed, ...]
-
-    @property
-    def needed(self) -> tuple[float, float]:
-        """Return the least width and height of the page, mm."""
-        return (max(self.width, CAPTION[0]) + 2.0 * MARGIN,
-                self.height + CAPTION[1] + 2.0 * MARGIN)
+    """From the print's top edge down."""
 
 
 class Page(NamedTuple):
@@ -131,6 +84,7 @@ class Page(NamedTuple):
     that share an edge leave hairlines on a screen.
     """
 
+    name: str
     width: float
     height: float
     boxes: list[Box]
@@ -139,126 +93,86 @@ class Page(NamedTuple):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Write the file and return the exit code."""
-    parser = _Parser(prog='marker', description='Draw ArUco markers to scale, ready to print.')
-    return guarded(lambda: _write(parsed(parser, args, _OPTIONS)), refused=2)
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Raise the error: one line, without the usage."""
-        raise ValueError(message)
+    parser = argparse.ArgumentParser(
+        prog='marker', description='Draw ArUco markers to scale, ready to print.')
+    parser.add_argument('--id', type=int, nargs='+', default=[], metavar='N',
+                        help='of the marker; several make several pages')
+    parser.add_argument('--panel', action='store_true',
+                        help='all markers on one page, for one leader: seen from far by the large '
+                        'one, from near by the small (sizes 0.3 0.06, ids 0 1)')
+    parser.add_argument('--dictionary', default='DICT_4X4_50', help='one of OpenCV; %(default)s')
+    parser.add_argument('--size', type=float, nargs='+', default=[], metavar='M',
+                        help='side of the black square, m; of a panel one for each id')
+    parser.add_argument('--output', type=pathlib.Path, default='marker.pdf', metavar='FILE',
+                        help='.pdf; %(default)s')
+    return guarded(partial(_write, parser.parse_args(args)), refused=2)
 
 
 def _write(options: argparse.Namespace) -> int:
     """Write the file and print the neighbours file."""
+    ids, sizes = options.id, options.size
     if options.panel:
-        options.size = options.size or [*SIZES]
-        options.id = options.id or [*range(len(options.size))]
-    ids, sizes, dictionary = options.id or [], options.size or [], options.dictionary
-    missing = [f'--{name}' for name in ('id', 'size') if not getattr(options, name)]
-    dictionary_size(dictionary)
-    for wrong, fault in (
-            (missing, f'the following arguments are required: {", ".join(missing)}'),
-            (options.output.suffix.lower() != '.pdf',
-             f'output = {options.output}: must end in .pdf'),
-            (len(set(ids)) < len(ids), f'id = {ids}: must name each marker once'),
-            (options.panel and (len(ids) != len(sizes) or len(ids) < 2),
-             f'size = {sizes}: a panel takes one for each of at least two ids, {ids}'),
-            (not options.panel and len(sizes) > 1, f'size = {sizes}: several are for --panel')):
-        if wrong:
-            raise ValueError(fault)
+        sizes = sizes or [*SIZES]
+        ids = ids or [*range(len(sizes))]
+    if not ids or len(set(ids)) < len(ids):
+        raise ValueError(f'--id = {ids}: must name each marker once')
+    if len(sizes) != (len(ids) if options.panel else 1):
+        raise ValueError(f'--size = {sizes}: must be one side, of a panel one for each of {ids}')
+    if options.output.suffix.lower() != '.pdf':
+        raise ValueError(f'--output = {options.output}: must end in .pdf')
     for size in sizes:
-        SIDE_LENGTHS.check('size', size)
-    prints = [layout(dictionary, each, sizes) for each in (
-        [ids] if options.panel else [[marker_id] for marker_id in ids])]
-    page = choose_page(options.page, prints[0])
-    pages = [draw(each, page) for each in prints]
-    title_ids, title_sizes = (', '.join(f'{n:g}' for n in given) for given in (ids, sizes))
+        SIDE_LENGTHS.check('--size', size)
+    groups = [ids] if options.panel else [[marker_id] for marker_id in ids]
+    prints = [layout(options.dictionary, group, sizes) for group in groups]
+    pages = [draw(options.dictionary, markers) for markers in prints]
     with whole_file(options.output) as file:
-        file.write(pdf(pages, f'{dictionary} {title_ids}, {title_sizes} m'))
-    hint = '' if options.panel or page == 'A4' else (
-        f'; A4 holds up to {largest_on_a4(dictionary)} m')
-    print(f'{options.output}: page {page}, {pages[0].width:g} x {pages[0].height:g} mm{hint}',
+        file.write(pdf(pages, f'{options.dictionary} {ids}, {sizes} m'))
+    page = pages[0]
+    print(f'{options.output}: page {page.name}, {page.width:g} x {page.height:g} mm',
           file=sys.stderr)
-    print(panel_entry(prints[0]) if options.panel else entry(dictionary, ids, sizes[0]))
+    print(neighbors_file(options.dictionary, prints))
     return 0
 
 
-def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> Print:
-    """Return the print of markers of these sides, m, in the order of their ids."""
-    (first, large), *others = sorted(zip(ids, sizes), key=lambda pair: -pair[1])
-    top, *outers = [outer_side(dictionary, size) - 2.0 * LINE
-                    for size in (large, *(size for _, size in others))]
-    width = max(top, sum(outers)) + 2.0 * LINE
-    placed = [Placed(first, large, 0.5 * width, LINE + 0.5 * top)]
-    left = 0.5 * (width - sum(outers))
-    for (marker_id, size), outer in zip(others, outers):
-        placed.append(Placed(marker_id, size, left + 0.5 * outer, LINE + top + 0.5 * outer))
-        left += outer
-    return Print(dictionary, width, top + max(outers, default=0.0) + 2.0 * LINE, tuple(placed))
+def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> list[Placed]:
+    """Return markers of these sides, m, in the order of their ids, the largest on top."""
+    top, placed = LINE, []
+    for marker_id, size in sorted(zip(ids, sizes), key=lambda pair: -pair[1]):
+        quiet = max(1.0 / marker_cells(dictionary), MIN_QUIET)
+        outer = 1e3 * size * (1.0 + 2.0 * quiet)
+        placed.append(Placed(marker_id, size, outer, top + 0.5 * outer))
+        top += outer
+    return placed
 
 
-def outer_side(dictionary: str, side_length: float) -> float:
-    """Return the side, mm, of a marker with its white border and the corner marks around it."""
-    quiet = max(1.0 / marker_cells(dictionary), MIN_QUIET)
-    return 1e3 * side_length * (1.0 + 2.0 * quiet) + 2.0 * LINE
-
-
-def largest_on_a4(dictionary: str) -> float:
-    """Return the longest side, m, of a marker on A4, which its width limits."""
-    marks = 2.0 * LINE
-    side = (PAGES['A4'][0] - 2.0 * MARGIN - marks) / (outer_side(dictionary, 1.0) - marks)
-    return math.floor(1e3 * side) / 1e3
-
-
-def choose_page(page: str, cut_out: Print) -> str:
+def draw(dictionary: str, markers: Sequence[Placed]) -> Page:
     """
-    Return the page for a print.
+    Return markers, to be cut out together, on the smallest page that holds them.
 
-    ``page`` is a key of ``PAGES`` or 'exact', and then returned as it is, or 'auto' for the
-    smallest from A4 up.
-
-    :raises ValueError: for an unknown page, and one too small, naming one that is not.
+    :raises ValueError: for an unknown dictionary or id, and a print larger than all pages.
     """
-    if page not in (*PAGES, 'auto', 'exact'):
-        raise ValueError(f'page = {page!r}: must be one of auto, {", ".join(PAGES)}, exact')
-    width, height = cut_out.needed
-    fitting = [name for name, size in PAGES.items() if size[0] >= width and size[1] >= height]
-    if page == 'auto' and fitting:
-        return fitting[0]
-    if page in (*fitting, 'exact'):
-        return page
-    what = 'a marker of' if len(cut_out.markers) == 1 else 'a panel of'
-    sides = ' and '.join(f'{marker.side_length:g}' for marker in cut_out.markers)
-    raise ValueError(
-        f'page = {page!r}: {what} {sides} m with its white border and caption takes '
-        f'{math.ceil(width)} x {math.ceil(height)} mm; use --page {[*fitting, "exact"][0]}')
-
-
-def draw(cut_out: Print, page: str) -> Page:
-    """
-    Return a print on a page that :func:`choose_page` returned.
-
-    :raises ValueError: for an unknown dictionary or id.
-    """
-    width, height = cut_out.needed if page == 'exact' else PAGES[page]
-    left, top = 0.5 * (width - cut_out.width), MARGIN + 0.5 * (height - cut_out.needed[1])
-    ids = ', '.join(str(marker.marker_id) for marker in cut_out.markers)
-    sides = ', '.join(f'{1e3 * marker.side_length:g}' for marker in cut_out.markers)
-    many = 's' if len(cut_out.markers) > 1 else ''
-    texts, ruler = caption(
-        0.5 * (width - CAPTION[0]), top + cut_out.height,
-        f'{cut_out.dictionary}   id{many} {ids}   side{many} {sides} mm',
-        'Print at 100 % (actual size); do not fit to page.',
-        f'Check: this ruler is 100 mm, the black square{many} {sides} mm.',
-        'Cut at the corner marks, keep it flat: all markers are one print.' if many else
-        'Cut at the corner marks: the white border is part of it.')
-    boxes = [*corner_marks(left, top, cut_out.width, cut_out.height), *ruler]
-    for marker in cut_out.markers:
+    cut = markers[0].outer + 2.0 * LINE, markers[-1].y + 0.5 * markers[-1].outer + LINE
+    least = max(cut[0], CAPTION[0]) + 2.0 * MARGIN, cut[1] + CAPTION[1] + 2.0 * MARGIN
+    sides = ' and '.join(f'{1e3 * marker.side_length:g}' for marker in markers)
+    name = next((name for name, (width, height) in PAGES.items()
+                 if width >= least[0] and height >= least[1]), None)
+    if name is None:
+        raise ValueError(f'--size: {sides} mm with white border and caption take {least[0]:.0f} x '
+                         f'{least[1]:.0f} mm: must fit {[*PAGES][-1]}')
+    width, height = PAGES[name]
+    left, top = 0.5 * (width - cut[0]), MARGIN + 0.5 * (height - least[1])
+    texts, boxes = caption(
+        0.5 * (width - CAPTION[0]), top + cut[1],
+        f'{dictionary}   id {", ".join(str(marker.marker_id) for marker in markers)}   '
+        f'side {sides} mm', 'Print at 100 % (actual size); do not fit to page.',
+        f'Check: this ruler is 100 mm, the black square {sides} mm.',
+        'Cut at the corner marks, keep it flat: the white border is part of it.')
+    boxes += corner_marks(left, top, *cut)
+    for marker in markers:
         side = 1e3 * marker.side_length
-        boxes += cells_of(cut_out.dictionary, marker.marker_id, left + marker.x - 0.5 * side,
+        boxes += cells_of(dictionary, marker.marker_id, 0.5 * (width - side),
                           top + marker.y - 0.5 * side, side)
-    return Page(width, height, boxes, texts)
+    return Page(name, width, height, boxes, texts)
 
 
 def cells_of(dictionary: str, marker_id: int, left: float, top: float, side: float) -> list[Box]:
@@ -330,25 +244,24 @@ def _figure(page: Page) -> Figure:
         Path(np.reshape(corners, (-1, 2)), box * len(corners)), transform=transform,
         facecolor='black', linewidth=0.0, snap=False))
     for x, y, size, text in page.texts:
-        figure.text(x, y, text, transform=transform, size=size * POINTS)
+        figure.text(x, y, text, transform=transform, size=size * 72.0 / INCH)  # in points
     return figure
 
 
-def panel_entry(panel: Print) -> str:
-    """Return the neighbours file of a leader that carries a panel on its tail."""
-    origin = min(panel.markers, key=lambda marker: marker.side_length)
-    return '\n'.join([
-        f'dictionary: {panel.dictionary}', 'neighbors:', _PANEL,
-        *(_PANEL_ENTRY.format(
-            **marker._asdict(), forward=TAIL, left=1e-3 * (origin.x - marker.x) + 0.0,
-            up=1e-3 * (origin.y - marker.y) + 0.0) for marker in panel.markers)])
-
-
-def entry(dictionary: str, ids: Sequence[int], side_length: float) -> str:
-    """Return the neighbours file for these markers, each on a neighbour's tail."""
-    return '\n'.join([f'dictionary: {dictionary}', 'neighbors:', *(
-        _ENTRY.format(name='leader' if len(ids) == 1 else f'drone{marker_id}',
-                      marker_id=marker_id, side_length=side_length) for marker_id in ids)])
+def neighbors_file(dictionary: str, prints: Sequence[Sequence[Placed]]) -> str:
+    """Return the neighbours file of leaders that each carry a print on the tail."""
+    lines = [f'dictionary: {dictionary}', 'neighbors:']
+    for markers in prints:
+        name = 'leader' if len(prints) == 1 else f'drone{markers[0].marker_id}'
+        lines.append(f'  - name: {name}')
+        first = indent = '    '
+        if len(markers) > 1:
+            lines.append('    markers:')
+            first, indent = '      - ', '        '
+        lines += [_ENTRY.format(
+            first=first, next=indent, marker_id=marker.marker_id, side_length=marker.side_length,
+            up=1e-3 * (markers[-1].y - marker.y)) for marker in markers]
+    return '\n'.join(lines)
 
 
 if __name__ == '__main__':

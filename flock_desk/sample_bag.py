@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor, T_BODY_OPTICAL
-from flock_desk.runs.console import guarded, Options, parsed, Progress
-from flock_desk.runs.processes import pooled
+from flock_desk.runs.console import guarded, progress, within
+from flock_desk.runs.processes import computed
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
@@ -217,7 +217,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     recording = _recording(variant, seed)
     count = len(recording.image_stamps_ns)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix='.writing-') as scratch:
-        images = pooled(jobs, partial(_rendered, variant, seed), range(count))
+        images = computed(partial(_rendered, variant, seed), range(count), jobs)
         with BagWriter(Path(scratch) / out.name) as bag:
             for message in recording.messages(_counted(images, count, out.name)):
                 bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
@@ -236,11 +236,11 @@ def _rendered(variant: Variant, seed: int, k: int) -> BagMessage:
 
 def _counted(images: Iterable[BagMessage], count: int, name: str) -> Iterator[BagMessage]:
     """Yield the images, showing how many have been."""
-    with Progress(1) as progress:
-        progress.start(f'{name}, {count} images')
-        for done, image in enumerate(images, start=1):
+    with progress(count) as bar:
+        bar.set_description_str(f'{name}, {count} images')
+        for image in images:
             yield image
-            progress.share(done / count)
+            bar.update()
 
 
 def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,
@@ -260,24 +260,20 @@ def _seconds(stamp_ns: int) -> float:
     return (stamp_ns - START_NS) * 1e-9
 
 
-_OPTIONS: Options = {
-    '--variant': {'nargs': '+', 'choices': [*VARIANTS, 'all'], 'default': ['sample'],
-                  'metavar': 'NAME', 'help': f'which: {", ".join(VARIANTS)} or all '
-                  '(default: sample)'},
-    '--out': {'type': Path, 'help': 'folder that will hold the bags (default: bags '
-              'for sample, build/bags for the others)'},
-    '--seed': {'type': int, 'default': 1, 'help': 'of all that is random (default: 1)'},
-    '--jobs': {'type': int, 'default': os.cpu_count() or 1,
-               'help': 'processes that render (default: one per processor)'}}
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 1 after an error."""
-    repository = Path(__file__).resolve().parents[2]
-    options = parsed(argparse.ArgumentParser(
+    repository = Path(__file__).resolve().parents[1]
+    parser = argparse.ArgumentParser(
         prog='sample', description='Render a flight and write it as a bag.',
-        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items())),
-        args, _OPTIONS, valid={'jobs': Range(1, whole=True)})
+        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items()))
+    parser.add_argument('--variant', nargs='+', choices=[*VARIANTS, 'all'], default=['sample'],
+                        metavar='NAME', help=f'{", ".join(VARIANTS)} or all (default: sample)')
+    parser.add_argument('--out', type=Path, help='folder that will hold the bags (default: bags '
+                        'for sample, build/bags for the others)')
+    parser.add_argument('--seed', type=int, default=1, help='of all that is random (%(default)s)')
+    parser.add_argument('--jobs', type=within(Range(1, whole=True)), default=os.cpu_count() or 1,
+                        help='processes that render (default: one per processor)')
+    options = parser.parse_args(args)
 
     def render() -> int:
         for name in VARIANTS if 'all' in options.variant else options.variant:

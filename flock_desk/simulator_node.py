@@ -63,7 +63,7 @@ from flock_follower.bags.live_line import LiveLine
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
@@ -320,10 +320,8 @@ class Simulator(FlockNode):
             late = now - self._step_due()
             return None if late < LATE else (
                 ERROR, f'{late:.1f} s late: this machine is too slow, or too busy')
-        if stalled := self._external.stalled(now, self._flight.time_ns):
-            return ERROR, stalled
-        slow = self._external.slow(now)
-        return (WARN, slow) if slow else None
+        stalled = self._external.stalled(now, self._flight.time_ns)
+        return (ERROR, stalled) if stalled else None
 
     def _watch(self, now: float) -> None:
         """

@@ -20,7 +20,6 @@ for each fault, and all that ``flock_desk.autopilot`` takes; ``--truth HOST:PORT
 listener who asks for the true pose, as the real simulators send it.
 """
 
-import argparse
 from dataclasses import dataclass
 import heapq
 import itertools
@@ -33,7 +32,6 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
-from flock_desk.runs.console import parsed
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
@@ -210,9 +208,10 @@ class TruthLink:
 
 
 def main():
-    options, start = parsed(argparse.ArgumentParser(), None, {
-        **autopilot.OPTIONS, '--truth': {'default': ''},
-        '--fault': {'action': 'append', 'default': [], 'type': json.loads}}), time.monotonic()
+    parser, start = autopilot.parser(), time.monotonic()
+    parser.add_argument('--truth', default='')
+    parser.add_argument('--fault', action='append', default=[], type=json.loads)
+    options = parser.parse_args()
     flown = FaultyAutopilot(now=start, faults=[Fault(**fault) for fault in options.fault],
                             **autopilot.settings(options))
     ends = [autopilot.Endpoint(autopilot.loopback_address(options.connect), flown)]

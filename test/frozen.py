@@ -198,23 +198,14 @@ def write(part: str, rows: Table) -> None:
     print(f'{part}: {len(rows) - 1} rows frozen')
 
 
-def differences(before: Table, after: Table, tolerance: float) -> list[str]:
-    """Return every figure that differs by more than a tolerance, before and after."""
+def differences(before: Table, after: Table) -> list[str]:
+    """Return every figure that differs, before and after."""
     columns, found = before.get('', []), []
     for name in {**before, **after}:
         figures = zip_longest(before.get(name, []), after.get(name, []), fillvalue='none')
-        for k, (old, new) in enumerate(figures):
-            if not _same(old, new, tolerance):
-                figure = columns[k] if k < len(columns) else f'figure {k + 1}'
-                found.append(f'{name}: {figure}: {old} -> {new}')
+        found += [f'{name}: {columns[k] if k < len(columns) else k + 1}: {old} -> {new}'
+                  for k, (old, new) in enumerate(figures) if old != new]
     return found
-
-
-def _same(old: str, new: str, tolerance: float) -> bool:
-    try:
-        return old == new or abs(float(old) - float(new)) <= tolerance
-    except ValueError:
-        return False
 
 
 def main() -> int:
@@ -225,37 +216,25 @@ def main() -> int:
     parser.add_argument('--runs', type=int, default=200, help='of each scenario (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
                         help='processes (one per processor)')
-    parser.add_argument('--tolerance', type=float, default=0.0,
-                        help='largest difference of a number that counts as none (%(default)s)')
     options = parser.parse_args()
     if unknown := {*options.parts} - {*PARTS}:
         parser.error(f'no such part: {", ".join(unknown)}')
-    if not (options.write or FOLDER.exists()):
-        print('nothing frozen: run make freeze')
-        return 1
     different = 0
     for part in options.parts or PARTS:
         before = {} if options.write else read(part)
-        if not options.write and not before:
-            print(f'{part}: nothing frozen: run make freeze')
-            different += 1
-            continue
-        if part == 'flights' and not options.write:  # only runs that both have
-            frozen = sum(name.startswith(f'{SCENARIOS[0]} ') for name in before)
-            options.runs = min(options.runs, frozen)
+        if part == 'flights' and before:  # only runs that both have
+            options.runs = min(options.runs, max(
+                int(name.split()[-1]) for name in before if name) + 1)
             before = {name: row for name, row in before.items()
                       if not name or int(name.split()[-1]) < options.runs}
         after = PARTS[part](options)
-        if not after:
-            continue
-        if options.write:
+        if options.write and after:
             write(part, after)
-            continue
-        found = differences(before, after, options.tolerance)
-        different += len(found)
-        for each in found:
-            print(f'{part}: {each}')
-        print(f'{part}: {len(after) - 1} rows compared, {len(found)} figures differ', flush=True)
+        elif after:
+            found = differences(before, after) if before else [f'{part}: run make freeze']
+            different += len(found)
+            print('\n'.join([*(f'{part}: {each}' for each in found), f'{part}: {len(after) - 1} '
+                             f'rows compared, {len(found)} figures differ']), flush=True)
     return 1 if different else 0
 
 

@@ -26,7 +26,7 @@ nothing else.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 import math
 import select
@@ -54,7 +54,7 @@ SLOW_RATE: Final[float] = 2.0
 """Hz, of slow values."""
 LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
-"""s between looks whether it comes at half the rate at least; else it is asked for again."""
+"""s between requests of the messages."""
 TRUTH_TIMEOUT: Final[float] = 6.0
 """s of received messages without a truth, after which the estimate is used."""
 POSE_TIMEOUT: Final[float] = 30.0
@@ -63,10 +63,6 @@ LATE: Final[float] = 0.5
 """s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
 """s without a pose of the follower after which there is nothing to simulate."""
-PACE_WINDOW: Final[float] = 5.0
-"""s over which the time of an autopilot is compared with ours."""
-SLOW: Final[float] = 0.95
-"""Least pace relative to the own clock: a slower simulator is less agile than its model."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 # The truth of each; an autopilot may complain of messages that it does not know.
@@ -91,8 +87,7 @@ class ExternalAutopilot:
         self._arrived: deque[tuple[Any, int]] = deque(maxlen=10_000)
         self._news = threading.Event()
         self._stopping = False
-        self._counts: Counter[str] = Counter()
-        self._next_question = 0.0
+        self._next_request = 0.0
         self._first_received = 0.0
         self._thread = threading.Thread(target=self._listen, name='truth', daemon=True)
         self._thread.start()
@@ -124,7 +119,8 @@ class ExternalAutopilot:
             now, newest = time.monotonic(), self.motion.newest
             if newest is not None and self.motion.knows(newest):
                 return
-            if self._truth_is_late(now):
+            received = self._first_received and now - self._first_received
+            if received > TRUTH_TIMEOUT and not self.motion.source:
                 if why_truth:
                     raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
                                      f'estimate will not do where {why_truth}')
@@ -150,11 +146,6 @@ class ExternalAutopilot:
         status = self._link.telemetry.status
         return '' if status is None else status.mode
 
-    def _truth_is_late(self, now: float) -> bool:
-        """Return whether messages have come for long without any truth."""
-        return bool(self._first_received and now - self._first_received > TRUTH_TIMEOUT
-                    and not self.motion.source)
-
     def silence(self) -> str:
         """Return, for people, why there is no pose."""
         link = self._link
@@ -162,10 +153,10 @@ class ExternalAutopilot:
             return link.transport.fault
         if link.telemetry.dialect is None:
             return link.silence()
-        title, name = link.telemetry.dialect.title, link.telemetry.dialect.name
-        return (f'{title} is connected, but sends no {_TRUTH_OF.get(name, "truth")}'
-                if self.motion.source != ESTIMATE
-                else f'{title} is connected, but sends no {ESTIMATE}: it has no position')
+        dialect = link.telemetry.dialect
+        missing = f'{ESTIMATE}: it has no position' if self.motion.estimated else (
+            _TRUTH_OF.get(dialect.name, 'truth'))
+        return f'{dialect.title} is connected, but sends no {missing}'
 
     def close(self) -> None:
         """End the thread and release the port."""
@@ -185,31 +176,27 @@ class ExternalAutopilot:
             now_ns = time.monotonic_ns()
             now = now_ns * 1e-9
             messages = self._link.receive(now)
-            for message in messages:
-                self._counts[message.get_type()] += 1
-                self._arrived.append((message, now_ns))
+            self._arrived.extend((message, now_ns) for message in messages)
             if messages:
                 self._first_received = self._first_received or now
                 self._news.set()
-            if now >= self._next_question:
-                self._ask(now)
+            if now >= self._next_request:
+                self._request(now)
 
-    def _ask(self, now: float) -> None:
-        """Request messages that come at less than half their rate."""
+    def _request(self, now: float) -> None:
+        """Request the messages that place the vehicle; a link that was lost is requested again."""
         dialect = self._link.telemetry.dialect
         if dialect is None:
             return
-        self._next_question = now + ASK_PERIOD
+        self._next_request = now + ASK_PERIOD
         rates = {CLOCK: SLOW_RATE, LANDED: SLOW_RATE}
-        if self.motion.source == ESTIMATE:
+        if self.motion.estimated:
             rates |= {ESTIMATE: POSE_RATE, ATTITUDE: POSE_RATE}
         elif dialect.name in _TRUTH_OF:
             rates[_TRUTH_OF[dialect.name]] = POSE_RATE
         for name, rate in rates.items():
-            if self._counts[name] < 0.5 * rate * ASK_PERIOD:
-                self._link.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                                        (getattr(mavlink, f'MAVLINK_MSG_ID_{name}'), 1e6 / rate))
-        self._counts.clear()
+            self._link.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+                                    (getattr(mavlink, f'MAVLINK_MSG_ID_{name}'), 1e6 / rate))
 
 
 class ExternalVehicles:
@@ -285,10 +272,3 @@ class ExternalVehicles:
             elif time_ns > 2 * LONGEST_GAP and not link.motion.knows(at):  # one pose at first
                 problems.append(f'poses of the {name} come too far apart: {lacking} between them')
         return '; '.join(problems)
-
-    def slow(self, now: float) -> str:
-        """Return, for people, whose simulator is too slow; '' if none is."""
-        paces = ((name, link.motion.pace(now - PACE_WINDOW)) for name, link in self._links)
-        return '; '.join(
-            f'the time of the autopilot of the {name} goes at {pace:.2f} of ours: its simulator '
-            'is too slow, or this machine too busy' for name, pace in paces if pace < SLOW)

@@ -52,9 +52,6 @@ SMOOTHING: Final[float] = 1.0
 JUMP: Final[float] = 0.5
 """Largest difference of integrated and reported place, m; a larger one is a jump."""
 _DEGREE = 111_320.0  # m along a meridian
-_WRAP = 2**32  # ms of time_boot_ms, 50 days
-_RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clocks differ
-_REBOOT = 1_000  # ms back of time_boot_ms that mean a reboot
 
 
 class Motion(NamedTuple):
@@ -72,37 +69,6 @@ class Motion(NamedTuple):
     """(3,), rad/s, FLU."""
 
 
-class BootClock:
-    """
-    Converts stamps of the autopilot's clock, ``time_boot_ms``, to the own clock.
-
-    The quickest recent message gives the offset of the clocks; a slower one was late.
-    """
-
-    def __init__(self) -> None:
-        self._last: int | None = None
-        self._boot = 0  # ms since boot, unwrapped
-        self._offset = math.inf  # s, ours less the autopilot's
-        self._received = 0.0
-        self.rebooted = False
-        """Whether the newest message is the first one after a reboot."""
-
-    def stamp(self, time_boot_ms: int, now: int) -> int:
-        """Return the stamp of a message received now, ns of the own clock."""
-        if self._last is not None:
-            step = (time_boot_ms - self._last + _WRAP // 2) % _WRAP - _WRAP // 2
-            self.rebooted = step < -_REBOOT
-            if self.rebooted:
-                self._offset, step = math.inf, 0
-            self._boot += step
-        self._last = time_boot_ms
-        seconds = now * 1e-9
-        self._offset = min(self._offset + _RISE * (seconds - self._received),
-                           seconds - self._boot * 1e-3)
-        self._received = seconds
-        return round((self._offset + self._boot * 1e-3) * 1e9)
-
-
 class ExternalMotion:
     """
     The motion of one vehicle at any time of the last second, from messages as they come.
@@ -117,7 +83,6 @@ class ExternalMotion:
         """Own time and the autopilot's since it booted, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
-        self._clock = BootClock()
         self.origin: Array | None = None
         """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""
 
@@ -154,14 +119,6 @@ class ExternalMotion:
     def newest(self) -> int | None:
         """Return until when, ns, the motion is known; None before anything is."""
         return self._poses[-1].time if self._poses else None
-
-    def pace(self, since: float) -> float:
-        """Return the rate of the autopilot's time to the own time since an own time, s, or NaN."""
-        recent = [sample for sample in self.times[-20:] if sample[0] >= since]
-        if len(recent) < 2 or recent[-1][0] - recent[0][0] < 1.0:
-            return math.nan
-        (ours, theirs), (ours_last, theirs_last) = recent[0], recent[-1]
-        return (theirs_last - theirs) / (ours_last - ours)
 
     def knows(self, time: int) -> bool:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
@@ -224,21 +181,18 @@ class ExternalMotion:
                          north * _DEGREE, up])
 
     def _estimate(self, message: Any, now: int) -> None:
-        time = self._clock.stamp(message.time_boot_ms, now)
-        if self._clock.rebooted:
-            self._poses.clear()
         turned, self._turned = self._turned, None
         if turned is None:
             return  # an attitude that stalls places nothing
         position = ned_to_enu([message.x, message.y, message.z])
         if self.origin is None:
             self.origin = position
-        self.add(Motion(time, position - self.origin,
-                        ned_to_enu([message.vx, message.vy, message.vz]), *turned))
+        self._place(now, position - self.origin,
+                    ned_to_enu([message.vx, message.vy, message.vz]), turned)
 
     def _place(self, now: int, reported: Array, velocity: Array,
                turned: tuple[Array, Array]) -> None:
-        """Add a place given in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
+        """Add a place by the time of arrival, smoothed by the velocity: its step is 1e-7 deg."""
         position = reported
         if self._poses:
             last = self._poses[-1]

@@ -13,46 +13,35 @@
 # limitations under the License.
 
 
-"""Commands on the console: their options, errors and exit codes, progress, tables."""
+"""Commands on the console: the ranges of their options, exit codes, progress, tables."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import sys
-from typing import Any
+from typing import TYPE_CHECKING
 
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_follower.bags.live_line import LOG_PERIOD, TERMINAL_PERIOD
 from flock_follower.ranges import Range
 
-WIDTH = 100  # characters of a bar
-Options = Mapping[str, Mapping[str, Any]]
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+WIDTH = 100  # characters of a line
 
 
-def parsed(parser: argparse.ArgumentParser, args: Sequence[str] | None,
-           options: Options, groups: Mapping[str, Options] | None = None,
-           valid: Mapping[str, Range] | None = None) -> argparse.Namespace:
-    """
-    Return the values of a command's options; a wrong one ends the program with exit code 2.
-
-    :param options: what ``add_argument`` takes, by the name of the option.
-    :param groups: likewise more options, by the title of their group in the help.
-    :param valid: the values of a number, by the name of the option without dashes.
-    """
-    sections: list[tuple[Any, Options]] = [
-        (parser, options),
-        *((parser.add_argument_group(title), rows) for title, rows in (groups or {}).items())]
-    for section, rows in sections:
-        for name, row in rows.items():
-            section.add_argument(name, **row)
-    values = parser.parse_args(args)
-    try:
-        for name, numbers in (valid or {}).items():
-            numbers.check(f'--{name}', getattr(values, name))
-    except ValueError as error:
-        parser.error(str(error))
-    return values
+def within(valid: Range) -> Callable[[str], float]:
+    """Return the type of an option for ``add_argument``: a number in a range."""
+    def number(text: str) -> float:
+        try:
+            value = int(text) if valid.whole else float(text)
+            valid.check('the value', value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return value
+    return number
 
 
 def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int:
@@ -84,40 +73,17 @@ def explained(error: Exception) -> str:
     return ' '.join(str(error).split())
 
 
-def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> str:
     """Return rows as lines of columns two apart, the first ``left`` of them flush left."""
     widths = [max(map(len, column)) for column in zip(*rows)]
-    return ['  '.join(cell.ljust(width) if n < left else cell.rjust(width)
-                      for n, (cell, width) in enumerate(zip(row, widths))).rstrip()
-            for row in rows]
+    return '\n'.join('  '.join(
+        cell.ljust(width) if n < left else cell.rjust(width)
+        for n, (cell, width) in enumerate(zip(row, widths))).rstrip() for row in rows)
 
 
-class Progress:
-    """The progress through a number of jobs of equal weight: a bar on stderr, also in a pipe."""
-
-    def __init__(self, jobs: int) -> None:
-        from tqdm import tqdm
-        period = TERMINAL_PERIOD if sys.stderr.isatty() else LOG_PERIOD
-        self._bar = tqdm(
-            total=jobs, file=sys.stderr, mininterval=period, ncols=WIDTH, desc='begin',
-            bar_format='{desc}: {percentage:3.0f} % |{bar}| {elapsed}<{remaining}')
-        self._done = -1
-
-    def start(self, name: str) -> None:
-        """Begin the next job, the one before being done."""
-        self._done += 1
-        self._bar.set_description_str(name, refresh=False)
-        self.share(0.0)
-
-    def share(self, share: float) -> None:
-        """Show that a share, 0 to 1, of the present job is done, if it is time for it."""
-        self._bar.update(self._done + share - self._bar.n)
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, error: object, *_: object) -> None:
-        """End the last job; after an error leave the bar: later output begins on a new line."""
-        if error is None:
-            self.share(1.0)
-        self._bar.close()
+def progress(jobs: int) -> tqdm[None]:
+    """Return a bar on stderr for a number of jobs, also in a pipe; ``desc`` names the present."""
+    from tqdm import tqdm
+    return tqdm(total=jobs, file=sys.stderr, ncols=WIDTH,
+                mininterval=TERMINAL_PERIOD if sys.stderr.isatty() else LOG_PERIOD,
+                bar_format='{desc}: {percentage:3.0f} % |{bar}| {elapsed}<{remaining}')

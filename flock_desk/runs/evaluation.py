@@ -23,10 +23,9 @@ mode from the first message on; its autopilot's own velocity and yaw are in no b
 
 from __future__ import annotations
 
-from array import array
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 import math
 from pathlib import Path
 import tempfile
@@ -35,7 +34,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_desk.runs.frame_errors import FrameErrors
+from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
@@ -60,7 +59,6 @@ from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
     from_range,
-    Make,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
@@ -83,6 +81,7 @@ STATES = tuple(state.value for state in State)
 #: What the autopilot is taken to be while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
+IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')
 TRUTHS: Final = ('truth/odom', 'truth/neighbors')
 #: Where a message with a header goes on after encapsulation and stamp.
@@ -91,7 +90,7 @@ _NOTHING = (math.nan,) * 3
 
 
 def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
-                several: Iterable[CameraValues] = ()) -> dict[str, tuple[str, str]]:
+                several: Sequence[CameraValues] = ()) -> dict[str, tuple[str, str]]:
     """
     Return the topics of a bag that a follower uses, and the truth.
 
@@ -101,172 +100,139 @@ def topics_used(bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None 
     :param several: cameras with topics of their own, in place of the only one.
     :returns: our name of each topic, ``image_raw`` for all images, and the camera's name, ''
         of the only one.
-    :raises BagError: naming a topic that is missing, or of another type, and those that it may be.
+    :raises BagError: naming topics that are missing, or of another type, and those that may be.
     """
-    remaps, kinds = remaps or {}, (RAW_IMAGES, COMPRESSED_IMAGES)
+    remaps = remaps or {}
     names = names_there(namespace, remaps)
     images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
     published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
-    # If images are named, others that happen to be in the bag are not meant.
-    meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
-    # Our name, the camera's, and the topics that it may be, each with the type that it must have.
-    wanted: list[tuple[str, str, dict[str, str]]] = [
-        (ours, camera.name, {full: published.get(full, '') for full in (
-            full_name(name, namespace) for name in choice)})
+    # If images are named, others that happen to be in the bag are not used.
+    images = [full_name(remaps[kind], namespace) for kind in IMAGES if kind in remaps]
+    # Our name, the camera's, and the topics that it may be.
+    wanted: list[tuple[str, str, list[str]]] = [
+        (ours, camera.name, [full_name(name, namespace) for name in choice])
         for camera in several for ours, choice in (
             (RAW_IMAGES, [camera.images('raw'), camera.images('compressed')]),
             ('camera_info', [camera.camera_info]))]
-    if not wanted:
-        wanted.append((RAW_IMAGES, '', {names[kind]: TYPES[kind] for kind in kinds
-                                        if not meant or names[kind] in meant}))
-        wanted.append(('camera_info', '', {names['camera_info']: TYPES['camera_info']}))
-    wanted += [(ours, '', {names[ours]: TYPES[ours]}) for ours in ('odom', *TRUTHS, 'ranges')]
-
-    def offered(ours: str) -> str:
-        same = kinds if ours == RAW_IMAGES else (ours,)
-        offers = offer(ours, published, [n for name, n in names.items() if name not in same])
-        return f'; {offers}' if offers else ''
-
+    wanted = wanted or [(RAW_IMAGES, '', images or [names[kind] for kind in IMAGES]),
+                        ('camera_info', '', [names['camera_info']])]
+    wanted += [(ours, '', [names[ours]]) for ours in ('odom', *TRUTHS, 'ranges')]
     used: dict[str, tuple[str, str]] = {}
-    missing: dict[str, str] = {}
+    faults: dict[str, str] = {}
     for ours, camera_name, choices in wanted:
         full = next((full for full in choices if full in published), '')
-        if full and published[full] != choices[full]:
-            raise BagError(f'{bag.path}: {full} holds {published[full]}, not {choices[full]}'
-                           f'{offered(ours)}')
-        if full:
+        types = [TYPES[kind] for kind in (IMAGES if ours == RAW_IMAGES else (ours,))]
+        if full and published[full] in types:
             used[full] = ours, camera_name
-        elif camera_name:
-            raise BagError(f'{bag.path}: holds no message on {next(iter(choices))} of '
-                           f'camera {camera_name}, only on {", ".join(published)}')
+        elif full:
+            faults[ours] = f'{full} holds {published[full]}, not {types[0]}'
         elif ours in NEEDED:
-            missing[ours] = ' or '.join(meant if ours == RAW_IMAGES and meant else choices)
-    if missing:
-        raise BagError(f'{bag.path}: holds no message on {", ".join(missing.values())}, only on '
-                       f'{", ".join(published)}{"".join(map(offered, missing))}')
+            whose = f' of camera {camera_name}' if camera_name else ''
+            faults[ours] = f'no message on {" or ".join(choices)}{whose}'
+    if faults:
+        offers = filter(None, (offer(ours, published, used) for ours in faults))
+        raise BagError(f'{bag.path}: ' + '; '.join(
+            [*faults.values(), f'it holds {", ".join(published)}', *offers]))
     whole = all(names[truth] in used for truth in TRUTHS)
     return {full: use for full, use in used.items() if whole or use[0] not in TRUTHS}
 
 
-class RecordedFlight:
+class Evaluation(Listener):
     """
-    Feeds a follower from the messages of a bag, CDR bytes with the time of recording in ns.
+    A follower fed from the messages of a bag, and the record of its run.
+
+    ``cpu`` holds CPU times, s, by stage; ``frames`` counts the images. ``tick_rows``: time, s
+    since the first message, index of the state in STATES, norm of the commanded acceleration (NaN:
+    none), own speed. ``reasons`` has the time and the reason of every tick in HOLD.
+    ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
 
     :param values: the checked values of every parameter, by node, see ``TABLE``.
-    :param listener: receives the events of the flight.
-    :param make: returns an empty message of a type.
-    :param cpu_time: see ``Follower``.
     :raises ValueError: if values do not fit together, or the neighbours file is wrong.
     :raises OSError: if the neighbours file cannot be read.
     """
 
-    def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,
-                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+    def __init__(self, bag: Bag, values: dict[str, dict[str, Any]], writer: BagWriter) -> None:
         perception, bridge = values['relative_pose'], values['mavlink_bridge']
+        self.bag, self.writer = bag, writer
+        self.duration = bag.duration_ns / NANOSECONDS
+        self.params = planner_table.build(values['planner'])
         self.perceiver = Perceiver(
             relative_pose_table.build(perception), max_wait=perception['max_wait'])
-        self.planner_params = planner_table.build(values['planner'])
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
-            PlannerLoop(), self.planner_params, Gate(
+            PlannerLoop(), self.params, Gate(
                 filled(GateLimits(), bridge), bridge['velocity_source']),
-            listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
+            self, empty, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy={camera.name: camera.rpy for camera in cameras(values['planner'])},
-            cpu_time=cpu_time)
+            cpu_time=time.process_time)
         self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
-        self._listener = listener
+        self.own: OwnMotion | None = None
+        """Filled for the rules of ``check``."""
+        self.findings: list[Finding] = []
+        """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
+        self.neighbors = self.perceiver.tracker.config.neighbors
+        self.errors = FrameErrors(self.neighbors, {
+            camera.name: camera_mounting(camera.position, camera.rpy)
+            for camera in cameras(perception)}, bag.start_ns)
+        self.wall_time = 0.0
+        self.cpu: defaultdict[str, list[float]] = defaultdict(list)
+        self.frames = 0
+        self.tick_rows: list[tuple[float, ...]] = []
+        self.setpoint_rows: list[tuple[float, ...]] = []
+        self.rejections, self.setpoint_kinds, self.brake_reasons = (
+            Counter[str](), Counter[str](), Counter[str]())
+        self.reasons: list[tuple[float, str]] = []
         self._calibrations: dict[str, bytes] = {}
-        self._began = False
 
     def take(self, name: str, time: int, msgtype: str, data: bytes, camera: str = '',
              message: Any = None, pixels: GrayImage | None = None) -> None:
         """
         Take a message of our topic ``name``; bytes that are no message of the type are counted.
 
+        :param time: when it was recorded, ns.
         :param camera: the name of the camera, if there are several.
         :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
         """
-        if not self._began:
-            self._began = True
-            self.follower.engage(time, True)
-            self.follower.permit(time, -math.inf)
-            self.follower.vehicle(time, FLYING)
-        if name == 'camera_info':
-            calibration = data[_AFTER_STAMP:]
-            if calibration == self._calibrations.get(camera):
-                return  # all but the first, usually
-            self._calibrations[camera] = calibration
         try:
-            if message is None:
-                message = read_odometry(data) if name == 'odom' else deserialize(data, msgtype)
-            if name == 'camera_info':
-                self.follower.camera_info(time, message, camera)
-            elif name == 'odom':
-                state = self.source.take(message, time)
-            elif name == 'ranges':
-                measured = from_range(message)
-            else:
-                stamp = read_stamp(message.header.stamp)
+            if name == 'odom':
+                self._take_odometry(time, read_odometry(data) if message is None else message)
+            elif name != 'camera_info' or self._is_new(camera, data[_AFTER_STAMP:]):
+                message = deserialize(data, msgtype) if message is None else message
+                if name == 'camera_info':
+                    self.follower.camera_info(time, message, camera)
+                elif name == 'ranges':
+                    self.follower.range(time, from_range(message))
+                else:
+                    self.follower.image(time, message if pixels is None else pixels,
+                                        read_stamp(message.header.stamp), camera)
         except ValueError as error:
             self.follower.advance(time)
-            self._listener.rejected(
-                INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
+            self.rejected(INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
             if name == RAW_IMAGES:
-                self._listener.image(ImageOutcome(time, camera=camera))
-            return
-        if name == 'odom':
-            for event in self.source.new_events():
-                self._listener.rejected(*event)
-            if state is not None:
-                self.follower.odometry(time, state)
-        elif name == 'ranges':
-            self.follower.range(time, measured)
-        elif name == RAW_IMAGES:
-            self.follower.image(time, message if pixels is None else pixels, stamp, camera)
+                self.image(ImageOutcome(time, camera=camera))
 
+    def _take_odometry(self, time: int, message: Any) -> None:
+        state = self.source.take(message, time)
+        for event in self.source.new_events():
+            self.rejected(*event)
+        if state is not None:
+            self.follower.odometry(time, state)
 
-@dataclass
-class Evaluation(Listener):
-    """
-    The record of a run: a few numbers for each image, tick and setpoint.
+    def _is_new(self, camera: str, calibration: bytes) -> bool:
+        """Return whether a calibration differs from the last one of its camera; most do not."""
+        before, self._calibrations[camera] = self._calibrations.get(camera), calibration
+        return calibration != before
 
-    ``cpu`` holds CPU times, s, by stage; ``frames`` the time of each image, s since the first
-    message, ``frame_cpu`` perception's CPU time for it, s. ``tick_rows``: time, index of the state
-    in STATES, norm of the commanded acceleration (NaN: none), own speed. ``reasons`` has the time
-    and the reason of every tick in HOLD. ``setpoint_rows``: time, the acceleration sent (NaN:
-    none), 1 for a command.
-    """
-
-    bag: str
-    duration: float
-    start: int
-    """The time of the first message, ns."""
-    incomplete: str
-    """Why the bag was never finished, '' if it was."""
-    writer: BagWriter
-    errors: FrameErrors = field(init=False)
-    flight: RecordedFlight = field(init=False)
-    names: list[str] = field(default_factory=list)
-    own: OwnMotion | None = None
-    """Filled for the rules of ``check``."""
-    findings: list[Finding] = field(default_factory=list)
-    """Findings of the rules of ``check`` in the bag; empty if the rules were not applied."""
-    wall_time: float = 0.0
-    cpu: dict[str, array[float]] = field(default_factory=dict)
-    frames: array[float] = field(default_factory=lambda: array('d'))
-    frame_cpu: array[float] = field(default_factory=lambda: array('f'))
-    tick_rows: array[float] = field(default_factory=lambda: array('d'))
-    setpoint_rows: array[float] = field(default_factory=lambda: array('d'))
-    rejections: Counter[str] = field(default_factory=Counter)
-    setpoint_kinds: Counter[str] = field(default_factory=Counter)
-    brake_reasons: Counter[str] = field(default_factory=Counter)
-    reasons: list[tuple[float, str]] = field(default_factory=list)
+    @cached_property
+    def tables(self) -> dict[str, Table]:
+        """Return the errors of each neighbour by its name, once all messages were taken."""
+        return {each.name: self.errors.table(each.name) for each in self.neighbors}
 
     @property
     def ticks(self) -> Array:
         """Return the ticks (n, 4)."""
-        return np.frombuffer(self.tick_rows).reshape(-1, 4)
+        return np.reshape(np.array(self.tick_rows, dtype=float), (-1, 4))
 
     @property
     def states(self) -> list[tuple[float, str]]:
@@ -278,7 +244,7 @@ class Evaluation(Listener):
     @property
     def setpoints(self) -> Array:
         """Return the setpoints (n, 5)."""
-        return np.frombuffer(self.setpoint_rows).reshape(-1, 5)
+        return np.reshape(np.array(self.setpoint_rows, dtype=float), (-1, 5))
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
         """Write a message that a node would publish."""
@@ -287,38 +253,38 @@ class Evaluation(Listener):
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
         self.errors.odometry(state)
-        if self.own is not None and state.stamp < self.start + LONGEST * NANOSECONDS:
+        if self.own is not None and state.stamp < self.bag.start_ns + LONGEST * NANOSECONDS:
             self.own.states.append(state)
 
     def image(self, outcome: ImageOutcome) -> None:
         """Take the outcome of an image."""
         seen, camera = outcome.sighting, outcome.camera
-        self.errors.models[camera] = self.flight.perceiver.model(camera)
-        self.frames.append(self._seconds(outcome.stamp))
-        self.frame_cpu.append(outcome.perception)
-        if seen is not None:
-            self._spent('decode', outcome.decoding)
-            self._spent(seen.stage, outcome.perception)
-        self.errors.frame(outcome.stamp, seen.estimates if seen else {},
-                          seen.stages if seen else {}, camera)
+        self.errors.models[camera] = self.perceiver.model(camera)
+        self.frames += 1
+        if seen is None:
+            self.errors.frame(outcome.stamp, {}, {}, camera)
+        else:
+            self.cpu['decode'].append(outcome.decoding)
+            self.cpu[seen.stage].append(outcome.perception)
+            self.errors.frame(outcome.stamp, seen.estimates, seen.stages, camera)
 
     def tick(self, tick: Tick) -> None:
         """Take the outcome of a tick of the planner."""
-        self._spent('planner', tick.cpu)
+        self.cpu['planner'].append(tick.cpu)
         if tick.decision.state is State.HOLD:
             self.reasons.append((self._seconds(tick.time), tick.decision.reason))
-        self.tick_rows.extend((
+        self.tick_rows.append((
             self._seconds(tick.time), STATES.index(tick.decision.state.value),
             _norm(tick.decision.acceleration),
             _norm(None if tick.own is None else tick.own.velocity)))
 
     def cycle(self, cycle: ControlCycle) -> None:
         """Take the outcome of a cycle of the control."""
-        self._spent('gate', cycle.cpu)
+        self.cpu['gate'].append(cycle.cpu)
         decision = cycle.setpoint
         self.setpoint_kinds[decision.kind] += 1
         self.brake_reasons.update(filter(None, [decision.reason]))
-        self.setpoint_rows.extend((
+        self.setpoint_rows.append((
             self._seconds(cycle.time),
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
@@ -332,10 +298,7 @@ class Evaluation(Listener):
                 self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
-        return (nanoseconds - self.start) / NANOSECONDS
-
-    def _spent(self, what: str, seconds: float) -> None:
-        self.cpu.setdefault(what, array('f')).append(seconds)
+        return (nanoseconds - self.bag.start_ns) / NANOSECONDS
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
@@ -353,17 +316,10 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     """
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        mounted = cameras(values['relative_pose'])
-        used = topics_used(bag, namespace, remaps, [camera for camera in mounted if camera.name])
+        used = topics_used(bag, namespace, remaps, [
+            camera for camera in cameras(values['relative_pose']) if camera.name])
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
-            evaluation = Evaluation(
-                path.name, bag.duration_ns / NANOSECONDS, bag.start_ns, bag.incomplete, writer)
-            flight = RecordedFlight(values, evaluation, empty, time.process_time)
-            neighbors = flight.perceiver.tracker.config.neighbors
-            evaluation.flight, evaluation.names = flight, [n.name for n in neighbors]
-            evaluation.errors = FrameErrors(neighbors, {
-                camera.name: camera_mounting(camera.position, camera.rpy)
-                for camera in mounted}, bag.start_ns)
+            evaluation = Evaluation(bag, values, writer)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *(
                     bag.topics[topic].msgtype for topic in used)):
@@ -371,7 +327,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             begin = time.perf_counter()
             system = None
             if checked:
-                evaluation.own = OwnMotion(flight.source)
+                evaluation.own = OwnMotion(evaluation.source)
                 system = RecordedSystem(bag, values, '', namespace, remaps, evaluation.own)
             _play(bag, used, evaluation, system)
             if system is not None:
@@ -383,16 +339,22 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
+    follower, message, pixels, began = evaluation.follower, None, None, False
     for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
-        message, pixels = (None, None) if system is None else (
-            system.take(topic, msgtype, stamp, data))
+        if system is not None:
+            message, pixels = system.take(topic, msgtype, stamp, data)
         name, camera = used.get(topic, ('', ''))
         if name in TRUTHS:
             evaluation.errors.truth(
                 from_odometry(read_odometry(data)), own=name == 'truth/odom')
         elif name:
-            evaluation.flight.take(name, stamp, msgtype, data, camera, message, pixels)
-    evaluation.flight.follower.finish()
+            if not began:
+                began = True
+                follower.engage(stamp, True)
+                follower.permit(stamp, -math.inf)
+                follower.vehicle(stamp, FLYING)
+            evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
+    follower.finish()
 
 
 def _norm(vector: Array | None) -> float:

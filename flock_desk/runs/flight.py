@@ -38,6 +38,7 @@ from flock_desk.runs.processes import (
     private_environment,
     Processes,
     SchedulingDelay,
+    wait_until,
 )
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.mavlink.envelope import GateLimits
@@ -144,19 +145,18 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
             if early:
                 print(f'\nthe bridge has ended the flight: {early}', flush=True)
-                come_down(processes)
             elif external:
                 call(processes, 'planner/engage', ('false',))
                 call(processes, 'mavlink_bridge/offboard', ('false',))
-                call(processes, 'mavlink_bridge/land', ())
-        except BaseException:
+        finally:
             if 'takeoff' in processes.children:
                 come_down(processes)
-            raise
         if external:
-            await_disarmed(processes)
+            simulator = processes.children['simulator']
+            wait_until(lambda: simulator.poll() is not None, LANDING_TIMEOUT,
+                       'the vehicle to land and disarm')
         time.sleep(COUNTED)
-        if any(simulator.returncode for simulator in all_of(processes, 'simulator').values()):
+        if any(simulator.returncode for simulator in simulators_of(processes)):
             raise RuntimeError('the simulator failed')
         exit_codes = processes.stop_all()
         for recorder, code in exit_codes.items():
@@ -189,10 +189,9 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
             show=show and simulates)
 
 
-def all_of(processes: Processes, node: str) -> dict[str, subprocess.Popen[bytes]]:
-    """Return the processes of a node, of every follower."""
-    return {name: child for name, child in processes.children.items()
-            if name.rpartition('/')[2] == node}
+def simulators_of(processes: Processes) -> list[subprocess.Popen[bytes]]:
+    """Return the simulators of all followers."""
+    return [child for name, child in processes.children.items() if name.endswith('simulator')]
 
 
 def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
@@ -269,7 +268,7 @@ def watch(processes: Processes, duration: float, external: bool) -> dict[str, fl
     :raises RuntimeError: if the simulator does not keep up, or something ends early.
     :raises TooBusyError: if the machine is too busy.
     """
-    simulators, delay = all_of(processes, 'simulator').values(), SchedulingDelay()
+    simulators, delay = simulators_of(processes), SchedulingDelay()
     begin = now = time.monotonic()
     used = before = processes.cpu()
     while None in (codes := [simulator.poll() for simulator in simulators]) and not any(codes):
@@ -279,9 +278,6 @@ def watch(processes: Processes, duration: float, external: bool) -> dict[str, fl
             break
         if now > begin + duration + PATIENCE:
             raise RuntimeError('the simulator does not keep up with the clock')
-        for name, recorder in all_of(processes, 'recorder').items():
-            if recorder.poll() is not None:
-                raise RuntimeError(f'the recorder ended early: {processes.last_line(name)}')
         used = {**used, **processes.cpu()}
         delay.check(now)
         time.sleep(0.2)
@@ -303,19 +299,6 @@ def ended_by_bridge(log: str) -> str:
                  if before.startswith('ACTIVE') and not state.startswith('ACTIVE')), '')
 
 
-def await_disarmed(processes: Processes) -> None:
-    """
-    Wait for the simulator to see the vehicle disarmed.
-
-    :raises RuntimeError: if it does not come down.
-    """
-    deadline = time.monotonic() + LANDING_TIMEOUT
-    while processes.children['simulator'].poll() is None:
-        if time.monotonic() > deadline:
-            raise RuntimeError(f'it has not landed and disarmed within {LANDING_TIMEOUT:g} s')
-        time.sleep(0.2)
-
-
 def come_down(processes: Processes) -> None:
     """Request a landing after something failed, whether it succeeds or not."""
     with contextlib.suppress(RuntimeError, KeyboardInterrupt):
@@ -331,7 +314,7 @@ def call(processes: Processes, service: str, value: Sequence[str] = ('true',),
     :param value: see ``Processes.ask``.
     :raises RuntimeError: if it goes on refusing, or the simulator has ended, with the reason.
     """
-    simulators = list(all_of(processes, 'simulator').values())
+    simulators = simulators_of(processes)
     answer = processes.ask(service, timeout, lambda: (
         'the simulator ended early' if any(s.poll() is not None for s in simulators) else ''),
         value)

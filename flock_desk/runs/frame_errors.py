@@ -51,29 +51,15 @@ from flock_follower.perception.neighbor_filter import Estimate
 
 STAGES = ('none', 'track', 'roi', 'full')
 
-#: The columns of the table; three of a kind are along the follower's x, y, z (forward, left, up).
-#: ``stage`` is an index into STAGES; ``visible`` is 1 if by the truth a marker is in view;
-#: positions are in odom, m; sigmas are standard deviations of the errors; ``turned`` is the angle
-#: between estimated and true attitude of the neighbour relative to the follower, rad. NaN is
-#: unknown.
-COLUMNS = (
-    'time', 'stage', 'visible', 'own_x', 'own_y', 'neighbor_x', 'neighbor_y',
-    'distance', 'true_distance', 'position_x', 'position_y', 'position_z',
-    'velocity_x', 'velocity_y', 'velocity_z', 'position_sigma_x', 'position_sigma_y',
-    'position_sigma_z', 'velocity_sigma_x', 'velocity_sigma_y', 'velocity_sigma_z',
-    'nees_position', 'nees_velocity', 'turned')
-#: The columns, (n,) each, by name.
+#: The columns of n images by name, (n,) or (n, 3), see :meth:`FrameErrors.table`.
 Table = Mapping[str, Array]
 #: States further apart than this are not interpolated, ns.
 MAX_GAP = NANOSECONDS // 2
-BATCH, LATE = 2000, 200
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
 #: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of what an
 #: image gives: stage, position, velocity, rotation matrix, covariance (6, 6).
 _STATE, _SEEN = 14, 52
-
-_P, _V = slice(0, 3), slice(3, 6)
 
 
 class _States(NamedTuple):
@@ -88,8 +74,7 @@ class FrameErrors:
     """
     Collects images, odometry and truth as they arrive; :meth:`table` compares them.
 
-    Memory grows by 0.2 kB per image and neighbour. ``BATCH`` images are compared at a time, except
-    the newest ``LATE``: their odometry and truth may still come.
+    An hour takes about 130 MB: 112 bytes for each state, 0.4 kB for each image and neighbour.
 
     :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
@@ -110,13 +95,6 @@ class FrameErrors:
         self._stamps = array('d')
         self._cameras: list[str] = []
         self._seen = {name: array('d') for name in self._neighbors}
-        self._compared: dict[str, list[Array]] = {name: [] for name in self._neighbors}
-
-    def table(self, name: str) -> dict[str, Array]:
-        """Return the columns, (n,) each, of a neighbour."""
-        self._compare()
-        return dict(zip(COLUMNS, np.concatenate(self._compared[name] or [
-            np.empty((0, len(COLUMNS)))]).T))
 
     def odometry(self, state: OdometryState) -> None:
         """Take the own odometry."""
@@ -140,73 +118,59 @@ class FrameErrors:
             seen.extend((0.0, *[np.nan] * (_SEEN - 1)) if estimate is None else (
                 STAGES.index(stages.get(name, 'full')), *estimate.position, *estimate.velocity,
                 *estimate.rotation.ravel(), *estimate.covariance[:6, :6].ravel()))
-        if len(self._stamps) == BATCH:
-            self._compare(BATCH - LATE)
 
     def _take(self, states: array[float], state: OdometryState) -> None:
-        """Keep states in the order of their stamps; restart if time jumps back."""
+        """Keep states in the order of their stamps: a late one is dropped."""
         time = state.stamp - self._start
-        if states and time <= states[-_STATE]:
-            if states[-_STATE] - time <= MAX_GAP:
-                return
-            self._compare()
-            del states[:]
-        states.extend((time, *state.position, *state.quaternion, *state.velocity,
-                       *state.angular_velocity))
+        if not states or time > states[-_STATE]:
+            states.extend((time, *state.position, *state.quaternion, *state.velocity,
+                           *state.angular_velocity))
 
-    def _compare(self, count: int | None = None) -> None:
-        """Compare the oldest ``count`` images, or all, and forget the states before the rest."""
-        stamps, cameras = np.array(self._stamps[:count]), np.array(self._cameras[:count])
-        if not len(stamps):
-            return
-        own, true_own = _at(self._own, stamps), _at(self._true[''], stamps)
-        for name, neighbor in self._neighbors.items():
-            true = _at(self._true[name], stamps)
-            seen = np.array(self._seen[name]).reshape(-1, _SEEN)[:count]
-            estimated = _States(seen[:, 1:4], seen[:, 4:7], seen[:, 7:16].reshape(-1, 3, 3))
-            columns = {
-                'time': stamps / NANOSECONDS, 'stage': seen[:, 0],
-                'visible': self._visible(neighbor, true, true_own, cameras),
-                'own_x': own.position[:, 0], 'own_y': own.position[:, 1],
-                **_errors(estimated, seen[:, 16:].reshape(-1, 6, 6), own, true, true_own)}
-            self._compared[name].append(np.stack([columns[key] for key in COLUMNS], axis=1))
-            del self._seen[name][:len(stamps) * _SEEN]
-        del self._stamps[:count], self._cameras[:count]
-        for states in (self._own, *self._true.values()):
-            before = np.array(states[::_STATE]) < min(self._stamps, default=-np.inf) - MAX_GAP
-            del states[:_STATE * np.count_nonzero(before)]
+    def table(self, name: str) -> dict[str, Array]:
+        """
+        Return the columns of a neighbour by name, a row for each of n images; NaN is unknown.
 
-    def _visible(self, neighbor: MarkedNeighbor, true: _States, true_own: _States,
-                 cameras: NDArray[np.str_]) -> Array:
+        (n,): ``time``, s; ``stage``, an index into STAGES; ``visible``, 1 if by the truth a marker
+        is in view; ``distance`` and ``true_distance``, m; ``nees_position``, ``nees_velocity``;
+        ``turned``, the angle between estimated and true attitude relative to the follower, rad.
+        (n, 3): ``own`` and ``neighbor``, m in odom; the errors ``position``, m, and ``velocity``,
+        m/s, along the follower's x, y, z (forward, left, up), and their standard deviations
+        ``position_sigma`` and ``velocity_sigma``.
+        """
+        stamps = np.array(self._stamps)
+        own, true_own, true = (
+            _at(states, stamps) for states in (self._own, self._true[''], self._true[name]))
+        seen = np.array(self._seen[name]).reshape(-1, _SEEN)
+        position, velocity, rotation = seen[:, 1:4], seen[:, 4:7], seen[:, 7:16]
+        covariance = seen[:, 16:].reshape(-1, 6, 6)
+        estimated = _relative(_States(position, velocity, rotation.reshape(-1, 3, 3)), own)
+        truth = _relative(true, true_own)
+        # The trace of R' R_true.
+        trace = np.einsum('nij,nij->n', estimated.rotation, truth.rotation)
+        table = {
+            'time': stamps / NANOSECONDS, 'stage': seen[:, 0],
+            'visible': self._visible(self._neighbors[name], truth),
+            'own': own.position, 'neighbor': position,
+            'distance': np.linalg.norm(estimated.position, axis=1),
+            'true_distance': np.linalg.norm(truth.position, axis=1),
+            'turned': np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)),
+            'position': estimated.position - truth.position,
+            'velocity': estimated.velocity - truth.velocity}
+        for kind, k in (('position', slice(0, 3)), ('velocity', slice(3, 6))):
+            in_body = own.rotation.transpose(0, 2, 1) @ covariance[:, k, k] @ own.rotation
+            table[f'{kind}_sigma'] = np.sqrt(np.diagonal(in_body, axis1=1, axis2=2))
+            table[f'nees_{kind}'] = _nees(table[kind], in_body)
+        return table
+
+    def _visible(self, neighbor: MarkedNeighbor, truth: _States) -> Array:
         """Return for every image whether a marker is in view, NaN if there is no truth."""
-        position, _, rotation = _relative(true, true_own)
-        visible = np.zeros(len(position), dtype=bool)
-        for name, model in self.models.items():
-            if model is not None:
-                for marker in neighbor.markers:
-                    visible |= (cameras == name) & _marker_visible(
-                        marker, model, self._T_camera_body[name], position, rotation)
-        return np.where(np.isfinite(position[:, 0]), visible, np.nan)
-
-
-def _errors(estimated: _States, covariance: Array, own: _States, true: _States,
-            true_own: _States) -> dict[str, Array]:
-    position, velocity, rotation = _relative(estimated, own)
-    true_position, true_velocity, true_rotation = _relative(true, true_own)
-    turned = np.einsum('nij,nij->n', rotation, true_rotation)  # the trace of R' R_true
-    columns = {
-        'neighbor_x': estimated.position[:, 0], 'neighbor_y': estimated.position[:, 1],
-        'distance': np.linalg.norm(position, axis=1),
-        'true_distance': np.linalg.norm(true_position, axis=1),
-        'turned': np.arccos(np.clip((turned - 1.0) / 2.0, -1.0, 1.0))}
-    for kind, error, k in (('position', position - true_position, _P),
-                           ('velocity', velocity - true_velocity, _V)):
-        in_body = own.rotation.transpose(0, 2, 1) @ covariance[:, k, k] @ own.rotation
-        columns[f'nees_{kind}'] = _nees(error, in_body)
-        for i, axis in enumerate('xyz'):
-            columns[f'{kind}_{axis}'] = error[:, i]
-            columns[f'{kind}_sigma_{axis}'] = np.sqrt(in_body[:, i, i])
-    return columns
+        visible, cameras = np.zeros(len(truth.position), dtype=bool), np.array(self._cameras)
+        calibrated = {name: model for name, model in self.models.items() if model is not None}
+        for name, model in calibrated.items():
+            for marker in neighbor.markers:
+                visible |= (cameras == name) & _marker_visible(
+                    marker, model, self._T_camera_body[name], truth.position, truth.rotation)
+        return np.where(np.isfinite(truth.position[:, 0]), visible, np.nan)
 
 
 def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transform,
@@ -233,8 +197,7 @@ def _at(states: array[float], stamps: Array) -> _States:
 
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
-    n = len(stamps)
-    result = _States(*(np.full((n, *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
+    result = _States(*(np.full((len(stamps), *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
     rows = np.array(states).reshape(-1, _STATE)
     if not len(rows):
         return result
@@ -245,9 +208,10 @@ def _at(states: array[float], stamps: Array) -> _States:
              & (times[after] - times[before] <= MAX_GAP))
     for k in np.flatnonzero(known):
         begin = times[before[k]]
-        state, end = (_sample(rows[row], begin) for row in (before[k], after[k]))
+        state = _sample(rows[before[k]], begin)
         if before[k] != after[k]:
-            state = between(state, end, float(stamps[k] - begin) / NANOSECONDS)
+            state = between(state, _sample(rows[after[k]], begin),
+                            float(stamps[k] - begin) / NANOSECONDS)
         result.position[k], result.velocity[k] = state.position, state.velocity
         result.rotation[k] = quaternion_to_matrix(state.quaternion)
     return result
@@ -257,12 +221,12 @@ def _sample(row: Array, since: float) -> OdometrySample:
     return OdometrySample((row[0] - since) / NANOSECONDS, row[1:4], row[4:8], row[8:11], row[11:])
 
 
-def _relative(neighbor: _States, own: _States) -> tuple[Array, Array, Array]:
-    """Return positions (n, 3), velocities (n, 3), rotations (n, 3, 3) in the follower's body."""
+def _relative(neighbor: _States, own: _States) -> _States:
+    """Return a neighbour's states relative to the own ones, in the follower's body."""
     to_body = own.rotation.transpose(0, 2, 1)
-    return (np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
-            np.einsum('nij,nj->ni', to_body, neighbor.velocity - own.velocity),
-            to_body @ neighbor.rotation)
+    return _States(np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
+                   np.einsum('nij,nj->ni', to_body, neighbor.velocity - own.velocity),
+                   to_body @ neighbor.rotation)
 
 
 def _nees(errors: Array, covariances: Array) -> Array:
@@ -277,8 +241,3 @@ def _nees(errors: Array, covariances: Array) -> Array:
     solved = np.linalg.solve(covariances[known], errors[known][:, :, None])[:, :, 0]
     nees[known] = np.einsum('ni,ni->n', errors[known], solved)
     return nees
-
-
-def by_axis(table: Table, kind: str) -> Array:
-    """Return the columns (n, 3) of a kind along x, y and z."""
-    return np.stack([table[f'{kind}_{axis}'] for axis in 'xyz'], axis=1)

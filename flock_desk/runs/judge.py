@@ -12,6 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+
 """
 Bounds on the figures of a summary: what makes ``evaluate``, ``demo`` and ``fly`` pass or fail.
 
@@ -36,7 +37,6 @@ import yaml
 
 #: Keys under which anything may appear, a count of 0 unless it does.
 COUNTERS = ('rejections.', 'setpoints.reasons.')
-
 
 
 class FigureBound(NamedTuple):
@@ -69,10 +69,8 @@ def load_bounds(path: str | Path) -> list[FigureBound]:
     """
     try:
         return parse_bounds(yaml.safe_load(Path(path).read_text(encoding='utf-8')))
-    except yaml.YAMLError as error:
-        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f'{path}: {" ".join(str(error).split())}') from None
 
 
 def parse_bounds(document: Any) -> list[FigureBound]:
@@ -83,42 +81,45 @@ def parse_bounds(document: Any) -> list[FigureBound]:
     """
     if not isinstance(document, Mapping) or not document:
         raise ValueError('must map figures of the summary to {min: ..., max: ...}')
-    bounds = []
     for key, ends in document.items():
-        if not isinstance(ends, Mapping) or not ends or not set(ends) <= {'min', 'max'}:
-            raise ValueError(f'{key} = {ends!r}: must have min, max or both, and nothing else')
-        for name, end in ends.items():
-            if isinstance(end, bool) or not isinstance(end, (int, float)) or (
-                    not math.isfinite(end)):
-                raise ValueError(f'{key}: {name} = {end!r}: must be a finite number')
-        bound = FigureBound(str(key), ends.get('min'), ends.get('max'))
-        if bound.least is not None and bound.most is not None and bound.least > bound.most:
-            raise ValueError(f'{key}: min = {bound.least:g}: must be at most max = '
-                             f'{bound.most:g}')
-        bounds.append(bound)
-    return bounds
+        if not isinstance(ends, Mapping) or not ends or not set(ends) <= {'min', 'max'} or any(
+                type(end) not in (int, float) or not math.isfinite(end) for end in ends.values()):
+            raise ValueError(f'{key} = {ends!r}: must have min, max or both, finite numbers')
+    return [FigureBound(str(key), ends.get('min'), ends.get('max'))
+            for key, ends in document.items()]
 
 
 def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> None:
     """
     Refuse a bound on something that is no figure of the summary.
 
-    :raises ValueError: naming it, and the figure that may have been meant.
+    :raises ValueError: naming it, and the figures of similar names, or all.
     """
     figures = [key for key, value in flat(summary) if not isinstance(value, (str, list))]
-    for key in (bound.key for bound in bounds):
-        if key in figures or _counted(key):
-            continue
-        near = difflib.get_close_matches(key, figures, n=1)
-        hint = f'did you mean {near[0]}?' if near else f'it has {", ".join(figures)}'
-        raise ValueError(f'{key} is no figure of the summary: {hint}')
+    for bound in bounds:
+        if bound.key not in figures and not bound.key.startswith(COUNTERS):
+            near = difflib.get_close_matches(bound.key, figures) or figures
+            raise ValueError(f'{bound.key} is no figure of the summary: must be one of '
+                             f'{", ".join(near)}')
 
 
 def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[Judgement]:
     """Return what became of every bound; a figure that is None or not finite breaks its bound."""
-    figures = dict(flat(summary))
-    return [_judge(bound, figures.get(bound.key, 0 if _counted(bound.key) else None))
-            for bound in bounds]
+    figures, judgements = dict(flat(summary)), []
+    for bound in bounds:
+        key, least, most = bound
+        figure = figures.get(key, 0 if key.startswith(COUNTERS) else None)
+        fault = ''
+        if figure is None:
+            fault = f'{key} is not known: it was not measured, or is not finite'
+        elif not math.isfinite(figure):
+            fault = f'{key} = {figure}: must be finite'
+        elif least is not None and figure < least:
+            fault = f'{key} = {figure:.6g}: must be at least {least:g}'
+        elif most is not None and figure > most:
+            fault = f'{key} = {figure:.6g}: must be at most {most:g}'
+        judgements.append(Judgement(bound, figure, fault))
+    return judgements
 
 
 def flat(summary: Mapping[str, Any], prefix: str = '') -> Iterable[tuple[str, Any]]:
@@ -128,23 +129,3 @@ def flat(summary: Mapping[str, Any], prefix: str = '') -> Iterable[tuple[str, An
             yield from flat(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
-
-
-def _judge(bound: FigureBound, figure: float | None) -> Judgement:
-    key, least, most = bound
-    if figure is None:
-        fault = (f'{key} is not known: it was not measured (no truth, no image, no /proc), or a '
-                 'value that it rests on is not finite')
-    elif not math.isfinite(figure):
-        fault = f'{key} = {figure}: must be finite'
-    elif least is not None and not figure >= least:
-        fault = f'{key} = {figure:.6g}: must be at least {least:g}'
-    elif most is not None and not figure <= most:
-        fault = f'{key} = {figure:.6g}: must be at most {most:g}'
-    else:
-        fault = ''
-    return Judgement(bound, figure, fault)
-
-
-def _counted(key: str) -> bool:
-    return key.startswith(COUNTERS)

@@ -14,7 +14,7 @@
 
 
 """
-The figures for a paper: simulated flocks, a panel for each model; flights of ``fly``.
+The figures for a paper: simulated flocks, a panel for each model; controllers compared.
 
 Each is one column wide and legible at that width; its lines are distinguishable in grey. The title
 belongs to the caption.
@@ -33,15 +33,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.axes3d import Axes3D
 import numpy as np
 
 from flock_desk.flocks.agents import Simulation
-from flock_desk.runs.plots import with_gaps
-from flock_desk.runs.record import LiveRecord
 from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
@@ -64,13 +60,12 @@ _STYLE = {
 Handle = Line2D | Patch
 Runs = Mapping[str, Simulation]
 Draw = Callable[[Axes, Simulation], None]
-#: in, of the arrow of 1 m/s: on the page, as the scale of the ground is another in each panel.
-_ARROW = 0.3
-_SIDE = 0.8  # in, the room of a panel beside the arrows
 #: The ratio of length to width of paths from which on both axes have a scale of their own.
 SLIM = 5.0
-_TRUTH: dict[str, Any] = {'linewidth': 3.2, 'alpha': 0.3, 'solid_capstyle': 'butt', 'zorder': 1.8}
 _TIME = 'time [s]'
+#: A legend above the axis, where no data can be.
+_ABOVE: dict[str, Any] = {
+    'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0), 'ncols': 3, 'columnspacing': 1.0}
 
 
 def styled() -> Any:
@@ -93,17 +88,11 @@ def draw_bounds(axis: Axes, params: FlockingParams) -> None:
         axis.axhline(bound, color=INK, linestyle='--', linewidth=0.9, zorder=1.5)
 
 
-def bounds_handle(label: str) -> Handle:
-    """Return the edges of the band, for a legend."""
-    return Line2D([], [], color=INK, linestyle='--', linewidth=0.9, label=label)
-
-
 @styled()
 def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
     """Return the paths of each model's agents up to a time, s, from start to end."""
     def draw(axis: Axes, run: Simulation) -> None:
-        shown = run.time <= end + 1e-9
-        x = run.positions[shown]
+        x = run.positions[run.time <= end + 1e-9]
         for n, line in ((0, ':'), (-1, '-')):
             loop = np.append(np.arange(x.shape[1]), 0)
             axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=line, zorder=1)
@@ -112,32 +101,17 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
             axis.plot(*x[0, i], 'o', color='white', markeredgecolor=colour, markersize=4,
                       zorder=5)
             axis.plot(*x[-1, i], 'o', color=colour, markersize=4)
-        velocities = run.velocities[0]
-        arrows = axis.quiver(
-            *x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS], units='inches',
-            width=0.022, scale_units='inches', scale=1.0 / _ARROW, headwidth=4.2, headlength=4.5,
-            headaxislength=4.0, zorder=6)
         spans = np.ptp(x, axis=(0, 1))
-        reach = _ARROW / _SIDE * spans  # m, of the arrow of 1 m/s
         axis.margins(0.12)
         if spans.max() > SLIM * spans.min():  # at one scale the panel would be empty
             axis.text(0.98, 0.02, 'scales differ', fontsize=7, ha='right',
                       transform=axis.transAxes)
         else:
-            reach = reach.max()
             axis.set_aspect('equal', adjustable='datalim')
-        axis.update_datalim(x[0] + reach * velocities)
-        if run is first:  # beside the legend
-            axis.quiverkey(arrows, 1.42, -0.07, 0.5, 'initial velocity,\n0.5 m/s', labelpos='E',
-                           color=INK, labelsep=0.08)
 
-    first = next(iter(runs.values()))
-    handles: list[Handle] = _agent_handles(names)
-    handles += [
-        Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
-               markersize=4, label='start'),
-        Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
-               label=f'after {end:g} s'),
+    handles = [*_agent_handles(names), *(
+        Line2D([], [], color=INK, marker='o', markerfacecolor=fill, linestyle='', markersize=4,
+               label=label) for fill, label in (('white', 'start'), (INK, f'after {end:g} s'))),
         Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
     return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
                    share=(False, False))
@@ -178,7 +152,8 @@ def distances(runs: Runs, end: float, note: str = '') -> Figure:
     if several:
         handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
                              label='least to greatest'))
-    handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
+    handles.append(Line2D([], [], color=INK, linestyle='--', linewidth=0.9,
+                          label='$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
     return _panels(runs, draw, handles, _TIME, 'distance [m]', note, share=('all', False))
 
 
@@ -194,11 +169,6 @@ def agreement(runs: Runs, end: float) -> Figure:
     law = next(iter(runs.values())).metrics
     shown = law.time <= end
     above.plot(law.time[shown], law.lyapunov[shown], color=INK)
-    last = np.flatnonzero(shown)[-1]
-    for n, place, side in ((0, (7, -2), 'left'), (last, (-3, 5), 'right')):
-        above.annotate(f'{law.lyapunov[n]:.4f} at {law.time[n]:g} s',
-                       (law.time[n], law.lyapunov[n]), place, fontsize=7, ha=side,
-                       textcoords='offset points')
     above.set(ylabel='$W$ of the law [m/s]')
     for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
         m = run.metrics
@@ -218,18 +188,25 @@ def agreement(runs: Runs, end: float) -> Figure:
 
 @styled()
 def flock(run: Simulation) -> Figure:
-    """Return the paths, distances and agreement of a larger flock, in 2-D or 3-D."""
+    """Return paths from above, distances and agreement of a larger flock on a graph."""
     figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
-    grid = figure.add_gridspec(3, 1, height_ratios=(2.2, 1.0, 1.0))
-    solid = run.positions.shape[2] == 3
-    paths = figure.add_subplot(grid[0], projection='3d' if solid else None)
-    _draw_paths(paths, run)
-    below, agreeing = figure.add_subplot(grid[1]), figure.add_subplot(grid[2])
+    paths, below, agreeing = figure.subplots(3, 1, height_ratios=(2.2, 1.0, 1.0))
+    # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
+    x = (run.positions - run.positions.mean(axis=1, keepdims=True))[:, :, :2]
+    edges = np.empty((0, 2), dtype=int) if run.graph is None else run.graph.edges[:2000]
+    paths.plot(*x[-1, edges].transpose(2, 1, 0), color=PALE, linewidth=0.5, zorder=1)
+    paths.plot(*x[:, :200].transpose(2, 0, 1), color=COLOURS[0][0], linewidth=0.6, alpha=0.7)
+    paths.plot(*x[-1].T, 'o', color=INK, markersize=2.5)
+    paths.set(xlabel='x from the mean [m]', ylabel='y from the mean [m]')
+    paths.set_aspect('equal', adjustable='datalim')
+    paths.legend(handles=[
+        Line2D([], [], color=COLOURS[0][0], linewidth=0.6, label='paths'),
+        Line2D([], [], color=INK, marker='o', markersize=2.5, linestyle='',
+               label=f'after {run.time[-1]:g} s'),
+        Line2D([], [], color=PALE, linewidth=0.5, label='edges')], **_ABOVE)
     m = run.metrics
-    on_graph = run.graph is not None
-    if on_graph or np.sqrt(m.max_r2.max()) < 2.0 * np.sqrt(run.params.d1):
-        below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
-                   label='longest edge' if on_graph else 'greatest')
+    below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
+               label='longest edge')
     below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
     draw_bounds(below, run.params)
     below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
@@ -237,38 +214,10 @@ def flock(run: Simulation) -> Figure:
     agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
                   linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
     agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
-    for axis in figure.axes:  # above the axis, where no data can be
-        axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
+    for axis in (below, agreeing):
+        axis.legend(**_ABOVE)
     figure.align_ylabels([below, agreeing])
     return figure
-
-
-def _draw_paths(axis: Axes, run: Simulation) -> None:
-    x = run.positions
-    # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
-    x = x - x.mean(axis=1, keepdims=True)
-    if run.graph is not None and len(run.graph.edges) <= 2000:
-        for i, j in run.graph.edges:
-            axis.plot(*x[-1, [i, j]].T, color=PALE, linewidth=0.5, zorder=1)
-    for i in range(min(x.shape[1], 200)):
-        axis.plot(*x[:, i].T, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, zorder=2)
-    axis.plot(*x[-1].T, 'o', color=INK, markersize=2.5, linestyle='', zorder=3)
-    none = np.empty((x.shape[2], 0))
-    axis.plot(*none, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, label='paths')
-    axis.plot(*none, 'o', color=INK, markersize=2.5, label=f'after {run.time[-1]:g} s')
-    if run.graph is not None:
-        axis.plot(*none, color=PALE, linewidth=0.5, label='edges')
-    axis.set(xlabel='x from the mean [m]', ylabel='y from the mean [m]')
-    axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-    if isinstance(axis, Axes3D):
-        axis.set_aspect('equal')
-        axis.set_box_aspect(np.ptp(np.reshape(axis.get_w_lims(), (3, 2)), axis=1), zoom=0.88)
-        axis.tick_params(pad=-2)
-        axis.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')  # there is no room for more
-        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
-            side.labelpad = -5.0
-    else:
-        axis.set_aspect('equal', adjustable='datalim')
 
 
 def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
@@ -300,54 +249,6 @@ def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
 
 
 @styled()
-def positions(flight: LiveRecord) -> Figure:
-    """
-    Return x and y of leader and follower over time, m in odom.
-
-    As in the paper they are what the follower knew: its own odometry, and where it saw the leader.
-    The true ones, in a frame without drift, are beneath.
-    """
-    table = _table(flight)
-    figure = Figure(figsize=(WIDTH, 3.1), layout='constrained')
-    axes: list[Axes] = list(figure.subplots(2, 1, sharex=True))
-    for axis, name in zip(axes, 'xy'):
-        for who, (colour, dash), known in (('leader', COLOURS[0], f'neighbor_{name}'),
-                                           ('follower', COLOURS[1], f'own_{name}')):
-            axis.plot(table['time'], table[f'{who}_{name}'], color=colour, **_TRUTH)
-            axis.plot(table['time'], table[known], color=colour, linestyle=dash)
-        axis.set_ylabel(f'{name} [m]')
-    axes[1].set(xlabel=_TIME, xlim=(0.0, flight.duration))
-    figure.align_ylabels(axes)
-    handles = [*_agent_handles(('leader', 'follower')), _truth_handle('true positions')]
-    figure.legend(handles=handles, loc='outside upper center', ncols=3)
-    return figure
-
-
-@styled()
-def distance(flight: LiveRecord) -> Figure:
-    """Return the distance over time, m, as the follower knew it and as it was, in the band."""
-    table, law = _table(flight), flight.params.law
-    figure = Figure(figsize=(WIDTH, 2.2), layout='constrained')
-    axis: Axes = figure.subplots()
-    for begin, end in flight.blind:
-        axis.axvspan(begin, end, color=PALE, alpha=0.6, linewidth=0)
-    axis.plot(table['time'], table['true_distance'], color=INK, **_TRUTH)
-    axis.plot(table['time'], table['distance'], color=COLOURS[0][0], linewidth=1.0)
-    draw_bounds(axis, law)
-    top = 1.05 * np.nanmax([*table['distance'], *table['true_distance'], 0.0])
-    axis.set(xlabel=_TIME, ylabel='distance [m]', xlim=(0.0, flight.duration),
-             ylim=(0.0, max(1.12 * np.sqrt(law.d1), top)))
-    handles: list[Handle] = [
-        Line2D([], [], color=COLOURS[0][0], linewidth=1.0, label='estimated'),
-        _truth_handle('true'), bounds_handle('$\\sqrt{d_0}$, $\\sqrt{d_1}$')]
-    if flight.blind:
-        handles.append(Patch(color=PALE, alpha=0.6, linewidth=0, label='hidden'))
-    figure.legend(handles=handles, loc='outside upper center', ncols=len(handles),
-                  columnspacing=1.2, handlelength=1.8)
-    return figure
-
-
-@styled()
 def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> Figure:
     """
     Return the share of runs that kept the band against the jerk, a panel for each ``v_max``, m/s.
@@ -367,15 +268,3 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
     figure.legend(*axes[0].get_legend_handles_labels(), loc='outside upper center', ncols=3,
                   columnspacing=1.0, handlelength=1.0)
     return figure
-
-
-def _table(flight: LiveRecord) -> Mapping[str, Array]:
-    """Return the columns drawn; NaN if images are missing, and so no line."""
-    true = {f'{who}_{name}': column
-            for who, places in flight.paths.items() for name, column in zip('xy', places.T)}
-    return with_gaps({**flight.table, **true})
-
-
-def _truth_handle(label: str) -> Handle:
-    return Line2D([], [], color=INK, linewidth=_TRUTH['linewidth'], alpha=_TRUTH['alpha'],
-                  label=label)

@@ -22,7 +22,7 @@ its workers need this package in the same version, and the same files where task
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
@@ -67,13 +67,10 @@ def claim_domain() -> int:
     """
     for domain_id in random.SystemRandom().sample(range(1, 101), 100):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
+        with contextlib.suppress(OSError):
             claim.bind(f'\0flock_follower domain {domain_id}')  # a name without a file
-        except OSError:
-            claim.close()
-            continue
-        _CLAIMS.append(claim)
-        return domain_id
+            _CLAIMS.append(claim)
+            return domain_id
     raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
 
 
@@ -102,14 +99,11 @@ def free_udp_port() -> int:
     The port is above the ephemeral ports: otherwise another process, such as DDS, could receive
     the same port before it is used.
     """
-    chance = random.SystemRandom()
     while True:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                port = chance.randrange(*PORTS)
-                probe.bind(('127.0.0.1', port))
-            except OSError:
-                continue
+        port = random.SystemRandom().randrange(*PORTS)
+        with contextlib.suppress(OSError), socket.socket(
+                socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(('127.0.0.1', port))
             return port
 
 
@@ -146,8 +140,7 @@ class SchedulingDelay:
     def __init__(self, parent: int | None = None, proc: Path = Path('/proc')) -> None:
         self._parent = os.getpid() if parent is None else parent
         self._proc = proc
-        self._threads: dict[Path, tuple[int, int]] = {}
-        self._history: deque[tuple[float, int, int]] = deque()
+        self._history: deque[tuple[float, dict[Path, list[int]]]] = deque()
 
     def check(self, now: float) -> None:
         """
@@ -157,24 +150,19 @@ class SchedulingDelay:
         """
         if self._history and now - self._history[-1][0] < 0.5:
             return
-        before, self._threads = self._threads, {}
-        ran = waited = 0
-        children: list[str] = []
-        for path in self._proc.glob(f'{self._parent}/task/*/children'):
-            with contextlib.suppress(OSError):  # a thread that has ended
-                children += path.read_text(encoding='ascii').split()
-        for child in children:
-            for path in self._proc.glob(f'{child}/task/*/schedstat'):
-                with contextlib.suppress(OSError, ValueError):  # a thread that has ended
-                    running, waiting, _ = map(int, path.read_text(encoding='ascii').split())
-                    last = before.get(path, (running, waiting))
-                    ran, waited = ran + running - last[0], waited + waiting - last[1]
-                    self._threads[path] = running, waiting
-        self._history.append((now, ran, waited))
-        if now - self._history[0][0] < BUSY_WINDOW:
+        counters: dict[Path, list[int]] = {}  # ns run and waited, of each thread
+        for tasks in self._proc.glob(f'{self._parent}/task/*/children'):
+            with contextlib.suppress(OSError, ValueError):  # a thread that has ended
+                for child in tasks.read_text(encoding='ascii').split():
+                    for path in self._proc.glob(f'{child}/task/*/schedstat'):
+                        counters[path] = [*map(int, path.read_text(encoding='ascii').split())]
+        self._history.append((now, counters))
+        began, before = self._history[0]
+        if now - began < BUSY_WINDOW:
             return
         self._history.popleft()
-        ran, waited = (sum(counts) for counts in list(zip(*self._history))[1:])
+        ran, waited = (sum(counters[path][k] - before[path][k]
+                           for path in counters.keys() & before.keys()) for k in (0, 1))
         if waited > BUSY_SHARE * (ran + waited):
             raise TooBusyError(
                 f'the processes waited for a processor for {waited / (ran + waited):.0%} of the '
@@ -239,11 +227,10 @@ class Processes:
         :raises RuntimeError: if the child ends before.
         """
         def printed() -> bool:
-            if text in self.log(name):
-                return True
-            if self.children[name].poll() is not None and text not in self.log(name):
+            ended = self.children[name].poll() is not None
+            if ended and text not in self.log(name):
                 raise RuntimeError(f'{name} ended early:\n{self.log(name)}')
-            return False
+            return text in self.log(name)
 
         wait_until(printed, timeout, f'{name} to print {text!r}')
 
@@ -314,19 +301,27 @@ class Processes:
             signal.signal(number, handler)
 
 
-def pooled(jobs: int, function: Callable[[Given], Result],
-           tasks: Iterable[Given]) -> Iterator[Result]:
-    """Yield what a function makes of each task, in their order, computed by ``jobs`` processes."""
+def computed(function: Callable[[Given], Result], tasks: Sequence[Given], jobs: int = 1,
+             scheduler: str = '') -> Iterator[Result]:
+    """
+    Yield what a function makes of each task, in their order.
+
+    :param jobs: processes that compute; 1: this one.
+    :param scheduler: of a cluster that computes instead, such as ``tcp://192.168.1.5:8786``.
+    :raises RuntimeError: if Dask is not installed here.
+    :raises OSError: if no scheduler answers there, or it is lost.
+    """
+    if scheduler:
+        yield from _on_cluster(scheduler, function, tasks)
+        return
     if jobs == 1:
         yield from map(function, tasks)
         return
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
     # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        results = pool.map(function, tasks)
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    results = pool.map(function, tasks)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         yield from results
     except BaseException:
@@ -338,15 +333,8 @@ def pooled(jobs: int, function: Callable[[Given], Result],
         pool.shutdown(cancel_futures=True)
 
 
-def mapped(address: str, function: Callable[[Given], Result],
-           tasks: Sequence[Given]) -> Iterator[Result]:
-    """
-    Yield what a function makes of each task, in their order, computed by a cluster's workers.
-
-    :param address: of its scheduler, such as ``tcp://192.168.1.5:8786``.
-    :raises RuntimeError: if Dask is not installed here.
-    :raises OSError: if no scheduler answers there, or it is lost.
-    """
+def _on_cluster(address: str, function: Callable[[Given], Result],
+                tasks: Sequence[Given]) -> Iterator[Result]:
     try:
         from distributed import CancelledError, Client
     except ImportError as error:

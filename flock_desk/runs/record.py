@@ -12,12 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-A flight through the real nodes, read from its files: a replayed one, and one of a scenario.
 
-`fly` leaves the last flight in its folder, earlier ones by scenario below it. A flight is complete
-once its summary is written; one that failed before does not count.
-"""
+"""A flight through the real nodes, read from its files: a replayed one, and one of a scenario."""
 
 from __future__ import annotations
 
@@ -25,7 +21,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field
 import fcntl
-import json
 import math
 from pathlib import Path
 import shutil
@@ -52,23 +47,26 @@ from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.planner.params import PlannerParams
 
 LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
-EARLIER = 'earlier'
-PICTURE = 'picture.jpg'
 REPLAYED = 'vehicle that flew the commands'
 _RECORD = 'record'
-_FILES = ('flight.npz', 'report.html', PICTURE, 'summary.json')
+_FILES = (_RECORD, 'flight.npz', 'report.html', 'summary.json')
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Flight:
     """
-    What the pictures of a flight behind one neighbour show; times in s from its beginning.
+    A flight behind one neighbour; times in s from its beginning, vectors in odom.
 
     ``table`` is that of ``frame_errors``, n images; ``paths`` (n, 2) or (n, 3), m, are the
     leader's and the follower's at these, ``speeds`` times (m,) and speeds (m,), m/s, each by its
-    label. ``setpoints`` (k, 3), m/s^2, were sent at ``setpoint_times`` (k,), for lack of a command
-    if ``commanded`` (k,) is False. ``states`` are the planner's, with the times at which it
-    entered them. ``blind`` holds the times in which the leader could not be seen, from and to.
+    label; the first is the vehicle that flew the setpoints. ``setpoints`` (k, 3), m/s^2, were sent
+    at ``setpoint_times`` (k,), for lack of a command if ``commanded`` (k,) is False. ``states``
+    are the planner's, with the times at which it entered them. ``blind`` holds the times in which
+    the leader could not be seen, from and to.
+
+    Of a flight through the nodes: ``distance`` holds true distances, m, as often as they are
+    known; ``diagnostics`` the arrays published, each with its time; ``command_times`` are those
+    for which the planner commanded, s on the bag's clock.
     """
 
     name: str = LEADER_NAME
@@ -82,21 +80,8 @@ class Flight:
     commanded: NDArray[np.bool_] | None = None
     states: list[tuple[float, str]]
     blind: Sequence[tuple[float, float]] = ()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FlightRecord(Flight):
-    """
-    A flight through the nodes, its vectors in odom or a frame like it without drift.
-
-    ``paths`` are the true ones; the first of ``speeds`` are those of the vehicle that flew the
-    setpoints. ``distance`` holds true distances, m, as often as they are known. ``diagnostics``
-    are the arrays published, each with its time. ``command_times`` are those for which the planner
-    commanded, s on the bag's clock.
-    """
-
-    distance: Array
-    diagnostics: list[tuple[float, Any]]
+    distance: Array = field(default_factory=lambda: np.empty(0))
+    diagnostics: Sequence[tuple[float, Any]] = ()
     command_times: Array = field(default_factory=lambda: np.empty(0))
 
     def values(self, node: str, key: str) -> list[tuple[float, str]]:
@@ -111,9 +96,9 @@ class FlightRecord(Flight):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LiveRecord(FlightRecord):
+class LiveFlight(Flight):
     """
-    A flight of a scenario, in the odom frame without drift.
+    A flight of a scenario, in the odom frame without drift; its paths are the true ones.
 
     An image of the table counts as one with the leader in view if the simulator says that the
     leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
@@ -143,7 +128,7 @@ class LiveRecord(FlightRecord):
                              & (self.distance < math.sqrt(law.d1))))
 
 
-def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
+def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
     """
     Return a replayed flight; its time begins with the bag's first image.
 
@@ -167,18 +152,17 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> FlightRecord:
     source = OdometrySource()  # as the nodes read it
     own = [state for message in odometry
            if (state := source.take(message, stamp_to_nanoseconds(message.header.stamp)))]
-    # Its leader is in view in every image.
     leader_states, follower_states = (
         [*map(from_odometry, states)] for states in (true_leader, true_own))
     table = compared(estimates(record['/neighbors']), own, follower_states, leader_states,
-                     stamps, np.ones(len(stamps)), int(stamps[0]))
+                     stamps, np.ones(len(stamps)), int(stamps[0]))  # its leader is always in view
     # The bag's clock relative to the monotonic one of the logs.
     origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
     with np.load(out / 'autopilot.npz') as file:
         log = dict(file)
     flown, sent = ((log[name] >= received[0]) & (log[name] <= received[-1])
                    for name in ('state_time', 'setpoint_time'))
-    return FlightRecord(
+    return Flight(
         duration=float(table['time'][-1]), params=params, table=table,
         paths={'leader': _positions(leader_states, stamps),
                'follower': _positions(follower_states, stamps)},
@@ -198,7 +182,7 @@ def tick_time(message: Any) -> float:
     return (command.stamp + command.ahead) / NANOSECONDS
 
 
-def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord:
+def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight:
     """
     Return the flight of a scenario that `fly` recorded in a folder.
 
@@ -241,7 +225,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord
         log['image_stamp'], log['image_usable'].astype(float), epoch)
     times, hidden = table['time'], table['visible'] == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
-    return LiveRecord(
+    return LiveFlight(
         duration=ended - began, params=scenario.flight.planner(True), table=table,
         paths={name: log[f'{name}_position'] for name in (LEADER_NAME, 'follower')},
         speeds={'follower': (log['state_time'] - began, np.linalg.norm(log['velocity'], axis=1)),
@@ -268,8 +252,8 @@ def _of(array: Any, namespace: str) -> Any:
 
 
 def _states(log: Mapping[str, Any], name: str, stamps: Any) -> list[OdometryState]:
-    unknown = np.zeros((6, 6))
-    return [OdometryState(int(stamp), 'odom', name, position, quaternion, velocity, np.zeros(3),
+    zero, unknown = np.zeros(3), np.zeros((6, 6))
+    return [OdometryState(int(stamp), 'odom', name, position, quaternion, velocity, zero,
                           unknown, unknown, np.eye(3))
             for stamp, position, quaternion, velocity in zip(stamps, *(
                 log[f'{name}_{what}'] for what in ('position', 'quaternion', 'velocity')))]
@@ -281,12 +265,11 @@ def read_record(path: Path) -> dict[str, list[tuple[float, Any]]]:
 
     :raises BagError: if it cannot be read.
     """
-    record: dict[str, list[tuple[float, Any]]] = {}
     with open_bag(path) as bag:
-        for m in bag.messages():
-            record.setdefault(m.topic, []).append(
-                (m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype)))
-    return record
+        messages = [(m.topic, m.stamp_ns / NANOSECONDS, deserialize(m.data, m.msgtype))
+                    for m in bag.messages()]
+    return {topic: [(time, message) for name, time, message in messages if name == topic]
+            for topic in {topic for topic, _, _ in messages}}
 
 
 def estimates(messages: Sequence[tuple[float, Any]]) -> dict[int, dict[str, Estimate]]:
@@ -339,25 +322,13 @@ def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[Odometry
 def _positions(states: Sequence[OdometryState], stamps: NDArray[np.int64]) -> Array:
     """Return the positions (n, 3) at stamps, linear between states."""
     times = np.array([s.stamp for s in states]) - stamps[0]
-    positions = np.array([s.position for s in states])
-    return np.stack([np.interp(stamps - stamps[0], times, column) for column in positions.T],
-                    axis=1)
+    return along(stamps - stamps[0], times, np.array([s.position for s in states]))
 
 
-def scenario_flown(folder: Path) -> str:
-    """Return the name of the scenario of the flight in a folder, '' if none is complete."""
-    try:
-        summary = json.loads((folder / 'summary.json').read_text(encoding='utf-8'))
-    except (OSError, ValueError):
-        return ''
-    name = summary.get('scenario') if isinstance(summary, dict) else None
-    return name if isinstance(name, str) else ''
-
-
-def last_flight(folder: Path, scenario: str) -> Path | None:
-    """Return the folder below that of `fly` of the last complete flight of a scenario, if any."""
-    return next((place for place in (folder, folder / EARLIER / scenario)
-                 if scenario_flown(place) == scenario), None)
+def along(times: Array, known: Array, positions: Array) -> Array:
+    """Return positions (n, 3) at times (n,), linear between known ones; NaN outside."""
+    return np.stack([np.interp(times, known, column, np.nan, np.nan)
+                     for column in positions.T], axis=1)
 
 
 @contextlib.contextmanager
@@ -378,23 +349,8 @@ def locked(folder: Path) -> Iterator[None]:
 
 def clear(folder: Path) -> None:
     """Remove the record, the logs and the results of an earlier flight, and nothing else."""
-    shutil.rmtree(folder / _RECORD, ignore_errors=True)
     for path in (*(folder / name for name in _FILES), *folder.glob('*.log')):
-        path.unlink(missing_ok=True)
-
-
-def set_aside(folder: Path) -> None:
-    """
-    Move the complete flight in a folder to the earlier ones, in place of that of its scenario.
-
-    :raises OSError: if it cannot be moved.
-    """
-    scenario = scenario_flown(folder)
-    if not scenario or Path(scenario).name != scenario:
-        return  # nothing there, or not written by `fly`
-    place = folder / EARLIER / scenario
-    clear(place)
-    place.mkdir(parents=True, exist_ok=True)
-    for name in (_RECORD, *_FILES):  # the summary last: an incomplete flight does not count
-        if (folder / name).exists():
-            (folder / name).replace(place / name)
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

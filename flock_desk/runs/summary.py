@@ -12,10 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-The figures of a flight: those that ``evaluate``, ``demo`` and ``fly`` share, and those of each.
 
-A summary is a mapping of figures by name, groups of them nested; None is unknown.
+"""
+The figures of a flight, computed: those that ``evaluate``, ``demo`` and ``fly`` share, and others.
+
+A summary is a mapping of figures by name, groups of them nested; None is unknown. Words, units
+and bounds are in ``figure_table.py``.
 """
 
 from __future__ import annotations
@@ -31,8 +33,8 @@ from typing import Any
 import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation, STATES
-from flock_desk.runs.frame_errors import by_axis, STAGES, Table
-from flock_desk.runs.record import FlightRecord, LiveRecord
+from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.record import Flight, LiveFlight
 from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.files import whole_file
@@ -63,22 +65,21 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     rows = {column: np.concatenate([table[column] for table in tables]) for column in tables[0]}
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])
     in_view = rows['visible'] == 1.0
-    position, velocity = _errors(rows, 'position'), _errors(rows, 'velocity')
-    sigmas = by_axis(rows, 'velocity_sigma')[np.isfinite(by_axis(rows, 'velocity')).all(axis=1)]
-    usable = np.sum(sigmas ** 2, axis=1) <= max_velocity_std ** 2
-    distance_error = (rows['distance'] - rows['true_distance'])[found & known]
+    measured = np.isfinite(rows['position'] + rows['velocity']).all(axis=1)
+    usable = measured & (np.sum(rows['velocity_sigma']**2, axis=1) <= max_velocity_std**2)
+    off = (rows['distance'] - rows['true_distance'])[found & known]
     return {
         'frames_in_view': int(np.count_nonzero(in_view)) if np.any(known) else None,
         'recall': mean(found[in_view]) if np.any(known) else (mean(found) or 0.0),
         'distance_m': spread(rows['distance'][found]),
         'true_distance_m': spread(rows['true_distance'][known]),
-        'distance_rms_m': rms(distance_error),
-        'distance_bias_m': mean(distance_error),
-        'position_rms_m': rms(np.linalg.norm(position, axis=1)),
-        'position_bias_m': _by_axis(position),
-        'velocity_rms_m_s': rms(np.linalg.norm(velocity[usable], axis=1)),
-        'velocity_rms_of_all_m_s': rms(np.linalg.norm(velocity, axis=1)),
-        'velocity_bias_m_s': _by_axis(velocity[usable]),
+        'distance_rms_m': rms(off),
+        'distance_bias_m': mean(off),
+        'position_rms_m': rms(norms(rows['position'][measured])),
+        'position_bias_m': _by_axis(rows['position'][measured]),
+        'velocity_rms_m_s': rms(norms(rows['velocity'][usable])),
+        'velocity_rms_of_all_m_s': rms(norms(rows['velocity'][measured])),
+        'velocity_bias_m_s': _by_axis(rows['velocity'][usable]),
         'nees_position': mean(_finite(rows['nees_position'])),
         'nees_velocity': mean(_finite(rows['nees_velocity'])),
         'orientation_wrong_share': mean(_finite(rows['turned']) > WRONG_ATTITUDE)}
@@ -88,9 +89,9 @@ def consistency(nees: float | None) -> str:
     """Return the verdict on a mean NEES of three-dimensional errors, '' of an unknown one."""
     if nees is None:
         return ''
-    low, high = CONSISTENT
-    return ('consistent' if low <= nees <= high
-            else 'covariances too small' if nees > high else 'covariances too large')
+    if nees > CONSISTENT[1]:
+        return 'covariances too small'
+    return 'consistent' if nees >= CONSISTENT[0] else 'covariances too large'
 
 
 def hold_figures(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[float, str]],
@@ -101,15 +102,15 @@ def hold_figures(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[fl
     :param states: those entered, each with its time.
     :param reasons: those reported, each with its time; of a HOLD the first one reported during it.
     """
-    held: list[tuple[float, float, str]] = []
+    total, holds = 0.0, dict[str, str]()
     for (begin, state), (until, _) in zip(states, [*states[1:], (end, '')]):
         begin, until = max(begin, 0.0), min(until, end)
         if state == 'HOLD' and begin < until:
-            held.append((begin, until - begin, next(
-                (reason for t, reason in reasons if begin <= t <= until and reason),
-                'too short for its reason to be on /diagnostics')))
-    return {'planner': {'hold_count': len(held), 'hold_s': float(sum(s for _, s, _ in held))},
-            'holds': {f'at_{begin:.1f}_s': f'{span:.1f} s: {why}' for begin, span, why in held}}
+            total += until - begin
+            why = next((reason for t, reason in reasons if begin <= t <= until and reason),
+                       'too short for its reason to be on /diagnostics')
+            holds[f'at_{begin:.1f}_s'] = f'{until - begin:.1f} s: {why}'
+    return {'planner': {'hold_count': len(holds), 'hold_s': total}, 'holds': holds}
 
 
 def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
@@ -122,21 +123,21 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
     of ticks in which it was too fast. ``check`` holds the errors and the warnings of the rules of
     ``check``, a line each.
     """
-    tables = [evaluation.errors.table(name) for name in evaluation.names]
+    tables = [*evaluation.tables.values()]
     stages = np.concatenate([np.where(np.isfinite(table['distance']), table['stage'], 0.0)
                              for table in tables])
-    cpu = {what: 1e3 * np.asarray(times, dtype=float) for what, times in evaluation.cpu.items()}
-    spent = np.concatenate([cpu.get(stage, np.empty(0)) for stage in STAGES])
-    ticks, params = evaluation.ticks, evaluation.flight.planner_params
-    acceleration, speed = (column[~np.isnan(column)] for column in (ticks[:, 2], ticks[:, 3]))
+    cpu = {what: 1e3 * np.array(evaluation.cpu.get(what, ()), dtype=float)
+           for what in ('decode', *STAGES, 'planner', 'gate')}
+    ticks, params = evaluation.ticks, evaluation.params
+    acceleration, speed = _finite(ticks[:, 2]), _finite(ticks[:, 3])
     held = hold_figures(evaluation.states, evaluation.reasons, evaluation.duration)
     return jsonable({
-        'bag': evaluation.bag,
+        'bag': evaluation.bag.path.name,
         'duration_s': evaluation.duration,
         'check': {f'{level}s': [finding.line for finding in evaluation.findings
                                 if finding.level == level] for level in (ERROR, WARNING)},
-        'neighbors': evaluation.names,
-        'frames': len(evaluation.frames),
+        'neighbors': [*evaluation.tables],
+        'frames': evaluation.frames,
         **sight_figures(tables, params.max_velocity_std),
         'own_speed_max_m_s': most(speed),
         'faster_than_v_max_share': mean(ticks[:, 3] > params.v_max),
@@ -153,18 +154,18 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
         'setpoints': {
             **{kind: evaluation.setpoint_kinds[kind]
                for kind in ('command', 'brake', 'level', 'none')},
-            'acceleration_max_m_s2': most(np.linalg.norm(evaluation.setpoints[:, 1:4], axis=1)),
+            'acceleration_max_m_s2': most(norms(evaluation.setpoints[:, 1:4])),
             'reasons': dict(sorted(evaluation.brake_reasons.items()))},
-        'cpu_ms_per_frame': mean(spent),
+        'cpu_ms_per_frame': mean(np.concatenate([cpu[stage] for stage in STAGES])),
         'realtime_factor': evaluation.duration / evaluation.wall_time,
         'timings': {
             'wall_time_s': evaluation.wall_time,
-            'cpu_ms': {what: _percentiles(cpu.get(what, np.empty(0)))
-                       for what in ('decode', *STAGES, 'planner', 'gate')}}})
+            'cpu_ms': {what: {
+                'p50': percentile(times, 50), 'p99': percentile(times, 99), 'count': len(times)}
+                for what, times in cpu.items()}}})
 
 
-def flight_figures(flight: FlightRecord,
-                   exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
     """
     Return the figures that ``demo`` and ``fly`` have in common, NaN if they are unknown.
 
@@ -175,27 +176,26 @@ def flight_figures(flight: FlightRecord,
     """
     held = hold_figures(flight.states, flight.values('planner', 'reason'), flight.duration)
     after = flight.duration + 1.0  # every node publishes its counters once per second
+    missed = (flight.value('planner', 'missed_ticks', after)
+              - flight.value('planner', 'missed_ticks', 0.0, 0.0))
     return {
         'duration_s': flight.duration,
         'frames': len(flight.table['time']),
         **sight_figures([flight.table], flight.params.max_velocity_std),
         'true_distance_m': spread(flight.distance),
-        'planner': {'missed_ticks': flight.value('planner', 'missed_ticks', after)
-                    - flight.value('planner', 'missed_ticks', 0.0, 0.0),
-                    **held['planner']},
+        'planner': {'missed_ticks': missed, **held['planner']},
         'holds': held['holds'],
         'setpoints': {
             'sent': len(flight.setpoints),
             'rate_hz': rate(flight.setpoint_times),
-            'acceleration_max_m_s2': most(np.linalg.norm(flight.setpoints, axis=1))},
+            'acceleration_max_m_s2': most(norms(flight.setpoints))},
         'speed_max_m_s': most(next(iter(flight.speeds.values()))[1]),
         'latency_ms': {f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
                        for p in (50, 95, 99)},
         'failed_processes': sum(code != 0 for code in exit_codes.values())}
 
 
-def replay_figures(flight: FlightRecord,
-                   exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
     """
     Return the summary of ``demo``.
 
@@ -211,7 +211,7 @@ def replay_figures(flight: FlightRecord,
         'planner': {'rate_hz': rate(flight.command_times), **common['planner']}})
 
 
-def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
+def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
                      exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
     """
     Return the summary of ``fly``.
@@ -232,6 +232,7 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
     times, leader_speeds = flight.speeds['leader']
     common = flight_figures(flight, exit_codes)
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
+    missed = common['planner']['missed_ticks'] * flight.params.period / flight.duration
     return jsonable({
         'scenario': flight.scenario.name,
         **common,
@@ -242,12 +243,8 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
         'leader_faster_than_v_max': _longest(
             times, leader_speeds > 1.001 * params.v_max) >= OUTRUN,
         'altitude_off_m': most(_altitude_off(flight)),
-        'planner': {
-            **common['planner'],
-            'missed_ticks_share': common['planner']['missed_ticks'] * flight.params.period
-            / flight.duration,
-            'warnings': len(warnings),
-            'warning': warnings[0] if warnings else None},
+        'planner': {**common['planner'], 'missed_ticks_share': missed, 'warnings': len(warnings),
+                    'warning': warnings[0] if warnings else None},
         'outages': {outage_name(outage): _outage(flight, outage)
                     for outage in judged_outages(flight)},
         'problems': _problems(flight),
@@ -261,7 +258,7 @@ def scenario_figures(flight: LiveRecord, cores: Mapping[str, float],
                       **dict(sorted(cores.items(), key=lambda item: -item[1]))}})
 
 
-def _altitude_off(flight: LiveRecord) -> Array:
+def _altitude_off(flight: LiveFlight) -> Array:
     """
     Return the height difference between follower and leader, m, at the images that count.
 
@@ -286,13 +283,13 @@ def outage_name(outage: Outage) -> str:
     return f'{outage.what}_at_{outage.at:g}_s'
 
 
-def judged_outages(flight: LiveRecord) -> list[Outage]:
+def judged_outages(flight: LiveFlight) -> list[Outage]:
     """Return the outages long enough, and flown far enough, to demand HOLD."""
     return [outage for outage in flight.scenario.outages if outage.duration >= hold_within(outage)
             and flight.duration >= outage.at + hold_within(outage)]
 
 
-def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
+def _outage(flight: LiveFlight, outage: Outage) -> dict[str, Any]:
     """Return when the planner held after an outage began, and followed again after its end."""
     end = outage.at + outage.duration
     held = next((t for t, s in flight.states if s == 'HOLD' and t >= outage.at), math.nan)
@@ -302,7 +299,7 @@ def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
             'reasons': len(reasons), 'reason': reasons[-1] if reasons else None}
 
 
-def _problems(flight: LiveRecord) -> dict[str, int]:
+def _problems(flight: LiveFlight) -> dict[str, int]:
     """Return the count of each problem reported by each node; numbers in its text are masked."""
     reported = Counter(
         f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
@@ -352,13 +349,16 @@ def most(values: Array) -> float | None:
     return float(np.max(values)) if len(values) and np.isfinite(values).all() else None
 
 
+def percentile(values: Array, percent: float) -> float | None:
+    """Return a percentile, or None of nothing."""
+    return float(np.percentile(values, percent)) if len(values) else None
+
+
 def spread(values: Array) -> dict[str, float | None]:
     """Return least, mean and greatest finite value."""
     values = _finite(values)
-    if not len(values):
-        return {'min': None, 'mean': None, 'max': None}
-    return {'min': float(np.min(values)), 'mean': float(np.mean(values)),
-            'max': float(np.max(values))}
+    return {'min': float(np.min(values)) if len(values) else None, 'mean': mean(values),
+            'max': most(values)}
 
 
 def rate(times: Array) -> float:
@@ -366,10 +366,9 @@ def rate(times: Array) -> float:
     return float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 else 0.0
 
 
-def _errors(rows: Table, kind: str) -> Array:
-    """Return the errors (n, 3) of the images where they are known."""
-    errors = by_axis(rows, kind)
-    return errors[np.isfinite(errors).all(axis=1)]
+def norms(vectors: Array) -> Array:
+    """Return the norms (n,) of vectors (n, 3)."""
+    return np.linalg.norm(vectors, axis=1)
 
 
 def _finite(values: Array) -> Array:
@@ -378,10 +377,3 @@ def _finite(values: Array) -> Array:
 
 def _by_axis(errors: Array) -> dict[str, float | None]:
     return {axis: mean(errors[:, i]) for i, axis in enumerate('xyz')}
-
-
-def _percentiles(values: Array) -> dict[str, float | int | None]:
-    if not len(values):
-        return {'p50': None, 'p99': None, 'count': 0}
-    p50, p99 = np.percentile(values, [50, 99])
-    return {'p50': float(p50), 'p99': float(p99), 'count': len(values)}

@@ -14,7 +14,6 @@
 
 """The embedded autopilots: modes, setpoints, answers, parameters, reboots, the command."""
 
-import argparse
 import math
 import os
 import signal
@@ -30,7 +29,6 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk import autopilot
-from flock_desk.runs.console import parsed
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import GRAVITY
@@ -286,8 +284,7 @@ def test_bad_arguments_are_one_line(arguments, complaint, capsys):
     ('px4', 'config/px4.params', 'COM_OF_LOSS_T'),
     ('arducopter', 'config/ardupilot.parm', 'GUID_TIMEOUT')])
 def test_the_recommended_parameters_can_be_set_from_their_file(personality, file, name):
-    options = parsed(argparse.ArgumentParser(), [
-        '--personality', personality, '--param-file', file], autopilot.OPTIONS)
+    options = autopilot.parser().parse_args(['--personality', personality, '--param-file', file])
     parameters = autopilot.settings(options)['parameters']
     options.param = [f'{name}=0.25']
     changed = autopilot.settings(options)['parameters']

@@ -21,7 +21,6 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.external.external_motion import (
-    BootClock,
     ExternalMotion,
     JUMP,
     LONGEST_GAP,
@@ -133,23 +132,6 @@ def test_the_estimate_counts_only_where_no_truth_came():
     assert not reported.estimated
 
 
-def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
-    clock = BootClock()
-    stamps = [clock.stamp((2**32 - 40 + 20 * k) % 2**32, (1_000 + 20 * k) * MS)
-              for k in range(5)]
-    np.testing.assert_allclose(np.diff(stamps), 20 * MS, atol=50_000)
-    # A long silence: the clock went on.
-    assert clock.stamp(300, 9_000 * MS) == pytest.approx((1_000 + 340) * MS, abs=20 * MS)
-    assert not clock.rebooted
-    clock = BootClock()
-    clock.stamp(50_000, 1_000 * MS)
-    assert clock.stamp(400, 2_000 * MS) == 2_000 * MS and clock.rebooted
-    # After it nothing is interpolated from before.
-    motion = received(*((now, estimate(boot, (0.0, 0.0, 0.0))) for boot, now in (
-        (50_000, 0), (50_020, 20), (100, 60))), by_estimate=True)
-    assert (motion.knows(50 * MS), motion.knows(60 * MS)) == (False, True)
-
-
 @pytest.mark.parametrize('message', [
     truth('SIM_STATE', velocity=(math.nan, 0.0, 0.0)),
     mavlink.MAVLink_sim_state_message(*[0.0] * 21, 474000000, 85000000),  # no attitude
@@ -157,10 +139,3 @@ def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
 ])
 def test_what_is_no_pose_places_nothing(message):
     assert received((0, message)).newest is None
-
-
-def test_the_pace_of_the_autopilots_time_is_told_once_there_is_a_second_of_it():
-    assert math.isnan(ExternalMotion().pace(0.0))
-    motion = received(*((500 * k, mavlink.MAVLink_system_time_message(0, 400 * k))
-                     for k in range(12)))
-    assert motion.pace(0.0) == pytest.approx(0.8) and math.isnan(motion.pace(5.4))

@@ -68,8 +68,8 @@ def evaluated(case: Case, folder: Path) -> tuple[Evaluation, dict[str, Any]]:
 
 def worst_second(evaluation: Evaluation) -> float:
     """Return the largest mean error of the velocity, m/s, over a second in TRACK."""
-    table = evaluation.errors.table('leader')
-    error = np.stack([table[f'velocity_{axis}'] for axis in 'xyz'], axis=1)
+    table = evaluation.tables['leader']
+    error = table['velocity']
     ticks = evaluation.ticks
     tracking = ticks[:, 1] == STATES.index(State.TRACK.value)
     worst = []

@@ -84,9 +84,6 @@ def test_a_second_camera_that_sees_nobody_changes_nothing(
         assert together[key] == pytest.approx(alone[key], rel=1e-9), key
     assert together['planner']['states'] == alone['planner']['states']
     assert together['rejections'] == alone['rejections']
-    # Only those images of the left camera are looked at in which it was searched for at first.
-    spent = together['timings']['cpu_ms']
-    assert spent['none']['count'] >= 34
 
 
 def test_a_topic_that_is_missing_is_named_with_its_camera(
@@ -95,7 +92,7 @@ def test_a_topic_that_is_missing_is_named_with_its_camera(
         **CAMERAS['camera'], 'left': {'rpy': [0.0, 0.0, 1.2]}})  # type: ignore[dict-item]
     assert main([str(bags[1]), '--output', str(tmp_path / 'out'), '--config', wrong]) == 2
     reported = capsys.readouterr().err
-    assert 'holds no message on /left/image_raw of camera left, only on ' in reported
+    assert 'no message on /left/image_raw or /left/image_raw/compressed of camera left' in reported
     assert '/port/mono/compressed' in reported
 
 

@@ -25,8 +25,8 @@ import pytest
 from flock_desk.demo import BOUNDS, PARAMS
 from flock_desk.runs.evaluation import evaluate
 from flock_desk.runs.judge import judge
-from flock_desk.runs.plots import chapters, flight_picture
-from flock_desk.runs.record import FlightRecord, read_replayed
+from flock_desk.runs.plots import chapters
+from flock_desk.runs.record import Flight, read_replayed
 from flock_desk.runs.summary import evaluation_figures, replay_figures
 from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
@@ -53,7 +53,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
 
 @pytest.fixture(scope='module')
 def flight(evaluated: tuple[Path, dict[str, Any]],
-           tmp_path_factory: pytest.TempPathFactory) -> FlightRecord:
+           tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Return the flight of a record made of that: nothing late, nothing lost."""
     out = tmp_path_factory.mktemp('record')
     with open_bag(evaluated[0]) as result, BagWriter(out / 'record') as record:
@@ -80,7 +80,7 @@ def diagnostics() -> Any:
 
 
 def test_its_figures_are_those_of_evaluate(
-        evaluated: tuple[Path, dict[str, Any]], flight: FlightRecord) -> None:
+        evaluated: tuple[Path, dict[str, Any]], flight: Flight) -> None:
     mine, theirs = replay_figures(flight, {}), evaluated[1]
     for key in ('frames', 'frames_in_view', 'recall'):
         assert mine[key] == theirs[key]
@@ -93,7 +93,7 @@ def test_its_figures_are_those_of_evaluate(
         {'sent': len(flight.setpoints), 'rate_hz': 20.0, 'acceleration_max_m_s2': 0.3})
 
 
-def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: FlightRecord) -> None:
+def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: Flight) -> None:
     summary = replay_figures(flight, {'planner': 0, 'replay': 0})
     assert [j.fault for j in judge(BOUNDS, summary) if j.fault] == []
     ended_badly = replay_figures(flight, {'planner': None, 'replay': 1})
@@ -106,7 +106,6 @@ def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: FlightRe
     assert all(j.fault for j in judge(BOUNDS, {}))
 
 
-def test_the_report_shows_the_flight_and_its_errors(flight: FlightRecord) -> None:
+def test_the_report_shows_the_flight_and_its_errors(flight: Flight) -> None:
     flown, errors = chapters(flight)
     assert [len(chapter.illustrations) for chapter in (flown, errors)] == [1, 1]
-    assert flight_picture(flight, 'a title').startswith(b'\x89PNG')

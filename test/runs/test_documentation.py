@@ -37,57 +37,36 @@ def test_the_parameter_page_is_that_of_the_nodes():
     assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown()
 
 
-@PAGES
-def test_every_file_and_folder_a_page_names_exists(page):
-    text = (ROOT / page).read_text()
-    folders = 'benchmarks|config|bags|deploy|docs|examples|launch|test|requirements|flock_follower'
-    named = re.findall(rf'`((?:{folders})/[\w./@-]*)`', text)
-    for name in named:
-        assert (ROOT / name).exists(), name
-
-
-@PAGES
-def test_every_module_a_page_runs_exists(page):
-    text = (ROOT / page).read_text()
-    for module in set(re.findall(r'-m (flock_follower[\w.]+)', text)):
-        assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module
-
-
+FOLDERS = 'benchmarks|config|bags|deploy|docs|examples|launch|test|requirements|flock_follower'
 #: Targets of PX4's Makefile.
-ELSEWHERE = ('px4_sitl', 'sihsim_quadx')
+ELSEWHERE = {'px4_sitl', 'sihsim_quadx'}
 SERVICES = {'mavlink_bridge/arm', 'mavlink_bridge/takeoff', 'mavlink_bridge/offboard',
             'mavlink_bridge/land', 'planner/engage', 'replay/pause'}
 
 
 @PAGES
-def test_every_command_of_ours_exists(page):
-    text = (ROOT / page).read_text()
-    targets = re.findall(r'^([\w.-]+):', (ROOT / 'Makefile').read_text(), re.M)
+def test_every_file_module_and_command_that_a_page_names_exists(page):
+    text, makefile, setup = (
+        (ROOT / name).read_text() for name in (page, 'Makefile', 'setup.py'))
+    for name in re.findall(rf'`((?:{FOLDERS})/[\w./@-]*)`', text):
+        assert (ROOT / name).exists(), name
+    for module in re.findall(r'-m (flock_[\w.]+)', text):
+        assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module
     for line in re.findall(r'^(?: {4,}|`)(make [^`\n#]*)', text, re.M):
-        called = [word for word in line.split()[1:] if '=' not in word and word[0] != '-']
-        assert set(called) <= {*targets, *ELSEWHERE}, line
-    programs = re.findall(r"'(\w+) = flock_", (ROOT / 'setup.py').read_text())
+        called = {word for word in line.split()[1:] if '=' not in word and word[0] != '-'}
+        assert called <= {*re.findall(r'^([\w.-]+):', makefile, re.M)} | ELSEWHERE, line
     for name in re.findall(r'ros2 run flock_follower (\w+)', text):
-        assert name in programs, name
-    for name, arguments in re.findall(r'ros2 launch flock_follower (\S+?)`?((?: \w+:=\S+)*)$',
-                                      text, re.M):
-        file = ROOT / 'launch' / name
-        assert file.exists(), name
-        said = file.read_text() + (ROOT / 'launch' / 'follower.launch.py').read_text()
-        for argument in re.findall(r'(\w+):=', arguments):
-            assert f"'{argument}': (" in said, argument
-    called = re.findall(r'ros2 service call /(\S+)', text)
-    called += re.findall(r'nodes[.]call /?(\w+/\w+)', text)
-    for service in called:
-        assert service in SERVICES, service
-    for extra in re.findall(r"pip install '\.\[(\w+)\]'", text):
-        assert f"'{extra}': [" in (ROOT / 'setup.py').read_text(), extra
+        assert f"'{name} = flock_" in setup, name
     for name in re.findall(r'^    flock_follower (\w+)', text, re.M):
         assert name in PROGRAMS, name
-    options = (ROOT / 'deploy' / 'install.sh').read_text().partition('END')[2]
-    for line in re.findall(r'deploy/install\.sh ([^#`\n]*)', text):
-        for option in re.findall(r'--[\w-]+', line):
-            assert f'  {option} ' in options, option
+    for name, arguments in re.findall(r'ros2 launch flock_follower (\S+?)`?((?: \w+:=\S+)*)$',
+                                      text, re.M):
+        launch = ''.join((ROOT / 'launch' / file).read_text()
+                         for file in (name, 'follower.launch.py'))
+        for argument in re.findall(r'(\w+):=', arguments):
+            assert f"'{argument}': (" in launch, argument
+    for service in re.findall(r'(?:ros2 service call /|nodes[.]call /?)(\w+/\w+)', text):
+        assert service in SERVICES, service
 
 
 def test_the_law_on_the_first_page_runs():

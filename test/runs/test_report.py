@@ -12,22 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The table on the console: what it shows, how wide it gets, and what it returns."""
+
+"""Bounds on figures, and what is shown of them: the console's table and the page."""
 
 from __future__ import annotations
 
 from pathlib import Path
+import re
 from typing import Any
 
 import pytest
 
-from flock_desk.runs.console import aligned, guarded, Progress
-from flock_desk.runs.judge import FigureBound, judge
+from flock_desk.runs.console import guarded, progress
+from flock_desk.runs.figure_table import bounds, FIGURES, words
+from flock_desk.runs.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
 from flock_desk.runs.processes import TooBusyError
-from flock_desk.runs.report import announce, name, table, text, WIDTH, write_report
+from flock_desk.runs.report import announce, table, text, WIDTH, write_report
 
 SUMMARY: dict[str, Any] = {
     'frames': 360, 'recall': 0.97, 'nees_position': None, 'bag': 'sample',
+    'distance_m': {'min': 1.3, 'max': 2.5}, 'rejections': {'outside the gate': 4},
     'setpoints': {'sent': 236, 'rate_hz': 20.0},
     'outages': {'vio_at_20_s': {'hold_after_s': 0.21, 'reason': 'odometry comes late'}},
     'planner': {'missed_ticks': 0, 'warning': 'leader too fast: ' + 99 * '!'}}
@@ -35,32 +39,88 @@ BOUNDS = (FigureBound('recall', least=0.98), FigureBound('setpoints.rate_hz', 19
           FigureBound('planner.missed_ticks', most=3), FigureBound('nees_position', 1.0, 6.0))
 
 
-def test_bounds_stand_beside_their_figures_in_a_hundred_columns() -> None:
+def faults(document: Any) -> list[str]:
+    found = parse_bounds(document)
+    check_names(found, SUMMARY)
+    return [judgement.fault for judgement in judge(found, SUMMARY) if judgement.fault]
+
+
+def test_bounds_hold_at_both_ends_and_each_broken_one_is_named() -> None:
+    assert faults({'recall': {'min': 0.97, 'max': 0.97}, 'frames': {'min': 1},
+                   'distance_m.max': {'max': 2.83}}) == []
+    assert faults({'recall': {'min': 0.98}, 'distance_m.min': {'max': 1.0},
+                   'rejections.outside the gate': {'max': 3}}) == [
+        'recall = 0.97: must be at least 0.98', 'distance_m.min = 1.3: must be at most 1',
+        'rejections.outside the gate = 4: must be at most 3']
+    # What is not known fails, what was never counted is zero.
+    assert faults({'nees_position': {'max': 6.0}, 'rejections.invalid image': {'max': 0}}) == [
+        'nees_position is not known: it was not measured, or is not finite']
+    for figure in (float('nan'), float('inf'), -float('inf')):
+        for bound in (FigureBound('x', least=1.0), FigureBound('x', most=1.0)):
+            assert judge([bound], {'x': figure})[0].fault == f'x = {figure:g}: must be finite'
+
+
+@pytest.mark.parametrize(('document', 'message'), [
+    ({'recal': {'min': 1}}, 'recal is no figure of the summary: must be one of recall'),
+    ({'bag': {'min': 1}}, 'bag is no figure'), ({'distance_m': {'min': 1}}, 'distance_m is no'),
+    ({'recall': 0.9}, 'recall = 0.9: must have min, max or both, finite numbers'),
+    ({'recall': {'least': 0.9}}, 'must have min'), ({'recall': {}}, 'must have min'),
+    ({'recall': {'min': 'high'}}, 'finite numbers'), ({'recall': {'min': True}}, 'finite numbers'),
+    ({'recall': {'min': float('nan')}}, 'finite numbers'),
+    ([], 'must map figures'), (None, 'must map figures')])
+def test_a_wrong_bound_is_named(document: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        faults(document)
+
+
+def test_a_wrong_file_of_bounds_is_named(tmp_path: Path) -> None:
+    path = tmp_path / 'bounds.yaml'
+    for content in ('recall: {min: 0.9', 'recall: 1'):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=f'^{path}: '):
+            load_bounds(path)
+
+
+def test_each_command_has_the_bounds_of_the_table() -> None:
+    limits = {'near': 0.9, 'far': 2.83, 'a_max': 2.5, 'speed': 0.55, 'planned': 59.9}
+    fly, external = bounds('fly', limits), bounds('external', limits)
+    assert fly['true_distance_m.max'] == ('true_distance_m.max', None, 2.83)
+    assert 'true_distance_m.max' not in external and 'external.pace' not in fly
+    assert external['duration_s'].least == 59.9 and external['time_in_band_share'].least == 0.99
+    assert all(key in FIGURES for key in {**fly, **external, **bounds('demo', limits)})
+
+
+def test_bounds_stand_beside_their_figures_in_a_hundred_columns(
+        capsys: pytest.CaptureFixture[str]) -> None:
     lines = table(SUMMARY, judge(BOUNDS, SUMMARY))
     assert max(map(len, lines)) <= WIDTH
-    assert [line.split() for line in lines[:4]] == [
+    assert [line.split() for line in lines[:3]] == [
         ['frames', '360'], ['recall', '0.97', '≥', '0.98', 'FAILED'],
-        ['nees_position', 'unknown', '≥', '1,', '≤', '6', 'FAILED'], ['setpoints.sent', '236']]
-    assert '  planner.missed_ticks                    0  ≤ 3               ok' in lines
-    assert not any('bag' in line for line in lines)  # is no figure worth a line
-    assert any(line.endswith('odometry comes late') for line in lines)
-
-
-def test_a_bound_on_what_is_not_in_the_summary_is_shown(
-        capsys: pytest.CaptureFixture[str]) -> None:
+        ['nees_position', 'unknown', '≥', '1,', '≤', '6', 'FAILED']]
+    shown = '\n'.join(lines)
+    assert 'bag' not in shown and 'odometry comes late' in shown  # the bag is no figure
+    assert re.search(r'planner.missed_ticks +0 +≤ 3 +ok', shown)
     judgements = judge([FigureBound('setpoints.reasons.no command', most=2),
                         FigureBound('nowhere', most=2)], SUMMARY)
-    assert announce(SUMMARY, judgements, [Path('out/report.html'), Path('out/report.png')],
-                    Path('logs')) == 1
+    assert announce(SUMMARY, judgements, [Path('out/report.html')], Path('logs')) == 1
     out, errors = capsys.readouterr()
     assert 'setpoints.reasons.no command' in out and 'nowhere' in out
-    assert out.splitlines()[-2:] == ['report: out/report.html', 'picture: out/report.png']
+    assert out.splitlines()[-1] == 'report: out/report.html'
     assert errors.splitlines() == [
-        'FAILED: nowhere is not known: it was not measured (no truth, no image, no /proc), or a '
-        'value that it rests on is not finite',
+        'FAILED: nowhere is not known: it was not measured, or is not finite',
         'the logs of every process are in logs']
     assert announce(SUMMARY, judgements[:1], [], Path('logs')) == 0
-    assert capsys.readouterr().err == ''
+
+
+def test_the_page_names_figures_in_words_with_their_keys_and_warnings_first(
+        tmp_path: Path) -> None:
+    write_report(tmp_path / 'report.html', 'A & B', '<p>', SUMMARY, judge(BOUNDS, SUMMARY),
+                 warnings=['too fast & furious'])
+    page = (tmp_path / 'report.html').read_text()
+    assert '<p class="warning">Too fast &amp; furious.</p><h2>Bounds</h2>' in page
+    assert '<h1>A &amp; B</h1><p>&lt;p&gt;</p>' in page and page.count('>FAILED<') == 2
+    assert ('<tr title="outages.vio_at_20_s.hold_after_s"><td>vio at 20 s: it held after, s</td>'
+            '<td>0.21</td>') in page
 
 
 @pytest.mark.parametrize(('error', 'code', 'line'), [
@@ -76,67 +136,19 @@ def test_a_command_ends_in_one_line_and_its_exit_code(
 
 
 def test_progress_is_shown_in_a_pipe_too(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress(2) as progress:
-        progress.start('first')
-        for share in (0.2, 0.4, 0.6):
-            progress.share(share)
-        progress.start('second')
-    shown = capsys.readouterr().err
-    assert shown.startswith('\rbegin:   0 %') and 'second: 100 %' in shown
-    assert len(shown.splitlines()) <= 3
+    with progress(2) as bar:
+        for name in ('first', 'second'):
+            bar.set_description_str(name)
+            bar.update()
+    assert 'second: 100 %' in capsys.readouterr().err
 
 
-def test_columns_are_aligned() -> None:
-    assert aligned([['a', 'model', '1'], ['long', 'b', '22.5']]) == [
-        'a     model     1', 'long  b      22.5']
-
-
-def test_without_matplotlib_the_page_says_so(tmp_path: Path) -> None:
-    def draw() -> list[Any]:
-        raise ImportError
-
-    write_report(tmp_path / 'report.html', 'A & B', '<p>', SUMMARY, judge(BOUNDS, SUMMARY), draw)
-    page = (tmp_path / 'report.html').read_text()
-    assert 'They need matplotlib, which is not installed.' in page
-    assert '<h1>A &amp; B</h1><p>&lt;p&gt;</p>' in page and page.count('>FAILED<') == 2
-    # In words, a group within indented; the key is told where the pointer rests.
-    assert '<tr class="head"><td>vio at 20 s</td><td></td></tr>' in page
-    assert ('<tr class=part title="outages.vio_at_20_s.hold_after_s">'
-            '<td>it held after, s</td><td>0.21</td>') in page
-    assert 'class="warning">' not in page
-
-
-def test_what_has_to_be_known_first_stands_at_the_top(tmp_path: Path) -> None:
-    write_report(tmp_path / 'report.html', 'A', 'b', SUMMARY, judge(BOUNDS, SUMMARY),
-                 warnings=['too fast & furious'])
-    page = (tmp_path / 'report.html').read_text()
-    assert '<p class="warning">Too fast &amp; furious.</p><h2>Bounds</h2>' in page
-
-
-def test_what_is_part_of_a_total_is_indented_below_it() -> None:
-    cores = {'total': 1.25, 'simulator': 0.5, 'planner': 0.75}
-    assert table({'cpu_cores': cores}, []) == [
-        '  cpu_cores.total  1.25', '    simulator       0.5', '    planner        0.75']
-
-
-def test_a_long_text_goes_on_below() -> None:
-    lines = table({'holds': {'at_2.0_s': '1.0 s: ' + 30 * 'why ', 'at_9.0_s': '2.0 s: x'}}, [])
-    assert len(lines) == 3 and max(map(len, lines)) <= WIDTH
-    assert ' '.join(' '.join(lines[:2]).split()) == f'holds.at_2.0_s 1.0 s: {(30 * "why ")[:-1]}'
-
-
-@pytest.mark.parametrize('key, words', [
-    ('velocity_rms_m_s', 'error of the relative velocity, RMS of the vector, m/s'),
-    ('rate_hz', 'rate, Hz'), ('time_in_band_share', 'share of time in the band'),
-    ('some_new_thing_ms', 'some new thing, ms'), ('at_20.2_s', 'at 20.2 s'),
-    ('no command', 'no command')])
-def test_figures_are_named_in_words_with_their_units(key: str, words: str) -> None:
-    assert name(key) == words
-
-
-@pytest.mark.parametrize('value, shown', [
+@pytest.mark.parametrize(('value', 'shown'), [
     (None, 'unknown'), (True, 'yes'), (12, '12'), (0.0, '0'), (-1.9e-6, '0'),
-    (8.694e-4, '0.00087'),
-    (0.037821, '0.03782'), (1330.04, '1330'), (['a', 'b'], 'a, b')])
+    (8.694e-4, '0.00087'), (0.037821, '0.03782'), (1330.04, '1330'), (['a', 'b'], 'a, b')])
 def test_figures_have_as_many_digits_as_people_read(value: Any, shown: str) -> None:
     assert text(value) == shown
+
+
+def test_a_figure_that_is_not_in_the_table_is_named_by_its_key() -> None:
+    assert words('some_group.new_thing') == 'new thing' and words('latency_ms.p50') == 'median'

@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 
 from flock_desk import sample_bag as sample
-from flock_desk.camera.lens import Camera
-from flock_desk.camera.renderer import Sensor
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.files import resource
 from flock_follower.perception.markers import detect
@@ -67,21 +65,3 @@ def test_everything_else_made_again_is_the_same_byte_for_byte(bag, recording):
     truth = [recording.truth(k) for k in range(360)]
     assert [t[0] for t in truth] == bag['/truth/odom']
     assert [t[1] for t in truth] == bag['/truth/neighbors']
-
-
-def test_a_bag_does_not_depend_on_how_many_processes_render_it(tmp_path):
-    tiny = sample.Variant('', 0.1, Camera(width=64, height=48), Sensor(sub_poses=1), None)
-    for jobs in (1, 2):
-        sample.write(tiny, 1, tmp_path / str(jobs) / 'tiny', jobs)
-    files = [(tmp_path / str(jobs) / 'tiny' / 'tiny.mcap').read_bytes() for jobs in (1, 2)]
-    assert files[0] == files[1]
-    with open_bag(tmp_path / '1' / 'tiny') as opened:
-        assert opened.topics['/image_raw'].count == 3
-
-
-def test_a_folder_that_is_no_bag_is_not_replaced(tmp_path, capsys):
-    (tmp_path / 'sample').mkdir()
-    (tmp_path / 'sample' / 'notes.txt').write_text('mine')
-    assert sample.main(['--out', str(tmp_path)]) == 1
-    assert 'exists and is not a bag: not replaced' in capsys.readouterr().err
-    assert (tmp_path / 'sample' / 'notes.txt').read_text() == 'mine'

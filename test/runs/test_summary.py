@@ -25,6 +25,7 @@ from flock_desk.runs.summary import (
     consistency,
     hold_figures,
     jsonable,
+    most,
     rate,
     sight_figures,
     spread,
@@ -64,15 +65,6 @@ def table(estimates: dict[int, dict[str, Estimate]], leader: list[float],
                     np.ones(len(STAMPS)) if visible is None else visible, 0)
 
 
-def test_drift_common_to_both_is_no_error() -> None:
-    figures = sight_figures([table(found(straight([2.0, 0.5, 0.0], 0.3)), [2.0, 0.5, 0.0], 0.3)],
-                            1.0)
-    assert figures['recall'] == 1.0
-    assert figures['position_rms_m'] == pytest.approx(0.0, abs=1e-9)
-    assert figures['velocity_rms_m_s'] == pytest.approx(0.0, abs=1e-9)
-    assert figures['distance_m']['mean'] == pytest.approx(np.hypot(2.0, 0.5))
-
-
 def test_an_offset_of_the_neighbour_is_the_error() -> None:
     estimates = found(straight([2.0, 0.0, 0.0]), np.array([0.0, 0.1, 0.0]))
     figures = sight_figures([table(estimates, [2.03, 0.04, 0.0])], 1.0)
@@ -108,6 +100,7 @@ def test_what_is_not_known_is_none() -> None:
     nothing = sight_figures([table({}, [2.0, 0.0, 0.0])], 1.0)
     assert nothing['position_rms_m'] is None and nothing['distance_m']['min'] is None
     assert spread(np.array([1.0, 2.0, 6.0])) == {'min': 1.0, 'mean': 3.0, 'max': 6.0}
+    assert most(np.array([1.0, np.inf])) is None and most(np.array([np.nan, 1.0])) is None
     assert jsonable({'a': {'b': np.nan, 'c': float('inf'), 'd': 1.0}}) == {
         'a': {'b': None, 'c': None, 'd': 1.0}}
 
@@ -126,11 +119,8 @@ def test_a_hold_is_told_with_its_length_and_reason() -> None:
     assert hold_figures([], [], 1.0) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
 
 
-def test_the_consistency_of_covariances_has_a_verdict() -> None:
-    assert [consistency(nees) for nees in (None, 1.4, 3.0, 6.1)] == [
-        '', 'covariances too large', 'consistent', 'covariances too small']
-
-
-def test_a_rate_counts_intervals() -> None:
+def test_a_rate_counts_intervals_and_a_nees_has_a_verdict() -> None:
     assert rate(np.arange(11) * 0.1) == pytest.approx(10.0)
     assert rate(np.array([1.0])) == 0.0
+    assert [consistency(nees) for nees in (None, 1.4, 3.0, 6.1)] == [
+        '', 'covariances too large', 'consistent', 'covariances too small']
