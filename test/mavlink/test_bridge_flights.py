@@ -66,7 +66,7 @@ def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer()
     """The autopilot's height follows it, in the hold mode too: on real ones to the ground."""
     flight = forwarding(Flight(**without_gps('px4')))
     flight.engage()
-    flight.odom_error[2] = -1.5
+    flight.odom_error[2] = -0.8
     flight.fly(6.0)
     errors = []
     for _ in range(20):
