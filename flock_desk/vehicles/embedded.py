@@ -50,9 +50,9 @@ STEP: Final[float] = 0.01  # s
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')
 #: PX4 sends CURRENT_MODE at the most every so many seconds while the mode stays.
 CURRENT_MODE_PERIOD: Final[float] = 0.5
-CURRENT, CAPACITY = 18.0, 5.2  # A, Ah
+CURRENT = 18.0  # A
 _LONGEST_WAY: Final[int] = 1_000_000_000  # ns from a TIMESYNC question to its answer
-_CELLS, _UNKNOWN_VOLTAGE = 4, 65535
+_CELLS = 4
 LATITUDE, LONGITUDE = 47.397742, 8.545594  # degrees, of the local origin
 DEGREE: Final[float] = 111_320.0  # m along a meridian
 _NO_PARAMETERS: Final[Mapping[str, float]] = MappingProxyType({})
@@ -302,12 +302,10 @@ class EmbeddedAutopilot:
             case 'CURRENT_MODE':
                 return 0, *(profile.modes[each].number
                             for each in (controller.mode, controller.chosen))
-            case 'BATTERY_STATUS':
-                cell, used = round(1e3 * (3.5 + 0.7 * self.charge)), 1.0 - self.charge
-                return (0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767,
-                        [cell] * _CELLS + [_UNKNOWN_VOLTAGE] * (10 - _CELLS),
-                        round(1e2 * CURRENT), round(1e3 * used * CAPACITY), -1,
-                        round(1e2 * self.charge))
+            case 'SYS_STATUS':
+                voltage = round(1e3 * _CELLS * (3.5 + 0.7 * self.charge))
+                return (0, 0, 0, 0, voltage, round(1e2 * CURRENT), round(1e2 * self.charge),
+                        0, 0, 0, 0, 0, 0)
         return ()
 
     def estimator_flags(self, now: float) -> int:

@@ -43,7 +43,7 @@ INT16: Final[int] = mavlink.MAV_PARAM_TYPE_INT16
 INT32: Final[int] = mavlink.MAV_PARAM_TYPE_INT32
 #: Rates, Hz, of the messages of both; SET_MESSAGE_INTERVAL changes them. 0: only on request.
 _RATES: Final[Mapping[int, float]] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0, mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0, mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 50.0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 0.0,

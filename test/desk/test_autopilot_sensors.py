@@ -137,6 +137,6 @@ def test_the_battery_shows_its_charge():
     shown = []
     for seconds in (1.4, 2.0):
         flight.fly(seconds)
-        battery = flight.last('BATTERY_STATUS')
-        shown.append((battery.battery_remaining, sum(battery.voltages[:4])))
+        status = flight.last('SYS_STATUS')
+        shown.append((status.battery_remaining, status.voltage_battery))
     assert shown == [(100, 16800), (15, pytest.approx(14420, abs=4))]

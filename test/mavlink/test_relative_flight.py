@@ -17,7 +17,7 @@
 import math
 import struct
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -96,6 +96,8 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
        st.floats(-0.2, 1.0) | ANY, st.floats(-3.0, 3.0),
        st.tuples(*[st.floats(-2.0, 2.0)] * 3), st.sampled_from([0.5, 2.5, 20.0]), st.booleans(),
        st.floats(-3.0, 3.0) | ANY)
+@example((0.0, 0.0, -1.0), 0.0, 0.9, 0.0, 1.0, 0.1, 0.0, (0.0, 0.0, 0.0), 2.5, True, 0.0)
+@example((0.0, 0.0, 1.0), 0.0, 9.6, 0.0, 1.0, 0.1, 0.0, (0.0, 0.0, 0.0), 2.5, True, 0.0)
 def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, wind, a_max, airborne, bias):
     limits = GateLimits(relative_flight=True, a_max=a_max)
