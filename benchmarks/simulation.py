@@ -16,7 +16,7 @@
 How fast a large flock is simulated on its neighbour graph: ``python benchmarks/simulation.py``.
 
 One step beside a plain numpy loop, the search for neighbours included in both. Exit code 0 only
-if the graph takes at most 1.1 times as long.
+if the graph takes no longer.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     n, rng = options.agents, np.random.default_rng(0)
     x, v = np.sqrt(n / _DENSITY) * rng.random((n, 2)), rng.normal(size=(n, 2))
-    ours, theirs = (min(timed(step, x, v) for _ in range(options.repeats))
-                    for step in (on_graph, plain))
+    # In turns: the load of the machine is the same for both.
+    times = [(timed(on_graph, x, v), timed(plain, x, v)) for _ in range(options.repeats)]
+    ours, theirs = map(min, zip(*times))
     print(f'one step of {n} agents in 2-D: neighbour graph {1e3 * ours:.1f} ms, '
           f'plain numpy loop {1e3 * theirs:.1f} ms')
-    return 0 if ours <= 1.1 * theirs else 1
+    return 0 if ours <= theirs else 1
 
 
 def on_graph(x: Array, v: Array) -> Array:
