@@ -36,7 +36,6 @@ import time
 from typing import Any
 
 import numpy as np
-from odometry_series import states_of
 from wire import V_NORTH, Wire
 
 from flock_desk.runs.processes import (
@@ -45,10 +44,11 @@ from flock_desk.runs.processes import (
     Processes,
     wait_until,
 )
-from flock_follower.bags.bag import deserialize, open_bag, serialize
+from flock_follower.bags.bag import Bag, deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
 from flock_follower.files import resource
-from flock_follower.messages import NANOSECONDS
+from flock_follower.geometry import Array
+from flock_follower.messages import from_odometry, NANOSECONDS
 
 VICTIMS = ('planner', 'relative_pose', 'replay')
 LIMIT = 0.3  # s
@@ -62,10 +62,11 @@ PULL = 0.05  # m/s^2, a command to the north
 def write_bag(path: Path, seconds: float) -> None:
     """Write a bag in which every image is that of the sample bag with the leader farthest off."""
     with open_bag(resource('bags/sample')) as bag:
-        leader, follower = (states_of(resource('bags/sample'), f'/truth/{name}')
-                            for name in ('neighbors', 'odom'))
         images = list(bag.messages([IMAGE]))
-        image = max(images, key=lambda m: _distance(leader, follower, m.stamp_ns))
+        stamps = [m.stamp_ns for m in images]
+        leader, follower = (_places(bag, f'/truth/{name}', stamps)
+                            for name in ('neighbors', 'odom'))
+        image = images[int(np.linalg.norm(leader - follower, axis=0).argmax())]
         info, odom = (next(iter(bag.messages([topic]))) for topic in (CAMERA, ODOM))
     with BagWriter(path) as writer:
         for k in range(round(seconds * 60)):
@@ -79,8 +80,11 @@ def write_bag(path: Path, seconds: float) -> None:
                              serialize(fields, message.msgtype))
 
 
-def _distance(leader: Any, follower: Any, stamp: int) -> float:
-    return float(np.linalg.norm(leader.at(stamp)[0] - follower.at(stamp)[0]))
+def _places(bag: Bag, topic: str, stamps: list[int]) -> Array:
+    """Return the positions (3, n), m, on an Odometry topic at stamps, ns."""
+    states = [from_odometry(deserialize(m.data, m.msgtype)) for m in bag.messages([topic])]
+    return np.array([np.interp(stamps, [state.stamp for state in states],
+                               [state.position[axis] for state in states]) for axis in range(3)])
 
 
 def _fly(odom: Any, seconds: float) -> None:

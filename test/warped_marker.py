@@ -35,6 +35,8 @@ from flock_follower.perception.images import GrayImage
 _TEXELS = 48  # per cell
 _FINER = 3  # pixels of the large image per pixel, each way
 _PAPER, _INK = 0.72, 0.03  # reflectance
+# Of the sensor: light that fills it, blur of the lens, px, full well, noise, share of that.
+_GAIN, _LENS, _ELECTRONS, _READ_NOISE = 1.2, 0.6, 12000.0, 0.004
 
 
 class Shade(NamedTuple):
@@ -46,16 +48,6 @@ class Shade(NamedTuple):
     """Where it begins, side lengths from the marker's middle."""
     light: float
     """Share that is left."""
-
-
-class Sensor(NamedTuple):
-    """What becomes of light: blur of the lens, px; exposure; noise, shares of the full well."""
-
-    gamma: float = 2.2
-    gain: float = 1.2
-    lens: float = 0.6
-    electrons: float = 12000.0
-    read_noise: float = 0.004
 
 
 class WarpedMarker:
@@ -82,15 +74,15 @@ class WarpedMarker:
             cv2.resize(rng.normal(0.0, 0.06, (n, n)), size, interpolation=cv2.INTER_CUBIC)
             for n in (5, 11, 25, 60)], axis=0), 0.02, 0.9)
 
-    def image(self, poses: Sequence[Transform], seed: int, *, shades: Sequence[Shade] = (),
-              sensor: Sensor | None = None) -> GrayImage:
+    def image(self, poses: Sequence[Transform], seed: int, *, shade: Shade | None = None,
+              gamma: float = 2.2) -> GrayImage:
         """Return the image of a marker at T_camera_marker, several spread over the exposure."""
         light = np.ones_like(self._print)
-        for shade in shades:
+        if shade is not None:
             across = self._x * np.cos(shade.direction) + self._y * np.sin(shade.direction)
-            light = np.where(across > shade.offset, light * shade.light, light)
+            light = np.where(across > shade.offset, shade.light, light)
         shown = np.mean([self._seen(pose, self._print * light) for pose in poses], axis=0)
-        return develop(shown, seed, sensor or Sensor())
+        return developed(shown, seed, gamma)
 
     def _seen(self, pose: Transform, lit: Array) -> Array:
         plane = np.column_stack([pose.rotation[:, :2], pose.translation])
@@ -104,10 +96,9 @@ class WarpedMarker:
         return seen
 
 
-def develop(light: Array, seed: int, sensor: Sensor) -> GrayImage:
-    """Return the image of light (H, W) on a sensor, 1 filling it at a gain of 1."""
-    light = cv2.GaussianBlur(np.minimum(light * sensor.gain, 1.0), (0, 0), sensor.lens)
+def developed(light: Array, seed: int, gamma: float) -> GrayImage:
+    """Return the image of light (H, W) on a sensor, with the blur of its lens and noise."""
+    light = cv2.GaussianBlur(np.minimum(light * _GAIN, 1.0), (0, 0), _LENS)
     noise = np.random.default_rng([seed, 5]).normal(0.0, 1.0, light.shape)
-    light = light + noise * np.sqrt(np.maximum(light, 0.0) / sensor.electrons
-                                    + sensor.read_noise**2)
-    return np.rint(255.0 * np.clip(light, 0.0, 1.0)**(1.0 / sensor.gamma)).astype(np.uint8)
+    light = light + noise * np.sqrt(np.maximum(light, 0.0) / _ELECTRONS + _READ_NOISE**2)
+    return np.rint(255.0 * np.clip(light, 0.0, 1.0)**(1.0 / gamma)).astype(np.uint8)

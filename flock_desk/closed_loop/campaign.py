@@ -68,8 +68,6 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     flock = scenario.company
     radio: Radio[OdometryState] = Radio(
         flock.followers, flock.delay, flock.loss, world.random('radio'))
-    failing = [] if flock.fails is None else followers[
-        flock.fails.follower - 1::flock.followers]
     count = round(scenario.duration / STEP)
     log = FlightsLog(world, lookout)
     for k in range(1, count + 1):
@@ -95,10 +93,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.outbox = []
             if now >= ENGAGED - 1e-9:
                 log.tick(now, followers)
-        if failing and flock.fails is not None and now >= flock.fails.at:
-            for follower in failing:
+        if flock.fails is not None and now >= flock.fails.at:
+            for follower in followers[flock.fails.follower - 1::flock.followers]:
                 follower.fail(now)
-            failing = []
         if k % GATE_STEPS == GATE_STEPS // 2:
             world.obey([follower.obey(now, *known)
                         for follower, known in zip(followers, world.flown(now))])

@@ -111,13 +111,14 @@ class SimulatedFollower(Listener):
         self._known: OwnState | None = None
         self._now = 0.0
         usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_STEPS * STEP)
-        self._waiting = sorted(scenario.operations or usual, key=lambda o: o.at)
+        self._waiting = [(o.at, o.what, o.duration if o.what == 'restart' else o.height)
+                         for o in sorted(scenario.operations or usual, key=lambda o: o.at)]
+        """What is to come: time, s, an operation or its outcome, and its height or duration."""
         self._armed = not scenario.takes_off
         self._mode = PX4.offboard if self._armed else PX4.hold
         self._status: VehicleStatus | None = None
         self._goal = start
         self._yaw: float | None = None
-        self._mode_asked = self._restart = math.inf  # s, when they come
         self._beat = self._setpoint_time = -math.inf
         self._setpoint: Setpoint | None = None
         self._asked = False
@@ -190,14 +191,10 @@ class SimulatedFollower(Listener):
         self._follower.estimate(time, self._T_odom_world.rotation @ estimate)
         self._follower.height(time, altitude, float(position[2]))
         self._follower.advance(time + _AFTER)
-        while self._waiting and self._waiting[0].at <= now + 1e-9:
-            self._do(self._waiting.pop(0), now, position, yaw)
-        if now >= self._restart:
-            self._restart = math.inf
-            self._follower.bridge_started(time, self._new_control())
-        if now >= self._mode_asked:
-            self._mode_asked = math.inf
-            self._mode, self._goal = PX4.offboard, position
+        for event in [each for each in self._waiting if each[0] <= now + 1e-9]:
+            self._waiting.remove(event)
+            self._yaw = yaw
+            self._do(*event[1:], now, position)
         on_ground = self._mode == TAKEOFF or bool(position[2] < 0.05)
         if self._mode == TAKEOFF and position[2] > self._goal[2] - 0.2:
             self._mode = PX4.hold
@@ -205,10 +202,9 @@ class SimulatedFollower(Listener):
         self._report_status(now, on_ground)
         return self._fly(now, position, velocity)
 
-    def _do(self, operation: Operation, now: float, position: Array, yaw: float) -> None:
-        time, above = to_nanoseconds(now), position + operation.height * UP
-        self._yaw = yaw
-        match operation.what:
+    def _do(self, what: str, amount: float, now: float, position: Array) -> None:
+        time, above = to_nanoseconds(now), position + amount * UP
+        match what:
             case 'arm':
                 self._armed = True
             case 'takeoff':
@@ -217,7 +213,9 @@ class SimulatedFollower(Listener):
                 self._asked = True
                 self._follower.permit(time, now - 1e-3)
                 # The bridge has to stream first, and to receive the mode by HEARTBEAT.
-                self._mode_asked = now + PX4.stream_before_offboard
+                self._waiting.append((now + PX4.stream_before_offboard, 'obeyed', 0.0))
+            case 'obeyed':
+                self._mode, self._goal = PX4.offboard, position
             case 'engage':
                 self._follower.engage(time, True)
             case 'pilot':
@@ -225,7 +223,9 @@ class SimulatedFollower(Listener):
             case 'restart':
                 self._asked = False
                 self._follower.bridge_died(time)
-                self._restart = now + operation.duration
+                self._waiting.append((now + amount, 'started', 0.0))
+            case 'started':
+                self._follower.bridge_started(time, self._new_control())
 
     def _report_status(self, now: float, on_ground: bool) -> None:
         if now - self._beat < HEARTBEAT_PERIOD - 1e-9:
@@ -257,8 +257,9 @@ class SimulatedFollower(Listener):
 
     def fail(self, now: float) -> None:
         """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
-        self.failed, self.decision = True, Decision(State.IDLE)
-        self._follower.bridge_died(to_nanoseconds(now))
+        if not self.failed:
+            self.failed, self.decision = True, Decision(State.IDLE)
+            self._follower.bridge_died(to_nanoseconds(now))
 
     def send(self, time: int, messages: list[OdometryState]) -> None:
         if not self.failed:

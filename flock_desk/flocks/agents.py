@@ -227,11 +227,9 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
     :param breaks: where the acceleration jumps, s: no step straddles these.
     :raises RuntimeError: if no step is small enough, as at a singularity of the law.
     """
-    from scipy.integrate import DOP853
-    shape = np.shape(start)
-    t, y = float(times[0]), np.ravel(start)
+    from scipy.integrate import solve_ivp
+    shape, t, y = np.shape(start), float(times[0]), np.ravel(start)
     yield start
-    waiting = 1
     for end in [*(b for b in sorted(breaks) if t < b < times[-1]), float(times[-1])]:
         # At the very end of a stretch the acceleration is still that of the stretch.
         last = np.nextafter(end, t)
@@ -240,18 +238,15 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
             x, v = y.reshape(shape)
             return np.concatenate([v.ravel(), acceleration(min(t, last), x, v).ravel()])
 
-        solver = DOP853(rate, t, y, end, rtol=1e-11, atol=1e-12)
-        while solver.status == 'running':
-            message = solver.step()
-            if solver.status == 'failed':
-                raise RuntimeError(f'the solution ends at t = {solver.t:.6g} s: {message}')
-            passed = int(np.searchsorted(times, solver.t, side='right'))
-            if passed > waiting:
-                for state in solver.dense_output()(times[waiting:passed]).T:
-                    x, v = state.reshape(shape)
-                    yield x, v
-                waiting = passed
-        t, y = end, solver.y
+        wanted = times[(times > t) & (times <= end)]
+        solution = solve_ivp(rate, (t, end), y, 'DOP853', np.union1d(wanted, end),
+                             rtol=1e-11, atol=1e-12)
+        if not solution.success:
+            raise RuntimeError(f'the solution ends after t = {t:.6g} s: {solution.message}')
+        for state in solution.y.T[:len(wanted)]:
+            x, v = state.reshape(shape)
+            yield x, v
+        t, y = end, solution.y[:, -1]
 
 
 def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: float,

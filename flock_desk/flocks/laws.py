@@ -70,9 +70,10 @@ def graph_accelerations(positions: Array, velocities: Array, params: FlockingPar
     # Any pair separates with f0 psi, and an edge with f0 (1 - psi) more: no search for edges.
     for pairs, joined in ((edges, True), (near, False)):
         i, j = np.ascontiguousarray(pairs.T)
-        offset, difference = x.take(j, 1) - x.take(i, 1), v.take(j, 1) - v.take(i, 1)
+        offset = x.take(j, 1) - x.take(i, 1)
         r2 = np.einsum('ij,ij->j', offset, offset)
         if joined:
+            difference = v.take(j, 1) - v.take(i, 1)
             pull = cohesion(r2, params) - separation(r2, params) * (1.0 - fade(r2, params))
             action = alignment(r2, params) * difference + scale * pull * offset
         else:

@@ -136,6 +136,8 @@ class FlightRecording:
         self.path, self._files, self._last = None, [], 0
         if path is not None and files:
             finish(path, files)
+        elif path is not None:
+            shutil.rmtree(path, ignore_errors=True)
 
     def _opened(self, stamp_ns: int) -> McapFile:
         """Return the file to write to."""

@@ -41,15 +41,13 @@ from flock_follower.bags.mcap_file import MCAP_MAGIC
 
 def has_end(file: Path) -> bool:
     """
-    Return whether an MCAP file ends as a finished one does; one of another format does, too.
+    Return whether an MCAP file ends as a finished one does.
 
     :raises OSError: it cannot be read.
     """
-    size = file.stat().st_size
     with file.open('rb') as opened:
-        if opened.read(len(MCAP_MAGIC)) not in (MCAP_MAGIC, b''):
-            return True
-        opened.seek(max(size - len(MCAP_MAGIC), 0), os.SEEK_SET)
+        size = opened.seek(0, os.SEEK_END)
+        opened.seek(max(size - len(MCAP_MAGIC), 0))
         return size > len(MCAP_MAGIC) and opened.read() == MCAP_MAGIC
 
 

@@ -114,8 +114,8 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if seen.sightings:
         yield check_marker_size(seen, path)
     if sure is None:
-        yield Finding(UNMEASURED, 'camera mounting', 'turned too little: pitch and yaw it by hand',
-                      MOUNTED)
+        yield Finding(UNMEASURED, 'camera mounting', 'turned too little, or too little texture: '
+                      'roll, pitch and yaw it by hand', MOUNTED)
     else:
         yield check_mounting(sure.mounting, sure.mounting_deviations, rpy)
 

@@ -64,7 +64,6 @@ ADVICE: Final[Mapping[str, str]] = {
     'QoS mismatch': 'change the QoS of the publisher',
     'another clock': 'set use_sim_time alike everywhere',
     'use_sim_time': 'set use_sim_time alike everywhere',
-    'axes of odom': 'set odom_child_rpy, see odom up above and docs/sensors.md',
     'velocity of odom': 'set odom_twist_frame:=auto',
     'internal error': 'a mistake in this package: report it, with the log',
     'no image processed': 'see images, calibration and odometry above'}

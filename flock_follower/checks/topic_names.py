@@ -33,9 +33,6 @@ TYPES: Final[Mapping[str, str]] = {
     'neighbors': ODOMETRY, 'neighbors/frames': 'std_msgs/msg/Header',
     'command/trajectory': TRAJECTORY, 'planner/state': STATE, 'mavlink_bridge/state': STATE,
     'ranges': RANGE, 'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
-#: In plain words.
-HOLDS: Final[Mapping[str, str]] = {
-    IMAGE: 'images', COMPRESSED: 'compressed images', INFO: 'a calibration', ODOMETRY: 'odometry'}
 #: Parts of the names of images that show no brightness.
 _NEVER: Final = ('depth', 'disparity', 'confidence')
 #: Parts of names that speak against a topic, and for it.
@@ -110,4 +107,4 @@ def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> st
         return ''
     others = f' (or {", ".join(found[1:3])})' if found[1:] else ''
     ours = COMPRESSED_IMAGES if topics[found[0]] == COMPRESSED else name
-    return f'{found[0]} holds {HOLDS[topics[found[0]]]}: --remap {ours}:={found[0]}{others}'
+    return f'{found[0]} holds {topics[found[0]]}: --remap {ours}:={found[0]}{others}'

@@ -17,13 +17,16 @@ Messages between followers: sends the own state and detections, transforms recei
 
 Each follower sends its own state and the vehicles that it sees, in its own odometry frame, and
 never what it received. Received states are transformed into the own frame once the sender's frame
-is aligned; until then they are kept, and not used.
+is aligned; until then they are not used.
 
-Two frames are related by a vehicle known in both at one time: the sender seen by this vehicle,
-this vehicle seen by the sender, or any vehicle that both see or that sends its own state. The
-relations of an unknown frame are collected until a first fit succeeds; later each updates the
-filter (``alignment``), and one that does not fit is refused. If the relations of a
-sender repeatedly do not fit, its frame has changed and is aligned again.
+The frame of a sender is related to the own frame by a vehicle known in both at one time: the
+sender seen by this vehicle, this vehicle seen by the sender, or a vehicle that both see. If there
+is none, by a vehicle that another aligned sender reports. Such relations lead away from this
+vehicle: a sender related by n others relates only senders that are related by more.
+
+Relations are collected until a first fit succeeds; later each updates the filter (``alignment``),
+and one that does not fit is refused. If the relations of a sender repeatedly do not fit, its frame
+has changed and is aligned again.
 """
 
 from __future__ import annotations
@@ -31,33 +34,25 @@ from __future__ import annotations
 from collections import defaultdict, deque
 import math
 
-from flock_follower.flock.alignment import FrameAlignment, in_own_frame, PairedFrames
+from flock_follower.flock.alignment import FEWEST, first_fit, in_own_frame, LONGEST
 from flock_follower.flock.peers import (
     ACCELERATION_STD,
     aged,
     checked_name,
-    DOUBTED,
     FRAME,
     FUTURE,
     is_covariance,
     leapt,
     MESSAGE_AGE_MAX,
     position_covariance,
-    POSITION_STD_MAX,
     refusal,
-    SEEN_TIMEOUT,
-    Sender,
     sender_of,
-    SENDERS_MAX,
-    SenderStatus,
-    TOO_FAST,
     too_fast,
     Track,
     track_point,
     TrackPoint,
-    WRONG,
-    YAW_STD_MAX,
 )
+from flock_follower.flock.sender import BAN, POSITION_STD_MAX, Sender, WRONG
 from flock_follower.messages import DUPLICATE, NANOSECONDS, OdometryState, to_nanoseconds
 
 #: Between two rounds of messages, ns; a little less than 0.1 s, as timers jitter.
@@ -66,14 +61,15 @@ PERIOD = 90_000_000
 #: older ones used after newer ones.
 STALE = 500_000_000
 OWN_FUTURE = 'own odometry from the future'
-#: A sender silent for so long, ns, is forgotten.
-FORGOTTEN = 30 * NANOSECONDS
-#: Vehicles that one vehicle may see, or report.
-SEEN_MAX = 40
+START_YAW = 0.35  # rad: a yaw less certain than this is no start for a linear filter
+SEEN_TIMEOUT = 500_000_000  # ns after an own sighting in which received states are not used
+FORGOTTEN = 30 * NANOSECONDS  # ns: a sender silent for so long is forgotten
+#: Senders, and vehicles that one vehicle may see, or report.
+SENDERS_MAX, SEEN_MAX = 32, 40
 #: A state that a vehicle sent of itself is replaced only by one with this share of its variance.
 OWN_STATE_SHARE = 0.5
 #: Own messages that may come back, and events that wait to be read.
-REMEMBERED, EVENTS = 500, 500
+REMEMBERED, EVENTS = 100, 500
 #: One vehicle relates two frames once in this time, ns: errors of sightings last.
 RELATING = 200_000_000
 
@@ -90,17 +86,13 @@ class Sharing:
 
     def __init__(self, name: str) -> None:
         self.name = checked_name(name)
-        self.frames = FrameAlignment(name)
         self.senders: dict[str, Sender] = {}
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
-        # By frame and vehicle.
-        self._tracks: dict[str, dict[str, Track]] = defaultdict(lambda: defaultdict(Track))
-        self._pairs: dict[tuple[str, str], PairedFrames] = {}
-        self._related: dict[tuple[str, str, str], int] = {}
+        self._tracks: defaultdict[str, Track] = defaultdict(Track)
         self._last_round: int | None = None
         self._sent: dict[str, int] = {}
-        self._echoes: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
+        self._echoes: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
         self._events: list[tuple[str, str]] = []
 
     # In.
@@ -108,7 +100,7 @@ class Sharing:
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
         fast, before = too_fast(state), self._own
-        if self._refused((fast, f'own odometry {TOO_FAST}', fast)):
+        if self._refused((fast, 'own odometry not finite, or too fast', fast)):
             return
         if before is not None:
             back = before.stamp - state.stamp
@@ -118,23 +110,26 @@ class Sharing:
             if before.frame != state.frame:
                 leap = f'from frame {before.frame!r} to {state.frame!r}'
             if self._refused((leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
-                self._align_all_anew(forget_senders=back > 0)
+                self._seen.clear()
+                self._tracks.clear()
+                self.senders.clear()
         self._own = state
-        self._tracks[self.name][self.name].add(track_point(state, True))
+        self._tracks[self.name].add(track_point(state, True))
 
     def take_seen(self, state: OdometryState) -> None:
         """Take an own sighting of another vehicle, as on ``neighbors``."""
         name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
         frame = None if self._own is None else self._own.frame
+        doubt = float(position_covariance(state, False).trace())
         # A second print of a marker is no vehicle.
         if DUPLICATE in name or self._refused(
                 (frame is None, 'sighting before own odometry', name),
                 (fast, 'unusable sighting', fast),
                 (name == self.name or state.frame != frame, 'unusable sighting',
-                 f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')):
+                 f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')) or (
+                     before is not None and 0 <= before.stamp - state.stamp <= STALE):
             return
-        doubt = float(position_covariance(state, False).trace())
-        if (before is not None and 0 <= before.stamp - state.stamp <= STALE) or self._refused(
+        if self._refused(
                 (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
                 (not is_covariance(state.pose_covariance[:3, :3]), 'sighting without a covariance',
                  name),
@@ -142,39 +137,38 @@ class Sharing:
                 (doubt > POSITION_STD_MAX ** 2, 'known too vaguely',
                  f'{name}: to {math.sqrt(max(doubt, 0.0)):.2f} m')):
             return
-        self._seen[name] = state
-        self._relate(self.name, name, track_point(state, False))
+        self._seen[name], point = state, track_point(state, False)
+        self._tracks[name].add(point)
+        self._relate_seen(name, point, 1)
 
     def take_message(self, state: OdometryState, received: int) -> None:
         """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
         name = sender_of(state.frame)
-        known = name in self.senders
+        sender = self.senders.get(name)
         # An own message may come back.
         if self._refused(
                 (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
                  f'NAME{FRAME}, where NAME is the sending vehicle'),
-                (name == self.name and _key(state) not in self._echoes,
+                (name == self.name and (state.stamp, *state.position) not in self._echoes,
                  'another vehicle uses this name', f'{name} sends {state.child[:70]!r}')) or (
                      name == self.name):
             return
         if refused := refusal(state, received):
-            if refused[0] == FUTURE and known:
-                self.senders[name].ban(received, 'has a clock that is ahead')
+            if refused[0] == FUTURE and sender is not None:
+                sender.ban = received + BAN, 'has a clock that is ahead'
             self._refuse(*refused)
-            return
-        if self._refused((not known and len(self.senders) >= SENDERS_MAX, 'too many senders',
-                          name)):
-            return
-        sender = self.senders.setdefault(name, Sender(name))
-        sender.received = received
-        why = sender.banned(received)
-        if not self._refused((why, 'ignored for a while', f'{name} {why}')):
-            self._take_from(sender, state, received)
+        elif not self._refused((sender is None and len(self.senders) >= SENDERS_MAX,
+                                'too many senders', name)):
+            sender = self.senders.setdefault(name, Sender(name))
+            sender.received = received
+            if not self._refused((received < sender.ban[0], 'ignored for a while',
+                                  f'{name} {sender.ban[1]}')):
+                self._take_from(sender, state, received)
 
     def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:
         """Take a valid message of a sender."""
-        of_itself, before = state.child == sender.name, sender.states.get(state.child)
-        what = f'{sender.name} sends {state.child}'
+        vehicle, of_itself = state.child, state.child == sender.name
+        before, what = sender.states.get(vehicle), f'{sender.name} sends {vehicle}'
         if self._refused(
                 (before is not None and state.stamp <= before.stamp, 'message out of order', what),
                 (before is None and len(sender.states) >= SEEN_MAX, 'too many vehicles', what)):
@@ -182,123 +176,99 @@ class Sharing:
         leap = '' if before is None else leapt(before, state)
         if of_itself:
             if leap:
-                sender.leapt_at(received)
-                self._align_anew(sender, f'its odometry leapt {leap}')
+                sender = self._align_anew(sender, f'its odometry leapt {leap}')
             sender.sent_at(state.stamp, received)
-            self.frames.set_anchor(sender.name, state.position)
+            if sender.frame is not None:
+                sender.frame.move_anchor(state.position)
+        if sender.vague and state.stamp - max(sender.related.values(), default=0) > LONGEST:
+            sender.hops = math.inf  # not related by its best relation any more: by any
         sender.ages.append((received - state.stamp) / NANOSECONDS)
-        sender.states[state.child] = state
-        fits = self._relate(sender.name, state.child, track_point(state, of_itself))
-        if leap or not fits:
-            sender.doubted.add(state.child)
-        else:
-            sender.doubted.discard(state.child)
-        why = self.unusable(sender)
+        point = track_point(state, of_itself)
+        sender.tracks[vehicle].add(point)
+        fits = self._relate(sender, vehicle, point, *self._known(vehicle, state.stamp, sender))
+        if sender.frame is not None and not of_itself:
+            self._relate_seen(vehicle, sender.frame.point(point), sender.hops + 1)
+        sender.states[vehicle] = state
+        if not fits or (leap and not of_itself):
+            del sender.states[vehicle]  # the next state will decide
+        why = sender.unusable(received)
         self._refused((why, f'not aligned with {sender.name}', why))
 
     # Relations between frames.
 
-    def unusable(self, sender: Sender) -> str:
-        """Return why a sender's messages are not used, or ''."""
-        if sender.name not in self.frames:
-            paired = [pairs.yaw_std for names, pairs in self._pairs.items()
-                      if sender.name in names]
-            return ('neither sees the other, nor do both see one vehicle' if not paired else
-                    f'its yaw is known to {min(paired):.1f} rad: somebody has to move')
-        if sender.refused >= DOUBTED:
-            return f'{sender.refused} times in a row it did not fit'
-        place, yaw = self.frames.stds(sender.name)
-        if place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX:
-            return ''
-        return (f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
-                f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
+    def _known(self, vehicle: str, stamp: int, of: Sender) -> tuple[TrackPoint | None, float]:
+        """
+        Return a vehicle at a stamp in the own frame, and the hops of a relation by it.
 
-    def _relate(self, frame: str, vehicle: str, point: TrackPoint) -> bool:
-        """Remember a vehicle in a frame, relate that to another; return whether that fits."""
-        self._tracks[frame][vehicle].add(point)
-        other = self._other_frame(frame, vehicle, point.stamp)
-        if other is None or self._own is None:
+        :param of: the sender to relate.
+        """
+        point = self._tracks[vehicle].at(stamp) if vehicle in self._tracks else None
+        if point is not None:
+            return point, 1
+        for sender in sorted(self.senders.values(), key=lambda s: (s.hops, s.name != vehicle)):
+            if sender.hops >= of.hops or sender.frame is None or sender.vague or (
+                    vehicle not in sender.tracks):
+                continue
+            point = sender.tracks[vehicle].at(stamp)
+            if point is not None:
+                return sender.frame.point(point), sender.hops + 1
+        return None, math.inf
+
+    def _relate_seen(self, name: str, ours: TrackPoint, hops: float) -> None:
+        """Relate the frame of a vehicle that was seen: its own states are newer than an image."""
+        if sender := self.senders.get(name):
+            self._relate(sender, name, sender.tracks[name].at(ours.stamp), ours, hops)
+
+    def _relate(self, sender: Sender, vehicle: str, theirs: TrackPoint | None,
+                ours: TrackPoint | None, hops: float) -> bool:
+        """Relate a sender's frame by a vehicle known in both frames; return whether it fits."""
+        own, last = self._own, sender.related.get(vehicle)
+        if theirs is None or ours is None or own is None or hops > sender.hops or (
+                last is not None and abs(theirs.stamp - last) < RELATING):
             return True
-        one, two = sorted((frame, other[0]))
-        last = self._related.get((one, two, vehicle))
-        if last is not None and abs(point.stamp - last) < RELATING:
+        sender.related[vehicle] = theirs.stamp
+        if sender.frame is None or hops < sender.hops:
+            self._begin(sender, theirs, ours, hops)
             return True
-        self._related[one, two, vehicle] = point.stamp
-        self.frames.drift(point.stamp, self._own.position)
-        if one not in self.frames or two not in self.frames:
-            self._begin((frame, point), other)
-            return True
-        doubt = self.frames.relate((frame, point), other)
+        sender.frame.drift(theirs.stamp, own.position)
+        doubt = sender.frame.relate(theirs, ours)
         if doubt <= 1.0:
-            for known in {one, two} & self.senders.keys():
-                self.senders[known].refused = 0
+            sender.refused = 0
             return True
-        blamed = self.senders.get(frame) or self.senders[other[0]]
-        blamed.refused += 1
-        self._refuse('does not fit the alignment', f'{blamed.name}: {doubt:.1f} times the gate')
-        if blamed.refused >= WRONG:
-            self._align_anew(blamed, f'{WRONG} times in a row it did not fit')
+        sender.refused += 1
+        self._refuse('does not fit the alignment', f'{sender.name}: {doubt:.1f} times the gate')
+        if sender.refused >= WRONG:
+            self._align_anew(sender, f'{WRONG} times in a row it did not fit')
         return False
 
-    def _other_frame(self, frame: str, vehicle: str, stamp: int) -> tuple[str, TrackPoint] | None:
-        """
-        Return the best other frame in which a vehicle is known at a stamp, and its track point.
-
-        The own frame is best, then the vehicle's, then the most certain; only one counts.
-        """
-        names = [name for name in (self.name, *self.senders)
-                 if name != frame and vehicle in self._tracks[name]]
-        for name in sorted(names, key=lambda name: (
-                name != self.name, name != vehicle or name not in self.frames,
-                self.frames.stds(name)[0])):
-            point = self._tracks[name][vehicle].at(stamp)
-            if point is not None:
-                return name, point
-        return None
-
-    def _begin(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> None:
-        """Collect a relation of an unknown frame, and start its estimate if that is possible."""
-        (one, there), (two, here) = sorted((first, second), key=lambda end: end[0])
-        pairs = self._pairs.setdefault((one, two), PairedFrames())
-        pairs.add(there, here)
-        reference, fresh = (one, two) if one in self.frames else (two, one)
-        if reference not in self.frames:
+    def _begin(self, sender: Sender, theirs: TrackPoint, ours: TrackPoint, hops: float) -> None:
+        """Collect a relation, and start the estimate of the frame if that is possible."""
+        pairs = sender.pairs
+        while pairs and theirs.stamp - pairs[0][0].stamp > LONGEST:
+            pairs.popleft()
+        pairs.append((theirs, ours))
+        if len(pairs) < FEWEST:
             return
-        fit = pairs.first_fit(swapped=reference == two)
-        if fit is None:
+        frame = first_fit(pairs)
+        if frame is None:
+            if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
+                for _ in range(len(pairs) // 2):
+                    pairs.popleft()
             return
-        self.frames.start(fresh, *fit, reference)
-        state = self.senders[fresh].states.get(fresh)
-        if state is not None:
-            self.frames.set_anchor(fresh, state.position)
-        del self._pairs[one, two]
+        sender.yaw_std = frame.stds[1]
+        if sender.yaw_std <= START_YAW:
+            sender.frame, sender.hops, sender.refused = frame, hops, 0
+            pairs.clear()
+            if state := sender.states.get(sender.name):
+                frame.move_anchor(state.position)
 
-    def _align_anew(self, sender: Sender, why: str) -> None:
-        """Forget a sender's frame, and the states received in it."""
+    def _align_anew(self, sender: Sender, why: str) -> Sender:
+        """Return a sender without its frame and the states received in it."""
         self._refuse(f'aligned anew with {sender.name}', why)
-        self._forget_frame(sender.name)
-        sender.states.clear()
-        sender.doubted.clear()
-        sender.refused = 0
-
-    def _forget_frame(self, name: str) -> None:
-        self.frames.drop(name)
-        self._tracks.pop(name, None)
-        self._pairs = {names: each for names, each in self._pairs.items() if name not in names}
-        self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
-
-    def _align_all_anew(self, forget_senders: bool) -> None:
-        """Reset after a change of the own frame; ``forget_senders``: after a jump of time, too."""
-        self.frames = FrameAlignment(self.name)
-        self._seen.clear()
-        self._pairs.clear()
-        self._related.clear()
-        self._tracks.pop(self.name, None)
-        for sender in self.senders.values():
-            sender.refused = 0
-        if forget_senders:
-            self._tracks.clear()
-            self.senders.clear()
+        anew = Sender(sender.name, received=sender.received, ages=sender.ages, sent=sender.sent,
+                      ban=sender.ban)
+        self.senders[sender.name] = anew
+        return anew
 
     # Out.
 
@@ -313,11 +283,12 @@ class Sharing:
             self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
             return []
         messages = [state._replace(frame=name + FRAME)
-                 for state in (own._replace(child=name), *self._seen.values())
-                 if abs(now - state.stamp) <= STALE and state.stamp != self._sent.get(state.child)]
+                    for state in (own._replace(child=name), *self._seen.values())
+                    if abs(now - state.stamp) <= STALE
+                    and state.stamp != self._sent.get(state.child)]
         for message in messages:
             self._sent[message.child] = message.stamp
-            self._echoes.append(_key(message))
+            self._echoes.append((message.stamp, *message.position))
         return messages
 
     def neighbors(self, now: int) -> list[OdometryState]:
@@ -328,48 +299,39 @@ class Sharing:
         several states of one vehicle are known, the most certain one is used: their errors may be
         correlated.
         """
-        for sender in list(self.senders.values()):
-            if now - sender.received > FORGOTTEN:
-                self._forget_frame(sender.name)
-                del self.senders[sender.name]
+        self.senders = {name: each for name, each in self.senders.items()
+                        if now - each.received <= FORGOTTEN}
         own = self._own
         if own is None or now - own.stamp > to_nanoseconds(MESSAGE_AGE_MAX):
             return []
-        self.frames.drift(now, own.position)
-        surest: dict[str, tuple[float, Sender]] = {}
+        surest: dict[str, tuple[float, OdometryState]] = {}
         for sender in self.senders.values():
-            if sender.banned(now) or self.unusable(sender):
+            frame = sender.frame
+            if frame is not None:
+                frame.drift(now, own.position)
+            if frame is None or sender.unusable(now):
                 continue
-            for state in sender.states.values():
-                age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(state.child)
-                if (state.child == self.name or state.child in sender.doubted
-                        or age > MESSAGE_AGE_MAX or (seen is not None and (
-                            now - seen.stamp <= to_nanoseconds(SEEN_TIMEOUT)))):
+            for name, state in sender.states.items():
+                age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(name)
+                if name == self.name or age > MESSAGE_AGE_MAX or (
+                        seen is not None and now - seen.stamp <= SEEN_TIMEOUT):
                     continue
-                of_itself = state.child == sender.name
-                doubt = float((self.frames.located(sender.name, state.position)[1]
-                               + position_covariance(state, of_itself)).trace())
-                if doubt > POSITION_STD_MAX ** 2:
-                    self._refuse('heard of too vaguely',
-                                 f'{state.child} by {sender.name}: to {math.sqrt(doubt):.2f} m')
+                of_itself = name == sender.name
+                placed = in_own_frame(state, of_itself, frame, own.frame)
+                doubt = float(placed.pose_covariance[:3, :3].trace())
+                if self._refused((doubt > POSITION_STD_MAX ** 2, 'heard of too vaguely',
+                                  f'{name} by {sender.name}: to {math.sqrt(doubt):.2f} m')):
                     continue
                 doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
                     OWN_STATE_SHARE if of_itself else 1.0)
-                if state.child not in surest or doubt < surest[state.child][0]:
-                    surest[state.child] = doubt, sender
-        return [aged(in_own_frame(sender.states[name], sender.name, own.frame, self.frames), now)
-                for name, (_, sender) in surest.items()]
+                if name not in surest or doubt < surest[name][0]:
+                    surest[name] = doubt, placed
+        return [aged(state, now) for _, state in surest.values()]
 
     def new_events(self) -> list[tuple[str, str]]:
         """Return the refusals since the last call."""
         events, self._events = self._events, []
         return events
-
-    def status(self, now: int) -> list[SenderStatus]:
-        """Return the status of every sender."""
-        return [SenderStatus(
-            s.name, s.banned(now) or self.unusable(s), *self.frames.stds(s.name),
-            (now - s.received) / NANOSECONDS, s.slow) for s in self.senders.values()]
 
     def why_silent(self, now: int) -> str:
         """Return why no received message can be used, or ''."""
@@ -377,11 +339,12 @@ class Sharing:
             return 'no own odometry'
         if self._own.stamp - now > STALE:
             return OWN_FUTURE
-        active = [s for s in self.status(now) if s.silent <= MESSAGE_AGE_MAX]
+        active = {name: sender.unusable(now) for name, sender in self.senders.items()
+                  if now - sender.received <= to_nanoseconds(MESSAGE_AGE_MAX)}
         if not active:
             return 'no other sender'
-        return '' if any(not s.why for s in active) else '; '.join(
-            f'not aligned with {s.name}: {s.why}' for s in active)
+        return '; '.join(f'not aligned with {name}: {why}' for name, why in active.items()
+                         ) if all(active.values()) else ''
 
     def _refused(self, *cases: tuple[object, str, str]) -> bool:
         """
@@ -398,8 +361,3 @@ class Sharing:
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
             self._events.append((reason, detail))
-
-
-def _key(message: OdometryState) -> tuple[int, str, bytes]:
-    """Return what identifies a message."""
-    return message.stamp, message.child, message.position.tobytes()

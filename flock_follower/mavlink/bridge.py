@@ -194,7 +194,7 @@ class Bridge:
             self.motion = None if motion is None else (motion, time)
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
-                refused := self.gate.update_height(altitude.altitude, now)):
+                refused := self.gate.update_height(altitude.altitude, now, altitude.source)):
             self.link.ignored[f'{altitude.source} {refused}'] += 1
         if battery is not None and battery.time == now:
             self.end.take_battery(battery.remaining, now)

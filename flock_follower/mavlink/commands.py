@@ -230,9 +230,8 @@ class Request:
             self._fail(self._refusal(texts), self.current.instead, now)
         elif waited >= (CONFIRM_TIMEOUT if self._result is None else self.current.timeout):
             holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
-            self._fail(self._unconfirmed(vehicle, texts),
-                       self.current.instead if holds else
-                       self.current.too_late or self.current.instead, now)
+            late = None if holds else self.current.too_late
+            self._fail(self._unconfirmed(vehicle, texts), late or self.current.instead, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
                 # An ACK of a mode command may answer an earlier one: it does not say. If it was
                 # this one's, the pilot may have left the mode between two HEARTBEATs: only what
@@ -296,8 +295,8 @@ class Request:
 
     def _refusal(self, texts: StatusTexts) -> str:
         # PX4 reports what speaks against a mode, or against arming in one.
-        mode, *_ = *self.current.modes, '' if self.current.ends_flight else self._mode
-        reasons = '; '.join(texts.why(self._since, mode)) or (
+        modes = (*self.current.modes, '' if self.current.ends_flight else self._mode)
+        reasons = '; '.join(texts.why(self._since, modes[0])) or (
             '' if self.current.instead else self._dialect.no_reason)
         return ': '.join(filter(None, (
             f'{self.current.name} refused', result_text(self._result or 0), reasons)))

@@ -22,7 +22,8 @@ vehicle beyond a bound is handed to the autopilot's hold mode. Vectors are ENU.
 not fused into: the autopilot's barometer, or its rangefinder if no barometer is reported. An
 observer with two poles at -BANDWIDTH follows the sensor. Between two samples it integrates a
 vertical velocity of the vehicle, whose constant error it estimates. If the sensor jumps and that
-velocity does not (a gust, a door, a table below), the reference is shifted by the jump.
+velocity does not (a gust, a door, a table below), the reference is shifted by the jump. If another
+sensor takes over, its altitudes are shifted: they have another zero.
 """
 
 from __future__ import annotations
@@ -210,6 +211,10 @@ def outside(limits: GateLimits, height: float | None) -> str:
 
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.
 BANDWIDTH: Final[float] = 1.0
+#: s: until then the observer does not know the vertical velocity by the sensor alone.
+SETTLING: Final[float] = 3.0
+#: m/s: a larger error of a vertical velocity is not corrected: the sensor may be the wrong one.
+MAX_CORRECTION: Final[float] = 1.0
 #: A height older than this, s, is not known any more.
 TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
@@ -244,15 +249,19 @@ class HeightEstimator:
         self._altitude = 0.0
         self._velocity_error = 0.0
         self._reported: float | None = None
-        self._time = -math.inf
+        self._time = self._began = -math.inf
+        self._sensor = ''
+        self._zero = 0.0  # altitude of the sensor at altitude 0
         self._reference: float | None = None
         self._differences: deque[tuple[float, float]] = deque()
 
-    def take(self, altitude: float, climb_rate: float | None, now: float) -> str:
+    def take(self, altitude: float, climb_rate: float | None, now: float, sensor: str = ''
+             ) -> str:
         """
-        Take an altitude of the sensor, m; return '' or the reason why it is refused.
+        Take an altitude of a sensor, m; return '' or the reason why it is refused.
 
         :param climb_rate: of the vehicle, m/s, by another source; None if none is known.
+        :param sensor: its name.
         """
         elapsed = now - self._time
         # Written so that NaN fails.
@@ -261,9 +270,15 @@ class HeightEstimator:
             return refused
         if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:
             climb_rate = None
+        if sensor != self._sensor:
+            before, self._sensor = self.altitude(now), sensor
+            self._zero = 0.0 if before is None else altitude - before
+            if before is None:
+                self._reference = None
+        altitude -= self._zero
         if elapsed > TIMEOUT:
             # A sensor that returns is used again, with the same reference.
-            self._altitude, self._velocity_error = altitude, 0.0
+            self._altitude, self._velocity_error, self._began = altitude, 0.0, now
             self._differences.clear()
         else:
             self._follow(altitude, climb_rate, elapsed, now)
@@ -274,7 +289,8 @@ class HeightEstimator:
                 now: float) -> None:
         if (climb_rate is None) != (self._reported is None):
             # The rate stays; only its components change.
-            self._velocity_error = self.climb_rate - (climb_rate or 0.0)
+            unknown = climb_rate is not None and now - self._began < SETTLING
+            self._velocity_error = 0.0 if unknown else self.climb_rate - (climb_rate or 0.0)
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
         self._differences.append((now, difference))
@@ -305,9 +321,10 @@ class HeightEstimator:
         return (self._reported or 0.0) + self._velocity_error
 
     def corrected(self, climb_rate: float, now: float) -> float:
-        """Return a vertical velocity by the other source, m/s, with its error taken out."""
+        """Return a vertical velocity by the other source, m/s, less at most MAX_CORRECTION."""
         known = self._reported is not None and now - self._time <= TIMEOUT
-        return climb_rate + (self._velocity_error if known else 0.0)
+        error = min(max(self._velocity_error, -MAX_CORRECTION), MAX_CORRECTION)
+        return climb_rate + (error if known else 0.0)
 
     def altitude(self, now: float) -> float | None:
         """Return the altitude by the sensor, m, at ``now``; None if none is known."""

@@ -196,13 +196,13 @@ class Gate:
             known.path.take(p, known.velocity if fresh else None, time)
             known.std = std if math.isfinite(std) else 0.0
 
-    def update_height(self, altitude: float, now: float) -> str:
-        """Take an altitude, m, of the barometer; return '' or why it is refused."""
+    def update_height(self, altitude: float, now: float, sensor: str = '') -> str:
+        """Take an altitude, m, of a barometer or another sensor; return '' or why not."""
         known = self._known(now)
         # Also from an invalid source: a constant error is estimated and removed.
         velocity = None if self.relative.reckoning else known.velocity or known.braking
         refused = self.heights.take(altitude, None if velocity is None else float(
-            velocity.vector[2]), now)
+            velocity.vector[2]), now, sensor)
         height = self.heights.altitude(now)
         if not refused and height is not None:
             self._height_path.take(np.array([0.0, 0.0, height]), None, now)

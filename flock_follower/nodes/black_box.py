@@ -32,7 +32,7 @@ from pathlib import Path
 import sys
 import threading
 import time
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -96,15 +96,6 @@ LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL
 IMAGE_QOS = best_effort(10)
 
 
-class _Subscribed(NamedTuple):
-    """A subscription whose messages wait until they are taken."""
-
-    topic: RecordedTopic
-    handle: Any
-    message_class: Any
-    change: Callable[[bytes], bytes]
-
-
 class BlackBox(FlockNode):
     """Takes messages as they come, and writes them in a thread of its own."""
 
@@ -120,7 +111,8 @@ class BlackBox(FlockNode):
         self._bytes_taken = self._bytes_written = 0
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
-        self._inputs: list[_Subscribed] = []
+        #: Topic, handle and class of a subscription, and what changes its messages.
+        self._inputs: list[tuple[RecordedTopic, Any, Any, Callable[[bytes], bytes]]] = []
         for name, msgtype in RECORDED.items():
             self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)
         transport = values['image_transport']
@@ -131,7 +123,7 @@ class BlackBox(FlockNode):
                 self._subscribe(camera.images(transport), IMAGE if raw else COMPRESSED, IMAGE_QOS,
                                 camera.images('compressed'), _compressed if raw else bytes)
         # rosbags takes tenths of a second for each type the first time: now, not in flight.
-        for msgtype in {each.topic.msgtype for each in self._inputs}:
+        for msgtype in {topic.msgtype for topic, *_ in self._inputs}:
             definition(msgtype)
             type_hash(msgtype)
         for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
@@ -166,7 +158,7 @@ class BlackBox(FlockNode):
         topic = RecordedTopic(
             f'/{(recorded or name).strip("/")}', COMPRESSED if recorded else msgtype,
             qos is LATCHED_QOS, self.resolve_topic_name(name))
-        self._inputs.append(_Subscribed(topic, handle, kind, change))
+        self._inputs.append((topic, handle, kind, change))
 
     def _ask(self) -> None:
         """Ask the nodes whose parameters are not known, if they run."""

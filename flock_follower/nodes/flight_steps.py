@@ -133,9 +133,9 @@ class Flight:
         if key == 'l' and 'land' not in self._pending and (airborne or 'takeoff' in self._pending):
             self._landing = True
             return self._request('disengage', 'land')
-        confirmed = self._question and key == self._question[0] and not (
-            self._pending or self._landing)
-        return self._request(self._question) if confirmed and self._question else []
+        if self._question and key == self._question[0] and not (self._pending or self._landing):
+            return self._request(self._question)
+        return []
 
     def answer(self, step: str, success: bool, message: str, now: float) -> None:
         """Take the answer to a request."""

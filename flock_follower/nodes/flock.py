@@ -106,15 +106,16 @@ class SharingNode(FlockNode):
 
     def _sender_problem(self, now: float) -> Problem | None:
         """Return which clocks of senders are implausible."""
-        odd = [f'{sender.name}: {sender.slow}' for sender in self._sharing.status(self._now())
-               if sender.slow]
+        odd = [f'{name}: {each.slow}' for name, each in self._sharing.senders.items()
+               if each.slow]
         return (WARN, '; '.join(odd)) if odd else None
 
     def _senders(self, now: float) -> dict[str, str]:
         """Return the frame of every sender for /diagnostics."""
-        return {f'frame of {sender.name}': sender.why or (
-            f'known to {sender.position_std:.3f} m, {sender.yaw_std:.3f} rad')
-            for sender in self._sharing.status(self._now())}
+        current = self._now()
+        return {f'frame of {name}': each.unusable(current) or (
+            'known to {:.3f} m, {:.3f} rad'.format(*each.frame.stds) if each.frame else '')
+            for name, each in self._sharing.senders.items()}
 
     def _rivals(self, now: float) -> Problem | None:
         return rivals(self, RECEIVED_TOPIC, 'publish on {}')

@@ -27,7 +27,7 @@ import os
 from pathlib import Path
 import signal
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -54,7 +54,11 @@ from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
-from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
+from flock_follower.nodes.support.middleware import (
+    open_to_network,
+    segment_size,
+    shares_memory,
+)
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.cdr import read_odometry
@@ -65,7 +69,6 @@ from flock_follower.perception.markers import load
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
 PROCESSORS = Path('/proc/stat')
-ANSWER = 2.0  # s for the nodes to send their parameters at the end
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
@@ -84,95 +87,54 @@ class Observer(Node):
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
                  camera: str) -> None:
         super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
-        self._seconds, self._remaps = seconds, remaps
-        self._camera, self._fault = camera, ''
+        self._seconds, self._remaps, self._camera = seconds, remaps, camera
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
-        self._listening = False
         self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
         self._remote: dict[str, RemoteParameters] = {}
-        self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
-        self.create_timer(POLL_PERIOD, self._ask_nodes, clock=STEADY)
-        self.create_timer(POLL_PERIOD, self._subscribe, clock=STEADY)
+        self.create_timer(POLL_PERIOD, self._look, clock=STEADY)
 
     def observe(self) -> Observations:
-        """Listen, and return the observations."""
+        """
+        Listen, and return the observations.
+
+        :raises ValueError: for a camera that does not exist.
+        """
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        before, began = PROCESSORS.read_text(), time.monotonic()
+        end = began + DISCOVERY + self._seconds
         try:
-            self._until(executor, time.monotonic() + DISCOVERY)
-            before, self._listening = PROCESSORS.read_text(), True
-            began = time.monotonic()
-            self._until(executor, began + self._seconds)
-            self.seen.duration = time.monotonic() - began
-            self._listening = False
-            idle = idle_share(before, PROCESSORS.read_text())
-            self._look_at_graph()
-            answers = time.monotonic() + ANSWER
-            while self._asked - self.seen.parameters.keys() and (
-                    time.monotonic() < answers):
-                executor.spin_once(timeout_sec=0.05)
+            while rclpy.ok() and (now := time.monotonic()) < end:
+                executor.spin_once(timeout_sec=end - now)
         finally:
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():
             raise ExternalShutdownException
-        if self._fault:
-            raise ValueError(self._fault)
-        self.seen.machine = _machine(idle)
+        self.seen.duration = time.monotonic() - began
+        self.seen.machine = _machine(idle_share(before, PROCESSORS.read_text()))
+        self._look_at_graph()
         self.seen.static_child = self._static.transform(self.seen.child_frame)
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
 
-    def _until(self, executor: SingleThreadedExecutor, end: float) -> None:
-        while rclpy.ok() and (now := time.monotonic()) < end:
-            executor.spin_once(timeout_sec=end - now)
-
-    def _ask_nodes(self) -> None:
-        """Ask our nodes for their parameters, and relative_pose for its topics."""
+    def _look(self) -> None:
+        """Ask nodes that are new for their parameters, and subscribe to topics that are new."""
+        nodes = self._nodes()
         for node in OURS:
             full = full_name(node, self.seen.namespace)
-            if node in self._asked or full not in self._nodes():
+            if node in self.seen.parameters or full not in nodes:
                 continue
             if node not in self._remote:
                 self._remote[node] = RemoteParameters(
                     self, full, partial(self._take_values, node))
-            if self._remote[node].ask():
-                self._asked.add(node)
+            self._remote[node].ask()
             if node == 'relative_pose':
                 self._names_of(full)
-
-    def _names_of(self, relative_pose: str) -> None:
-        namespace, _, name = relative_pose.rpartition('/')
-        for topic, types in self.get_subscriber_names_and_types_by_node(name, namespace or '/'):
-            ours = BY_TYPE.get(types[0])
-            if ours is not None and ours not in self._remaps:
-                self.seen.names[ours] = topic
-
-    def _take_values(self, node: str, values: dict[str, Any]) -> None:
-        """Keep the parameters of a node; of several cameras those of the one to observe."""
-        if NAMES in values:
-            try:
-                camera, values = alone(values, self._camera)
-            except ValueError as error:
-                self._fault = str(error)
-            else:
-                topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}
-                self.seen.names.update({
-                    ours: full_name(topic, self.seen.namespace)
-                    for ours, topic in topics.items() if ours not in self._remaps})
-        self.seen.parameters[node] = values
-
-    def _nodes(self) -> list[str]:
-        return sorted(f'{namespace.rstrip("/")}/{name}'
-                      for name, namespace in self.get_node_names_and_namespaces()
-                      if name != self.get_name())
-
-    def _subscribe(self) -> None:
-        """Subscribe to those of our topics that are published and not yet subscribed to."""
         published = dict(self.get_topic_names_and_types())
         for name in (*READ, *COUNTED):
             topic = self.seen.names[name]
@@ -185,12 +147,33 @@ class Observer(Node):
             self._subscribed.add('/clock')
             self.create_subscription(Clock, '/clock', self._take_clock, best_effort(50))
 
+    def _names_of(self, relative_pose: str) -> None:
+        """Take the names of our topics from the subscriptions of relative_pose."""
+        namespace, _, name = relative_pose.rpartition('/')
+        for topic, types in self.get_subscriber_names_and_types_by_node(name, namespace or '/'):
+            ours = BY_TYPE.get(types[0])
+            if ours is not None and ours not in self._remaps:
+                self.seen.names[ours] = topic
+
+    def _take_values(self, node: str, values: dict[str, Any]) -> None:
+        """Keep the parameters of a node; of several cameras those of the one to observe."""
+        if NAMES in values:
+            camera, values = alone(values, self._camera)
+            topics = topics_of_camera(camera.image, camera.camera_info) if camera.name else {}
+            self.seen.names.update({
+                ours: full_name(topic, self.seen.namespace)
+                for ours, topic in topics.items() if ours not in self._remaps})
+        self.seen.parameters[node] = values
+
+    def _nodes(self) -> list[str]:
+        return sorted(f'{namespace.rstrip("/")}/{name}'
+                      for name, namespace in self.get_node_names_and_namespaces()
+                      if name != self.get_name())
+
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
 
     def _take(self, name: str, topic: str, message: Any, info: Any) -> None:
-        if not self._listening:
-            return
         # The time of reception, not that of the callback: decoding an image takes a while.
         arrival = (self._simulated if self._simulated is not None
                    else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
@@ -215,23 +198,15 @@ class Observer(Node):
             for info in infos if info.node_name != self.get_name()]
 
 
-class Process(NamedTuple):
-    """One of our nodes on this computer: its name and environment."""
-
-    node: str
-    environment: dict[str, str]
-
-
-def processes() -> Iterator[Process]:
-    """Yield our nodes that run on this computer, but those of other users."""
+def processes() -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield name and environment of our nodes on this computer, but those of other users."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
             words = _words(folder / 'cmdline')
             for node in OURS:
                 if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
-                    yield Process(node, dict(
-                        entry.split('=', 1) for entry in _words(folder / 'environ')
-                        if '=' in entry))
+                    yield node, dict(entry.split('=', 1) for entry in _words(folder / 'environ')
+                                     if '=' in entry)
 
 
 def _words(path: Path) -> list[str]:
@@ -252,10 +227,9 @@ def _machine(idle: float | None) -> Machine:
 def _open_nodes() -> list[str]:
     """Return our nodes on this computer that the network reaches; as check, where none is read."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    found = {process.node: reach(process.environment) for process in processes()
-             if process.environment.get('ROS_DOMAIN_ID', '0') == domain}
-    return sorted(node for node, far in (found or {'check': reach(os.environ)}).items()
-                  if far == NETWORK)
+    found = {node: environment for node, environment in processes()
+             if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}
+    return sorted(node for node, environment in found.items() if open_to_network(environment))
 
 
 def observe(seconds: float, namespace: str, remaps: dict[str, str], camera: str

@@ -47,15 +47,12 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.messages import (
-    AccelerationState,
     from_acceleration,
     from_odometry,
     MOTION_TOPIC,
-    NANOSECONDS,
     OdometryState,
     stamp_to_nanoseconds,
     trajectory,
-    with_acceleration,
 )
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
@@ -75,8 +72,6 @@ from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 
-#: ns between the stamps of a neighbour's state and of its acceleration, two messages.
-ACCELERATION_AGE = 100_000_000
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
 
@@ -98,7 +93,6 @@ class Planner(FlockNode):
         self._reported: tuple[State, bool] | None = None
         self._ticked = time.monotonic()
         self._even_clock = EvenClock(self)
-        self._accelerations: dict[str, AccelerationState] = {}
         self._own = OwnOdometry(self, values, self._take_odom, self._even_clock)
 
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
@@ -107,11 +101,12 @@ class Planner(FlockNode):
             self._poll_states(Odometry, MOTION_TOPIC, from_odometry, self._take_motion, 200),
             self._own.poll,
             self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
-                              from_acceleration, self._take_acceleration, 100),
+                              from_acceleration, self._loop.take_acceleration, 100),
             # Images without a leader in them: a silent publisher is no fault.
-            self._poll_states(Odometry, 'neighbors', from_odometry, self._take_neighbor, 100,
+            self._poll_states(Odometry, 'neighbors', from_odometry, self._loop.take_neighbor, 100,
                               required=True, sporadic=True),
-            self._poll_states(Odometry, 'neighbors/heard', from_odometry, self._take_received, 50),
+            self._poll_states(Odometry, 'neighbors/heard', from_odometry,
+                              partial(self._loop.take_neighbor, received=True), 50),
             *(self.poll(CameraInfo, camera.camera_info,
                         partial(self._take_camera_info, camera=camera.name), best_effort(),
                         required=False) for camera in configured)]
@@ -146,14 +141,13 @@ class Planner(FlockNode):
             self._settings.values['require_bridge'] or self._loop.engaged)
 
     def _poll_states(self, kind: Any, topic: str, convert: Callable[[Any], Any],
-                     take: Callable[[Any, int], None], depth: int, required: bool = False,
+                     take: Callable[[Any], None], depth: int, required: bool = False,
                      sporadic: bool = False) -> Callable[[], None]:
-        """Poll a topic; ``take`` gets states, their stamps by the loop's clock, and arrivals."""
+        """Poll a topic; ``take`` gets states, their stamps by the loop's clock."""
         def taken(message: Any, arrival: int) -> None:
             if self._even_clock.fresh(topic, stamp_to_nanoseconds(message.header.stamp)):
                 state = convert(message)
-                take(state._replace(stamp=self._even_clock.dated(state.stamp, arrival)),
-                     arrival - self._even_clock.shift)
+                take(state._replace(stamp=self._even_clock.dated(state.stamp, arrival)))
         return self.poll(kind, topic, taken, best_effort(depth), required=required,
                          sporadic=sporadic)
 
@@ -162,20 +156,8 @@ class Planner(FlockNode):
             state = state._replace(stamp=min(state.stamp, arrival))
         self._loop.take_odometry(state, arrival)
 
-    def _take_motion(self, state: OdometryState, arrival: int) -> None:
-        self._loop.take_odometry(state, arrival)
-
-    def _take_acceleration(self, state: AccelerationState, _: int) -> None:
-        self._accelerations[state.child] = state
-
-    def _take_neighbor(self, state: OdometryState, _: int) -> None:
-        reported = self._accelerations.get(state.child)
-        if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
-            state = with_acceleration(state, reported)
-        self._loop.take_neighbor(state)
-
-    def _take_received(self, state: OdometryState, _: int) -> None:
-        self._loop.take_neighbor(state, received=True)
+    def _take_motion(self, state: OdometryState) -> None:
+        self._loop.take_odometry(state, self._even_clock.now())
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -240,8 +222,6 @@ class Planner(FlockNode):
         for poll in self._polls:
             poll()
         nanoseconds = self._even_clock.now()
-        self._accelerations = {name: each for name, each in self._accelerations.items()
-                               if nanoseconds - each.stamp < NANOSECONDS}
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)
         decision, command = self._loop.tick(
@@ -272,16 +252,19 @@ class Planner(FlockNode):
         """Return the values of the newest tick for /diagnostics."""
         decision, memory = self._decision, self._loop.memory
         now = self._loop.seconds(self._even_clock.now())
-        states = {'odom': memory.own, **memory.neighbors}
+        states, values = {'odom': memory.own, **memory.neighbors}, self._settings.values
         return {
             'state': decision.state.value, 'reason': decision.reason,
             'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
             'missed_ticks': self._loop.missed, 'limits': decision.limits,
+            # The band about a neighbour, to its hull.
+            'nearest_m': f'{math.sqrt(values["d0"]) + values["radius"]:.3f}',
+            'farthest_m': f'{math.sqrt(values["d1"]) + values["radius"]:.3f}',
             'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),
             **{f'{name}_age_s': f'{now - state.stamp:.3f}'
                for name, state in states.items() if state is not None},
-            **{f'{each.name}_is': f'{each.member.role}, {"heard" if each.received else "seen"}'
-               for each in decision.known}}
+            **{f'{name}_is': f'{n.member.role}, {"heard" if n.received else "seen"}'
+               for name, n in memory.neighbors.items()}}
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked
@@ -299,11 +282,7 @@ class Planner(FlockNode):
         return (WARN, '; '.join(decision.warnings)) if decision.warnings else None
 
     def _sight_problem(self, now: float) -> Problem | None:
-        view = self._loop.view
-        if view and all(field.outside(0.0) for field in view) and (
-                self._settings.current.yaw_mode == 'leader'):
-            return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view or self._decision.state is State.IDLE:
+        if self._loop.view or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without bounds '
                       'that keep the leader in the image')

@@ -174,7 +174,10 @@ class RelativePose(FlockNode):
         """Publish the states of neighbours out of sight, from the ranges."""
         for outcome in self._tracker.ranged():
             if isinstance(outcome, Ranged):
-                self._publish(outcome.name, outcome.estimate, outcome.stamp)
+                state, acceleration = self._perceiver.messages(
+                    make, outcome.stamp, outcome.name, outcome.estimate)
+                self._accelerations.publish(acceleration)
+                self._neighbors.publish(state)
             else:
                 self.diagnostics.reject(*outcome)
 
@@ -187,7 +190,10 @@ class RelativePose(FlockNode):
                 image, sighting = seen.image, seen.sighting
                 for name, estimate in (*sighting.estimates.items(),
                                        *sighting.duplicates.items()):
-                    self._publish(name, estimate, image.stamp_ns)
+                    state, acceleration = self._perceiver.messages(
+                        make, image.stamp_ns, name, estimate)
+                    self._accelerations.publish(acceleration)  # first: the state needs it
+                    self._neighbors.publish(state)
                 if seen.usable:  # after the estimates: the planner has them when it receives this
                     self._frames.publish(Header(
                         stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
@@ -225,11 +231,6 @@ class RelativePose(FlockNode):
             camera.debug_images.publish(Image(
                 header=image.message.header, height=height, width=width, encoding='bgr8',
                 step=3 * width, data=array('B', drawn.tobytes())))
-
-    def _publish(self, name: str, estimate: Estimate, stamp: int) -> None:
-        state, acceleration = self._perceiver.messages(make, stamp, name, estimate)
-        self._accelerations.publish(acceleration)  # first: the planner has it with the state
-        self._neighbors.publish(state)
 
     def _learnt(self, now: float) -> dict[str, object]:
         """Return the estimates of clock offsets, noise and range errors for /diagnostics."""

@@ -49,14 +49,12 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
-from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 
 SPECS: list[Spec] = []
 PERIOD = 0.1  # s between two drawings
-ASK_PERIOD = 3.0  # s between two requests for the band, which can be changed in flight
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
 LARGEST = 65536  # bytes of a message on /diagnostics
 
@@ -70,6 +68,9 @@ SILENT = 0.5  # s after which a command is drawn no more
 ABOVE = np.array([0.0, 0.0, 0.3])  # m: the place of a label
 BODY_SIZE = (0.35, 0.35, 0.1)  # m
 TEXT_SIZE = (0.0, 0.0, 0.15)  # m: the height
+ARROW_SIZE, LINE_SIZE = (0.04, 0.08, 0.1), (0.02, 0.0, 0.0)  # m: widths; length of the head
+#: A level circle of radius 1 m, (49, 3).
+RING = np.array([[math.cos(a), math.sin(a), 0.0] for a in np.linspace(0.0, math.tau, 49)])
 
 Color = tuple[float, float, float, float]
 """Red, green, blue and opacity, each in [0, 1]."""
@@ -89,11 +90,11 @@ class Visualizer(FlockNode):
         super().__init__('visualizer', **kwargs)
         self.declare(SPECS, dict)
         self._own: OdometryState | None = None
+        self._frame = ''
         self._neighbors: dict[str, OdometryState] = {}
         self._command: Command | None = None
         self._report: dict[str, str] = {}
         """The planner's newest values on /diagnostics."""
-        self._planner = RemoteParameters(self, 'planner')
         self._polls = [
             self.poll(Odometry, 'odom', self._take_odom, best_effort()),
             self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False),
@@ -106,14 +107,14 @@ class Visualizer(FlockNode):
         self._markers = self.create_publisher(MarkerArray, 'visualizer/markers', QoSProfile(
             depth=1))
         self.create_timer(PERIOD, self._tick, clock=STEADY)
-        self.create_timer(ASK_PERIOD, self._ask, clock=STEADY)
 
     def _take_odom(self, message: Odometry, _: int) -> None:
         self._own = from_odometry(message)
+        self._frame = self._own.frame
 
     def _take_neighbor(self, message: Odometry, _: int) -> None:
         state = from_odometry(message)
-        self._neighbors[state.child] = state
+        self._neighbors[state.child], self._frame = state, state.frame
 
     def _take_command(self, message: MultiDOFJointTrajectory, _: int) -> None:
         self._command = from_trajectory(message, message.header.frame_id)
@@ -124,9 +125,6 @@ class Visualizer(FlockNode):
             if status.name == planner:
                 self._report = {pair.key: pair.value for pair in status.values}
 
-    def _ask(self) -> None:
-        self._planner.ask(['d0', 'd1', 'radius'])
-
     def _tick(self) -> None:
         """Take the messages that wait and draw them, if a viewer subscribes."""
         if not self._markers.get_subscription_count():
@@ -134,12 +132,13 @@ class Visualizer(FlockNode):
         for poll in self._polls:
             poll()
         now = self.get_clock().now()
-        drawn = [marker for state in self._neighbors.values()
-                 for marker in self._neighbor(state, now.nanoseconds)]
+        drawn: list[Marker] = []
+        for state in self._neighbors.values():
+            drawn += self._neighbor(state, now.nanoseconds)
         if self._own is not None:
             drawn += self._follower(self._own, now.nanoseconds)
         for marker in drawn:
-            marker.header.stamp = now.to_msg()
+            marker.header.frame_id, marker.header.stamp = self._frame, now.to_msg()
         self._markers.publish(MarkerArray(markers=drawn))
 
     def _guarded(self) -> list[str]:
@@ -148,94 +147,73 @@ class Visualizer(FlockNode):
 
     def _neighbor(self, state: OdometryState, now: int) -> list[Marker]:
         """Return a neighbour, its velocity, ellipsoid, edge of the graph, and band."""
-        name, frame, at = state.child, state.frame, state.position
+        name, at, velocity = state.child, state.position, VELOCITY_TIME * state.velocity
         age = (now - state.stamp) / NANOSECONDS
         if age > FORGOTTEN:
             return []
         color, label = (SEEN, name) if age <= UNSEEN else (
             GREY, f'{name}, not seen for {age:.1f} s')
-        drawn = [box(frame, name, at, state.quaternion, color),
-                 *arrow(frame, f'{name} velocity', at, VELOCITY_TIME * state.velocity, color),
-                 text(frame, f'{name} name', at + ABOVE, label, color)]
+        drawn = [shape(name, Marker.CUBE, color, BODY_SIZE, at, state.quaternion),
+                 shape(f'{name} name', Marker.TEXT_VIEW_FACING, color, TEXT_SIZE, at + ABOVE,
+                       text=label)]
+        if np.linalg.norm(velocity) > DEGENERATE:
+            drawn.append(shape(f'{name} velocity', Marker.ARROW, color, ARROW_SIZE,
+                               points=[at, at + velocity]))
         if np.all(np.isfinite(state.pose_covariance[:3, :3])):
-            drawn.append(ellipsoid(frame, f'{name} covariance', at, state.pose_covariance[:3, :3]))
-        band, attended = self._planner.values, name in self._report.get('edges', '').split(', ')
-        if attended and self._own is not None:
-            drawn.append(lines(frame, f'{name} edge', [self._own.position, at], EDGE, 0.02))
-        if attended and band is not None:
-            drawn += [circle(frame, f'{name} {edge}', at, math.sqrt(band[edge]) + band['radius'],
-                             color, 0.05 if reason in self._guarded() else 0.015)
-                      for edge, color, reason in (('d0', INNER, SEPARATION),
-                                                  ('d1', OUTER, COHESION))]
-        return drawn
+            drawn.append(ellipsoid(f'{name} covariance', at, state.pose_covariance[:3, :3]))
+        if name not in self._report.get('edges', '').split(', '):
+            return drawn
+        if self._own is not None:
+            drawn.append(shape(f'{name} edge', Marker.LINE_STRIP, EDGE, LINE_SIZE,
+                               points=[self._own.position, at]))
+        return drawn + [
+            shape(f'{name} {edge}', Marker.LINE_STRIP, color,
+                  (0.05 if reason in self._guarded() else 0.015, 0.0, 0.0),
+                  points=at + float(self._report[edge]) * RING)
+            for edge, color, reason in (('nearest_m', INNER, SEPARATION),
+                                        ('farthest_m', OUTER, COHESION))]
 
     def _follower(self, own: OdometryState, now: int) -> list[Marker]:
         """Return the follower with its state and its command."""
-        at, guarded, state = own.position, self._guarded(), self._report.get('state', 'no planner')
-        color = STATES.get(state, GREY)
+        guarded, state = self._guarded(), self._report.get('state', 'no planner')
+        color, at, command = STATES.get(state, GREY), own.position, self._command
         label = [state, *(f'guard: {reason}' for reason in guarded)]
         if state != 'TRACK':
             label.append(self._report.get('reason', ''))
-        drawn = [box(own.frame, 'follower', at, own.quaternion, color),
-                 text(own.frame, 'state', at + ABOVE, '\n'.join(filter(None, label)), color)]
-        command = self._command
+        drawn = [shape('follower', Marker.CUBE, color, BODY_SIZE, at, own.quaternion),
+                 shape('state', Marker.TEXT_VIEW_FACING, color, TEXT_SIZE, at + ABOVE,
+                       text='\n'.join(filter(None, label)))]
         if command is not None and command.ages(now)[0] <= SILENT:
-            drawn += arrow(own.frame, 'command', at, ACCELERATION_SCALE * np.asarray(
-                command.acceleration, float), GUARDED if guarded else COMMAND)
+            drawn.append(shape(
+                'command', Marker.ARROW, GUARDED if guarded else COMMAND, ARROW_SIZE,
+                points=[at, at + ACCELERATION_SCALE * np.asarray(command.acceleration, float)]))
         return drawn
 
 
-def box(frame: str, name: str, position: Array, quaternion: Array, color: Color) -> Marker:
-    """Return a vehicle at a pose."""
-    return placed(frame, name, Marker.CUBE, position, BODY_SIZE, color, quaternion)
-
-
-def text(frame: str, name: str, position: Array, label: str, color: Color) -> Marker:
-    """Return text that faces the viewer."""
-    return placed(frame, name, Marker.TEXT_VIEW_FACING, position, TEXT_SIZE, color, text=label)
-
-
-def ellipsoid(frame: str, name: str, centre: Array, covariance: Array) -> Marker:
+def ellipsoid(name: str, centre: Array, covariance: Array) -> Marker:
     """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]
     size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), DEGENERATE)
-    return placed(frame, name, Marker.SPHERE, centre, size, ELLIPSOID, matrix_to_quaternion(axes))
+    return shape(name, Marker.SPHERE, ELLIPSOID, size, centre, matrix_to_quaternion(axes))
 
 
-def arrow(frame: str, name: str, start: Array, along: Array, color: Color) -> list[Marker]:
-    """Return an arrow from a place (3,) along a vector (3,); none if it has no length."""
-    if np.linalg.norm(along) <= DEGENERATE:
-        return []
-    marker = lines(frame, name, [start, start + along], color, 0.04)
-    marker.type, marker.scale.y, marker.scale.z = Marker.ARROW, 0.08, 0.1
-    return [marker]
+def shape(name: str, kind: int, color: Color, size: ArrayLike, position: ArrayLike = (0, 0, 0),
+          quaternion: Array = IDENTITY_QUATERNION, points: ArrayLike = (),
+          text: str = '') -> Marker:
+    """
+    Return a marker; its name is the namespace, so that each can be hidden.
 
-
-def circle(frame: str, name: str, centre: Array, radius: float, color: Color,
-           width: float) -> Marker:
-    """Return a level circle about a place (3,)."""
-    angle = np.linspace(0.0, math.tau, 49)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    return lines(frame, name, centre + radius * ring, color, width)
-
-
-def lines(frame: str, name: str, points: ArrayLike, color: Color, width: float) -> Marker:
-    """Return a line through points (n, 3)."""
-    marker = placed(frame, name, Marker.LINE_STRIP, np.zeros(3), (width, 0.0, 0.0), color)
-    marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, float).tolist()]
-    return marker
-
-
-def placed(frame: str, name: str, kind: int, position: Array, size: ArrayLike, color: Color,
-           quaternion: Array = IDENTITY_QUATERNION, text: str = '') -> Marker:
-    """Return the message of a shape; its name is the namespace, so that each can be hidden."""
+    :param size: (3,), m; of lines the first is the width, of text the last the height.
+    :param points: of lines and arrows (n, 3), m.
+    """
     red, green, blue, opacity = color
+    places = np.asarray(points, float).tolist()
     marker = Marker(ns=name, type=kind, action=Marker.ADD, text=text,
                     lifetime=Duration(seconds=LIFETIME).to_msg(),
-                    color=ColorRGBA(r=red, g=green, b=blue, a=opacity))
-    marker.header.frame_id = frame
+                    color=ColorRGBA(r=red, g=green, b=blue, a=opacity),
+                    points=[Point(x=x, y=y, z=z) for x, y, z in places])
     set_vector(marker.pose.position, position)
     set_quaternion(marker.pose.orientation, quaternion)
     set_vector(marker.scale, size)

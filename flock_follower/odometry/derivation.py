@@ -288,17 +288,9 @@ class TwistFrame:
 
     @property
     def describe(self) -> str:
-        """Return the result as text."""
-        if self.wanted == AUTO:
-            return {'': 'auto: not known yet, read as REP-105 says (child) where it does not '
-                    'matter, else derived from the positions',
-                    NONE: 'auto: none, the velocity comes from the positions: that of the '
-                    f'messages is off by {self.contradiction:.2f} m/s'}.get(
-                        self.found, f'auto: {self.found}, found by the positions')
-        if self.wanted == NONE:
-            return 'none: the velocity comes from the positions'
-        return self.wanted + {'': '', self.wanted: ' (the positions agree)'}.get(
-            self.found, f' as configured, but the positions say {self.found}')
+        """Return the frame as configured, and the frame that fits the positions."""
+        off = f', off by {self.contradiction:.2f} m/s' if self.found == NONE else ''
+        return f'{self.wanted}: {self.found or "not known yet"} by the positions{off}'
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""

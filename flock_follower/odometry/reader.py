@@ -18,10 +18,6 @@ Odometry of any source as the vehicle's own state: the pose of base_link, with a
 Sources differ (see docs/sensors.md): their child frame is an IMU or a camera instead of base_link;
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
 their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
-
-The attitudes show which axis of base_link points up: in flight it is z. If another axis points up,
-the pose of the child frame on base_link is set wrongly. The forward axis cannot be found in this
-way, because a quadrotor flies in all directions.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -57,45 +53,6 @@ from flock_follower.odometry.derivation import (
     TwistFrame,
 )
 from flock_follower.ranges import Checked, parameter, Range
-
-#: In which time the mean follows, s.
-MEAN_TIME: Final[float] = 2.0
-#: Attitudes are looked at so far apart at least, s.
-PERIOD: Final[float] = 0.05
-#: An axis points up while the mean of its upward part is above this, which is 45 degrees.
-UPWARD: Final[float] = 0.7
-
-
-class UpAxis:
-    """Watches attitudes."""
-
-    def __init__(self) -> None:
-        self._stamp = -math.inf
-        self._up = [0.0, 0.0, 0.0]  # in base_link, mean
-
-    def take(self, stamp: float, rotation: Array) -> None:
-        """Take an attitude (3, 3), base_link to odom, at a stamp, s."""
-        if stamp - self._stamp < PERIOD:
-            return
-        share = 1.0 - math.exp((self._stamp - stamp) / MEAN_TIME)
-        self._up = [old + share * (new - old) for old, new in zip(self._up, rotation[2].tolist())]
-        self._stamp = stamp
-
-    @property
-    def axis(self) -> str:
-        """Return the axis that points up, 'x', '-x', 'y', ..., or '' if none does."""
-        k = max(range(3), key=lambda axis: abs(self._up[axis]))
-        upward = self._up[k]
-        return '' if abs(upward) < UPWARD else ('-' if upward < 0.0 else '') + 'xyz'[k]
-
-    @property
-    def fault(self) -> str:
-        """Return the fault if another axis than z points up, else ''."""
-        if self.axis in ('', 'z'):
-            return ''
-        return (f'base_link has {self.axis} up instead of z: set odom_child_rpy to how the child '
-                'frame of odom lies on it')
-
 
 #: Where the way to read the velocity changes, the step is faded out in this time constant, s.
 FADING = 0.5
@@ -142,7 +99,7 @@ class OdometrySource:
     """
     The own odometry, message by message.
 
-    ``twist`` describes the frame of the velocity, ``up`` which axis of base_link points up.
+    ``twist`` describes the frame of the velocity.
     ``events`` are (reason, detail) of dropped messages and jumps since :meth:`new_events`.
     """
 
@@ -178,7 +135,6 @@ class OdometrySource:
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
         self._attitudes: deque[tuple[float, Array]] = deque(maxlen=ATTITUDES)
-        self.up = UpAxis()
         self.twist.restart()
         self._latencies.clear()
         self._gaps.clear()
@@ -226,7 +182,6 @@ class OdometrySource:
             lever = -rotation.dot(self._child_position)
             position = position + lever
         self._attitudes.append((time, quaternion))
-        self.up.take(time, rotation)
         if jump := self.motion.take(time, position):
             self.events.append(('odom jumped', f'by {jump:.2f} m'))
             self.twist.restart()

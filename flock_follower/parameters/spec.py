@@ -41,6 +41,7 @@ REMOVED = {
     'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
     'j_max': 'the jerk of setpoints is not limited: remove the line',
     'check_parameters': 'they are always compared: remove the line',
+    'range_max': 'the bridge bounds the distance: set radius_max of mavlink_bridge',
     'silent_at_rest': 'the bridge requests hold mode 3 s after the last command',
     'paused': 'call replay/pause',
     'clock': 'replay always publishes /clock: remove the line',

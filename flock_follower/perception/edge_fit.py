@@ -29,7 +29,6 @@ them unequally.
 from __future__ import annotations
 
 import math
-from operator import truediv
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -251,8 +250,7 @@ class EdgeFit(NamedTuple):
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
     vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
-    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found,
-    ``smear`` the blur, as a share of the narrowest cell.
+    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found.
     """
 
     pose: Transform
@@ -263,7 +261,6 @@ class EdgeFit(NamedTuple):
     degrees: float
     inliers: float
     spacing: tuple[float, float]
-    smear: float
     lines: Lines
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
@@ -308,8 +305,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if settled or count == _PASSES - 1:
             if not settled and farthest * farthest > _SETTLED**2 * near:
                 return None
-            return _fitted(pose, lines, found, step, suited,
-                           max(map(truediv, blur, lines.narrowest)))
+            return _fitted(pose, lines, found, step, suited)
         spacing = suited
         # A fit to a part of the edges must not exclude the others.
         last = step if clear else None
@@ -319,7 +315,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
-            spacing: tuple[float, float], smear: float) -> EdgeFit | None:
+            spacing: tuple[float, float]) -> EdgeFit | None:
     """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
@@ -333,7 +329,7 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(
         pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
-        degrees, inliers, spacing, smear, lines, last.residual, weights)
+        degrees, inliers, spacing, lines, last.residual, weights)
 
 
 class _Step(NamedTuple):

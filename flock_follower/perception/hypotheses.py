@@ -35,6 +35,7 @@ Positions are in the smooth frame of ``OdometryBuffer``.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
 
@@ -80,18 +81,21 @@ class _Motion:
         self.moved = self.moved or math.dist(self._place, (x, y, z)) > MOVED
 
 
+@dataclass(eq=False)
 class Candidate:
     """A track other than the primary one; candidates are numbered from 1 on."""
 
-    def __init__(self, number: int, track: NeighborFilter, reachable: bool) -> None:
-        self.number, self.track, self.reachable = number, track, reachable
-        self.motion = _Motion()
-        self.measured = 0
-        """Measurements taken in."""
-        self.alone = 0
-        """Measurements since the last one of the primary track."""
-        self.beside = False
-        """Whether the primary track was ever measured in the same image."""
+    number: int
+    track: NeighborFilter
+    reachable: bool
+    """Whether the primary track could have reached its first place."""
+    motion: _Motion = field(default_factory=_Motion)
+    measured: int = 0
+    """Measurements taken in."""
+    alone: int = 0
+    """Measurements since the last one of the primary track."""
+    beside: bool = False
+    """Whether the primary track was ever measured in the same image."""
 
     @property
     def confirmed(self) -> bool:
@@ -101,8 +105,7 @@ class Candidate:
     @property
     def seen(self) -> float:
         """Return when it was measured last, s."""
-        newest = self.track.newest
-        return -math.inf if newest is None else newest.stamp
+        return -math.inf if self.track.newest is None else self.track.newest.stamp
 
     def name(self, neighbor: str) -> str:
         """Return under which name it is known, given the neighbour's."""
@@ -110,12 +113,8 @@ class Candidate:
 
     def distance(self, time: float, place: Array) -> float:
         """Return how far a place (3,), m, is from where it is expected, m."""
-        expected = self.track.place(time)
-        if expected is None:
-            newest = self.track.newest
-            assert newest is not None, 'it was measured once'
-            return math.dist(place, newest.position)
-        return math.dist(place, expected.translation)
+        expected = self.track.place(time) or (self.track.newest and self.track.newest.pose)
+        return math.inf if expected is None else math.dist(place, expected.translation)
 
     def take(self, time: float, measured: Transform, reference: Array,
              covariance: Array) -> None:
@@ -176,7 +175,8 @@ class Hypotheses:
         newest = self.primary.newest
         if newest is not None and time < newest.stamp - MAX_JUMP:
             self.reset()
-        self._forget(time)
+        self.candidates = [each for each in self.candidates if time - each.seen <= (
+            MEMORY if each.confirmed and not each.motion.moved else self.params.max_gap)]
         candidate = self.candidate_at(time, measured.translation)
         arguments = time, measured, reference, covariance
         if candidate is None:
@@ -262,10 +262,3 @@ class Hypotheses:
         candidate.track.walk = self.primary.walk
         self.candidates.append(candidate)
         return candidate
-
-    def _forget(self, time: float) -> None:
-        """Forget candidates that have not been seen for long."""
-        if not self.candidates:
-            return
-        self.candidates = [each for each in self.candidates if time - each.seen <= (
-            MEMORY if each.confirmed and not each.motion.moved else self.params.max_gap)]

@@ -200,7 +200,7 @@ class Look:
     view: View
     near: Sequence[str]
     anywhere: Sequence[str]
-    expected: dict[str, PosePrior] = field(default_factory=dict)
+    expected: dict[str, PosePrior]
     measured: dict[str, Measurement] = field(default_factory=dict)
     others: list[Measurement] = field(default_factory=list)
     sighting: Sighting = field(default_factory=Sighting)

@@ -62,15 +62,8 @@ SIGMA_FLOOR = 0.05
 NARROW = 0.01
 #: Of a marker that is not tracked yet, more than this share of the edges must agree.
 FOUND_INLIERS = 0.8
-#: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
-#: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
-SMEARED = 0.26
 #: Number of independent samples of a smeared print, to decide between two attitudes.
 SMEAR_DEGREES = 200.0
-#: Share of the distance: a smeared print is fitted twice as well, and takes six times as long.
-UNCERTAIN = 0.0075
-#: px: by less, it is the lens that blurs them.
-LENS_BLUR = 1.6
 
 
 class Target(NamedTuple):
@@ -103,22 +96,9 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
         if found is not None:  # from afar it may have settled early
             found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
-    measured = None if found is None else _of_edges(
-        image, camera, sought, found, expected, spacing, check_mirrored)
-    if found is None or measured is None:
+    if found is None:
         return _smeared(image, camera, sought, expected.pose)
-    blurred = found.smear > max(SMEARED, LENS_BLUR / min(found.lines.narrowest))
-    if (blurred and len(found.lines.model.codes) == 1
-            and _uncertainty(measured) > UNCERTAIN):
-        smeared = _smeared(image, camera, sought, expected.pose)
-        return measured if smeared is None else min(measured, smeared, key=_uncertainty)
-    return measured
-
-
-def _uncertainty(measurement: Measurement) -> float:
-    """Return the deviation of the place, as a share of the distance."""
-    offset = measurement.T_camera_body.translation
-    return math.sqrt(measurement.covariance[:3, :3].trace() / offset.dot(offset))
+    return _of_edges(image, camera, sought, found, expected, spacing, check_mirrored)
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,

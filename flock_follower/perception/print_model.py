@@ -26,7 +26,6 @@ with its surrounding cells, in the window in which they agree best with the code
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -129,52 +128,44 @@ _MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
-@dataclass(frozen=True, eq=False)
 class CellCode:
     """
-    The code of a marker: the colours of its cells.
+    The code of a marker of a dictionary: the colours of its cells.
 
     ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
     rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread. ``others``
     (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells that are
-    compared with one another under uneven light.
+    compared with one another under uneven light. ``by_cell`` takes pixels (c, 2) to how far, px,
+    it is from cell to cell along rows and columns, (2, c).
     """
 
-    centers: Array
-    grid: Array
-    bits: Array
-    border: int
-    errors: int
-    others: Any
-    windows: Windows
-    #: Takes pixels (c, 2) to how far, px, it is from cell to cell along rows and columns: (2, c).
-    by_cell: Array
-
-
-@lru_cache(maxsize=64)
-def cell_code(marker: Marker, dictionary: str) -> CellCode:
-    """Return the cells of a marker of a dictionary."""
-    cells = marker_cells(dictionary)
-    rows, columns = (index.ravel() for index in np.mgrid[-1:cells + 1, -1:cells + 1])
-    from_edge = np.minimum(np.minimum(rows, columns), cells - 1 - np.maximum(rows, columns))
-    order = np.argsort(-np.minimum(from_edge, 1), kind='stable')  # inner, border, around
-    x, y = columns[order] + 0.5 - cells / 2.0, cells / 2.0 - rows[order] - 0.5
-    centers = marker.side_length / cells * np.stack([x, y, np.zeros(len(order))], axis=1)
-    words = dictionary_words(dictionary)
-    turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
-    signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
-    bits = signs[marker.marker_id, 0].copy()
-    signs[marker.marker_id, 0] = -bits  # not one of the others
-    grid, border = np.stack([columns[order], rows[order]], axis=1), int((from_edge == 0).sum())
-    white = np.concatenate([bits > 0.0, np.zeros(border, dtype=bool),
-                            np.ones(len(order) - bits.size - border, dtype=bool)])
-    return CellCode(
-        marker.T_body_marker.apply(centers), grid, bits, border,
-        max(correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
-        windows(grid, white),
+    def __init__(self, marker: Marker, dictionary: str) -> None:
+        cells = marker_cells(dictionary)
+        rows, columns = (index.ravel() for index in np.mgrid[-1:cells + 1, -1:cells + 1])
+        from_edge = np.minimum(np.minimum(rows, columns), cells - 1 - np.maximum(rows, columns))
+        order = np.argsort(-np.minimum(from_edge, 1), kind='stable')  # inner, border, around
+        x, y = columns[order] + 0.5 - cells / 2.0, cells / 2.0 - rows[order] - 0.5
+        self.centers = marker.T_body_marker.apply(
+            marker.side_length / cells * np.stack([x, y, np.zeros(len(order))], axis=1))
+        self.grid = np.stack([columns[order], rows[order]], axis=1)
+        self.border = int((from_edge == 0).sum())
+        words = dictionary_words(dictionary)
+        turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
+        signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
+        self.bits: Any = signs[marker.marker_id, 0].copy()
+        signs[marker.marker_id, 0] = -self.bits  # not one of the others
+        self.others: Any = signs.reshape(-1, self.bits.size)
+        self.errors = max(correctable_cells(dictionary), 1)
+        self.windows = windows(self.grid, np.concatenate([
+            self.bits > 0.0, np.zeros(self.border, dtype=bool),
+            np.ones(len(order) - self.bits.size - self.border, dtype=bool)]))
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
-        np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
+        self.by_cell = np.linalg.pinv(np.column_stack([self.grid, np.ones(len(self.grid))]))[:2]
+
+
+#: The code of a marker of a dictionary, made once.
+cell_code = lru_cache(maxsize=64)(CellCode)
 
 
 def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = False) -> bool:

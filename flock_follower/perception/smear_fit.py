@@ -26,7 +26,6 @@ Lengths on a marker are in cells: (0, 0) is the middle of its first black cell, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 import math
 from typing import Any, NamedTuple
@@ -66,7 +65,6 @@ _SHARP = 1
 _LENGTHS = (0.5, 1.0, 1.45)
 
 
-@dataclass(frozen=True, eq=False)
 class SmearModel:
     """
     The model of a print whose image is smeared by motion.
@@ -82,44 +80,36 @@ class SmearModel:
     ``cells``: number of cells along a side, with the black border.
     """
 
-    origin: Array
-    axes: Array
-    places: Array
-    around: Array
-    printed: Any
-    smears: Array
-    lenses: tuple[int, ...]
-    smeared: Any
-    codes: Array
-    errors: int
-    cells: int
+    def __init__(self, marker: Marker, dictionary: str) -> None:
+        printed = marker_code(dictionary, marker.marker_id)
+        self.cells = n = len(printed)
+        cell, R = marker.side_length / n, marker.T_body_marker.rotation
+        self.origin = marker.T_body_marker.apply(
+            0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
+        self.axes = cell * np.array([R[:, 0], -R[:, 1]])
+        self.places, self.around = _samples(n, MARGIN), _samples(n, MARGIN + REACH)
+        white = np.pad(printed, _WHITE, constant_values=True).astype(float)
+        level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
+        self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
+            level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
+        angles = np.arange(4) * np.pi / 4
+        self.smears = np.array([[0.0, 0.0], *(length * np.array([np.cos(a), np.sin(a)])
+                                              for length in _LENGTHS for a in angles),
+                                *np.zeros((len(LENSES) - FOCUSED, 2))])
+        self.lenses = (_SHARP,) * (1 + len(_LENGTHS) * len(angles)) + tuple(
+            range(FOCUSED, len(LENSES)))
+        size = n * PER_CELL + 2 * MARGIN
+        self.smeared: Any = np.array([
+            smear_print(self.printed[lens], self.places, smear)[0]
+            for lens, smear in zip(self.lenses, self.smears)]).reshape(-1, size, size).astype(
+                np.float32)
+        code = cell_code(marker, dictionary)
+        self.codes = 0.5 + 0.5 * np.vstack([code.bits, code.others])
+        self.errors = max(code.errors // 2, 1)
 
 
-@lru_cache(maxsize=64)
-def smear_model(marker: Marker, dictionary: str) -> SmearModel:
-    """Return the model of a smeared marker."""
-    code = marker_code(dictionary, marker.marker_id)
-    n = len(code)
-    cell = marker.side_length / n
-    R = marker.T_body_marker.rotation
-    origin = marker.T_body_marker.apply(0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
-    white = np.pad(code, _WHITE, constant_values=True).astype(float)
-    level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
-    printed = np.array([_with_slopes(cv2.GaussianBlur(
-        level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
-    cells = cell_code(marker, dictionary)
-    angles = np.arange(4) * np.pi / 4
-    smears = np.array([[0.0, 0.0], *(length * np.array([np.cos(a), np.sin(a)])
-                                     for length in _LENGTHS for a in angles),
-                       *np.zeros((len(LENSES) - FOCUSED, 2))])
-    lenses = (_SHARP,) * (1 + len(_LENGTHS) * len(angles)) + tuple(range(FOCUSED, len(LENSES)))
-    places, size = _samples(n, MARGIN), n * PER_CELL + 2 * MARGIN
-    smeared = np.array([smear_print(printed[lens], places, smear)[0]
-                        for lens, smear in zip(lenses, smears)])
-    return SmearModel(
-        origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + REACH),
-        printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
-        0.5 + 0.5 * np.vstack([cells.bits, cells.others]), max(cells.errors // 2, 1), n)
+#: The model of a marker of a dictionary, made once.
+smear_model = lru_cache(maxsize=64)(SmearModel)
 
 
 def _with_slopes(level: Array) -> Any:

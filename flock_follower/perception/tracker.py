@@ -135,6 +135,8 @@ class Tracker:
             camera.restart(self._targets)
         self._schedule.restart()
         self.ranging.restart()
+        self._planned: tuple[float, MountedCamera, Sought | Missing] | None = None
+        """The result of :meth:`wanted`, for the image that is processed next."""
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take the own state; return whether time jumped back and everything restarted."""
@@ -165,6 +167,7 @@ class Tracker:
         """
         source = self.cameras[camera]
         sought = self._sought(stamp, model, source)
+        self._planned = stamp, source, sought
         return isinstance(sought, Missing) or bool(sought.near) or (
             bool(sought.anywhere) and self._schedule.search_due(source, stamp)
         ) or self._schedule.sweep_due(source, stamp)
@@ -218,18 +221,18 @@ class Tracker:
 
     def _look(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Look | Missing:
         """Return the expected content of an image, or why nothing is known."""
-        sought = self._sought(stamp, model, camera)
+        planned, self._planned = self._planned, None
+        sought = planned[2] if planned is not None and planned[:2] == (stamp, camera) else (
+            self._sought(stamp, model, camera))
         if isinstance(sought, Missing):
             return sought
         exposed = stamp + 0.5 * camera.readout_time
         view = self._view(camera, exposed)
         if isinstance(view, Missing):
             return view
-        look = Look(stamp, exposed, camera, model, view, *sought)
-        for name in {*look.near, *look.anywhere}:
-            expected = self._filters[name].predict(self._time(name, camera, exposed))
-            look.expected[name] = view.prior(expected)
-        return look
+        return Look(stamp, exposed, camera, model, view, *sought, {
+            name: view.prior(self._filters[name].predict(self._time(name, camera, exposed)))
+            for name in {*sought.near, *sought.anywhere}})
 
     def _view(self, camera: MountedCamera, exposed: float) -> View | Missing:
         """Return the view of a camera at a time by its clock, s."""

@@ -70,7 +70,7 @@ from flock_follower.planner.limits import (
     SIGHT,
 )
 from flock_follower.planner.params import GuardParams, PlannerParams
-from flock_follower.planner.sight import all_round, MARGIN, vertical, View
+from flock_follower.planner.sight import MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
@@ -233,14 +233,12 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view:
     # Its height alone never forces a horizontal motion: altitude control follows its height.
     faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
     slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
-    bounds = [Bound(-forward, -faster, SIGHT), Bound(forward, -slower, SIGHT)]
-    if all_round(view):
-        return bounds  # the yaw need not follow it
     left = np.array([-y, x, 0.0]) / distance
     passing = float(left @ (it.velocity - velocity))
     turning = TURNING_SHARE * params.yaw_rate_max * distance
     across = float(left @ it.acceleration)
-    return [*bounds, Bound(left, (passing - turning) / TURNING_TIME + across, SIGHT),
+    return [Bound(-forward, -faster, SIGHT), Bound(forward, -slower, SIGHT),
+            Bound(left, (passing - turning) / TURNING_TIME + across, SIGHT),
             Bound(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
 
 

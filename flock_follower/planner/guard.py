@@ -38,7 +38,6 @@ from flock_follower.planner.bounds import (
     in_sight,
     LEVEL,
     marker_bounds,
-    radial_bounds,
     sight_bounds,
     stop,
 )
@@ -61,8 +60,8 @@ from flock_follower.planner.limits import (
 )
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.neighborhood import Neighborhood
 from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.scene import Scene
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
@@ -129,23 +128,19 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     return max(least, min(-rest, most)), min(most, max(rest, least))
 
 
-def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
+def fences(lost: Loss | None, position: Array, velocity: Array,
            params: PlannerParams) -> list[Bound]:
-    """Return the bounds that keep it near home and, out of sight, from moving on unseeing."""
-    bounds = list[Bound]()
-    if home is not None:
-        inside = radial_bounds(LEVEL * (position - home), LEVEL * velocity,
-                               Edges(-math.inf, params.range_max), params.guarding)
-        bounds += [each._replace(reason=FENCE) for each in inside if each.reason == COHESION]
-    if lost is not None:
-        offset = LEVEL * (position - lost.origin)
-        distance = math.hypot(*offset.tolist())
-        if distance > 1e-6:
-            left = retreat(lost, params) - distance
-            bounds.append(stop(offset / distance, left, velocity, params))
-        left = lost.free - params.guarding.m - float(lost.towards @ position)
-        bounds.append(stop(lost.towards, left, velocity, params))
-    return bounds
+    """Return the bounds that, out of sight, keep it from moving on unseeing."""
+    if lost is None:
+        return []
+    left = lost.free - params.guarding.m - float(lost.towards @ position)
+    onward = stop(lost.towards, left, velocity, params)
+    offset = LEVEL * (position - lost.origin)
+    distance = math.hypot(*offset.tolist())
+    if distance <= 1e-6:
+        return [onward]
+    left = retreat(lost, params) - distance
+    return [stop(offset / distance, left, velocity, params), onward]
 
 
 def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
@@ -177,7 +172,7 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     distance = lost.free - float(lost.towards @ lost.origin)
-    beyond = max(distance - math.sqrt(params.law.d1), 0.0) if math.isfinite(distance) else 0.0
+    beyond = max(distance - math.sqrt(params.law.d1), 0.0)
     return max(params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond,
                0.0)
 
@@ -199,42 +194,24 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     return held + CLIMB_MAX
 
 
-def beside(velocity: Array, offset: Array) -> Array:
-    """
-    Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
-
-    :param velocity: of the neighbour (3,), m/s.
-    :param offset: own position minus the neighbour's (3,), m.
-    """
-    x, y, _ = velocity.tolist()
-    length = math.hypot(x, y)
-    if length < 1e-6:
-        return np.zeros(3)
-    across = np.array([-y, x, 0.0]) / length
-    return math.copysign(1.0, float(across @ offset)) * across
-
-
-def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, state: State,
-              blinded: bool, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
-              params: PlannerParams) -> LimitedCommand:
+def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, scene: Scene,
+              velocity: Array, view: View, params: PlannerParams) -> LimitedCommand:
     """
     Return the nearest command within all limits and bounds.
 
     :param nominal: horizontal part of the nominal acceleration (3,), m/s^2, without limits.
     :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
-    :param blinded: whether no images are processed.
     :param velocity: own velocity when the command acts (3,), m/s.
-    :param neighbors: the neighbors at hand in TRACK, else none.
     """
     # Limits lowered in flight bind the law and coasting, not braking and keeping clear.
     lowered, start = (params.a_max, params.v_max), (params.strongest, params.fastest)
-    limits = lowered if state in (State.TRACK, State.COAST) else start
+    limits = lowered if scene.state in (State.TRACK, State.COAST) else start
     more = _lost_to_drag(memory, velocity, params)
-    rising = max(abs(float(me.velocity[2])), abs(climb))
+    rising = max(abs(float(scene.me.velocity[2])), abs(climb))
     command = limit_horizontal(nominal, vertical, velocity, limits[0], limits[1] + more,
                                params.period, rising)
-    if params.guard and (state is not State.SEARCH or memory.flock):
-        bounds = _bounds(memory, me, velocity, neighbors, view, blinded, params)
+    if params.guard and (scene.state is not State.SEARCH or memory.flock):
+        bounds = _bounds(memory, scene, velocity, view, params)
         allowed = constrained(command.acceleration, velocity, bounds, params.a_max,
                               params.v_max + more, params.period)
         if start != lowered:
@@ -248,7 +225,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sta
     # The velocity of commands not yet flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = start
-    final = limit_command(command.acceleration, me.velocity, *limits, params.period,
+    final = limit_command(command.acceleration, scene.me.velocity, *limits, params.period,
                           command.separation_axis)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
@@ -262,29 +239,29 @@ def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> flo
     return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
 
 
-def _bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood, view: View,
-            blinded: bool, params: PlannerParams) -> list[Bound]:
+def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
+            params: PlannerParams) -> list[Bound]:
     """
     Return all bounds in their order.
 
     Without a camera a neighbor seen last may be anywhere: the follower does not back away.
     """
-    near = list[Bound]()
+    near, me = list[Bound](), scene.me
     for name, n in memory.ranged.items():
         if name not in memory.neighbors:
             near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
-        if here or not (name in memory.ranged or (blinded and not n.received)):
-            near += _neighbor_bounds(n, memory, me, velocity, neighbors, here, params)
-    return ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
-                   _sight_bounds(memory, me, velocity, neighbors, view, params))
+        if here or not (name in memory.ranged or (scene.blinded and not n.received)):
+            near += _neighbor_bounds(n, memory, scene, velocity, here, params)
+    return ordered(near, fences(memory.lost, me.position, velocity, params),
+                   _sight_bounds(memory, scene, velocity, view, params))
 
 
-def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
-                     neighbors: Neighborhood, here: bool,
+def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array, here: bool,
                      params: PlannerParams) -> list[Bound]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
+    me, neighbors = scene.me, scene.neighbors
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
@@ -302,12 +279,13 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
     return [each._replace(seen=False) for each in found] if n.received else found
 
 
-def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood,
-                  view: View, params: PlannerParams) -> list[Bound]:
+def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
+                  params: PlannerParams) -> list[Bound]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
-    n = None if neighbors.faced is None else memory.flock[neighbors.faced.name]
-    if n is None or not view or n.received:
+    me, faced = scene.me, scene.neighbors.faced
+    if faced is None or not view or faced.received:
         return []
+    n = memory.flock[faced.name]
     it = _expected(n, memory, me, params)
     offset = it.position - me.position
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)

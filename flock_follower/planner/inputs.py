@@ -15,11 +15,6 @@
 """
 Inputs of the planner: own odometry and neighbors, their validity, and their prediction.
 
-Odometry is overdue by the rhythm of its messages. Between two messages it grows old by nature: at
-10 Hz and 60 ms of latency it is 0.06 s old on arrival, and 0.16 s just before the next arrives. A
-fast source is overdue at ``LATE`` of the timeout, a slow one if it becomes older than usual. A
-source whose odometry is usually too old, on average or at its oldest, is too slow to fly on.
-
 Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
 
 1. The neighbor keeps the velocity of its newest estimate, and its acceleration, if plausible, for
@@ -36,7 +31,6 @@ Nothing here reads a clock. The assumptions about a neighbor at the time when a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import NamedTuple, TypeVar
 
@@ -47,36 +41,6 @@ from flock_follower.messages import FARTHEST, FASTEST, FUTURE_TOLERANCE
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.params import Member, PlannerParams, SEEN_DEFAULT
 
-LATE = 0.5  # share of the timeout: younger odometry is never overdue
-LATEST = 0.8  # share of the timeout: older odometry always is, to brake before commands end
-OVERDUE = 1.2  # times the greatest age that the last ones reached
-AVERAGE = 0.55  # share of the timeout: older on average than this it is too slow
-STEADY = 0.9  # hysteresis: once too slow, the limits are this much tighter
-
-Span = tuple[float, float]
-"""The ages, s, between which one odometry was the newest: on arrival, and when replaced."""
-
-
-def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | None:
-    """
-    Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
-
-    :param timeout: age at which odometry is not used at all, s.
-    :param before: whether the odometry was too slow before.
-    """
-    if not spans:
-        return None
-    usual = sorted(spans, key=sum)[len(spans) // 2]
-    share = timeout * (STEADY if before else 1.0)
-    slow = usual[1] > LATEST * share or 0.5 * sum(usual) > AVERAGE * share
-    return usual[1] if slow else None
-
-
-def overdue(age: float, spans: Sequence[Span], timeout: float) -> bool:
-    """Return whether odometry of an age, s, should have been replaced by now."""
-    longest = OVERDUE * max((last for _, last in spans), default=0.0)
-    return age > min(max(LATE * timeout, longest), LATEST * timeout)
-
 
 class OwnState(NamedTuple):
     """Own odometry: stamp, s; position (3,), m, and velocity (3,), m/s, in ENU; yaw, rad."""
@@ -85,8 +49,8 @@ class OwnState(NamedTuple):
     position: Array
     velocity: Array
     yaw: float
-    spans: tuple[Span, ...] = ()
-    """Between which ages those before it were the newest, if that is known."""
+    ages: tuple[float, ...] = ()
+    """Ages, s, at which the messages before it were replaced; () if unknown."""
     relative: bool = False
     """Whether it is the motion without odometry, in the frame ``messages.RELATIVE``."""
 

@@ -23,8 +23,15 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import Command, OdometryChoice, OdometryState, RELATIVE
-from flock_follower.planner.inputs import at, Neighbor, OwnState, Span
+from flock_follower.messages import (
+    AccelerationState,
+    Command,
+    OdometryChoice,
+    OdometryState,
+    RELATIVE,
+    with_acceleration,
+)
+from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
@@ -41,6 +48,8 @@ from flock_follower.planner.step import Decision, step
 
 #: Largest standard deviation of a neighbour's yaw that is used, rad.
 MAX_YAW_STD = 0.5
+#: ns between the stamps of a neighbour's state and of its acceleration, two messages.
+ACCELERATION_AGE = 100_000_000
 #: Processed images of which the stamps are kept.
 FRAMES = 20
 #: Messages of odometry: 2 s at 10 Hz, but a hiccup at 60 Hz is forgotten in 0.3 s.
@@ -75,8 +84,9 @@ class PlannerLoop:
         self._frame = ''
         self._choice = OdometryChoice()
         self._own: OdometryState | None = None
-        self._newest = 0, 0
-        self._spans: deque[Span] = deque(maxlen=REMEMBERED)
+        self._newest = 0
+        self._ages: deque[float] = deque(maxlen=REMEMBERED)
+        self._accelerations: dict[str, AccelerationState] = {}
         self._neighbors: list[tuple[OdometryState, bool]] = []
         self._looked: int | None = None
         self._frames: deque[int] = deque(maxlen=FRAMES)
@@ -125,15 +135,16 @@ class PlannerLoop:
         """Take the own state at a time, ns; only the newest since the last tick counts."""
         if not self._choice.takes(state):
             return
-        stamp, arrived = self._newest
+        stamp = self._newest
         if state.stamp < stamp:
-            self._spans.clear()  # the clock jumped back, or another source took over
+            self._ages.clear()  # the clock jumped back, or another source took over
         elif state.stamp > stamp > 0:
-            self._spans.append(((arrived - stamp) * 1e-9, (nanoseconds - stamp) * 1e-9))
-        if state.stamp != stamp:
-            self._newest = state.stamp, nanoseconds
-        self._own = state
-        self._frame = state.frame
+            self._ages.append((nanoseconds - stamp) * 1e-9)
+        self._newest, self._own, self._frame = state.stamp, state, state.frame
+
+    def take_acceleration(self, state: AccelerationState) -> None:
+        """Take the acceleration of a neighbour, which comes before the neighbour's state."""
+        self._accelerations[state.child] = state
 
     def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
         """
@@ -142,6 +153,10 @@ class PlannerLoop:
         :param received: whether another vehicle reported it; else the own camera sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
+        reported = self._accelerations.get(neighbor.child)
+        if not received and reported is not None and (
+                abs(neighbor.stamp - reported.stamp) <= ACCELERATION_AGE):
+            neighbor = with_acceleration(neighbor, reported)
         if not self._frame:
             return  # without odometry nothing flies: step() reports that
         if neighbor.frame != self._frame:
@@ -205,7 +220,7 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion), tuple(self._spans),
+            yaw_from_quaternion(self._own.quaternion), tuple(self._ages),
             self._own.frame == RELATIVE)
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],

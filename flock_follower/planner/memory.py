@@ -43,42 +43,36 @@ from flock_follower.planner.params import member, PlannerParams
 from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
-SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
 SETTLING = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
-class SmoothedMotion(NamedTuple):
-    """A neighbor's velocity (3,), m/s, at a stamp, s: smoothed, and how fast it changes."""
+class Motion(NamedTuple):
+    """A neighbor's acceleration (3,), m/s^2, smoothed, and its velocity (3,), m/s, at a stamp."""
 
     stamp: float
     velocity: Array
     acceleration: Array
-    """(3,), m/s^2."""
 
 
-def observed(motions: Mapping[str, SmoothedMotion],
-             neighbors: Iterable[Neighbor]) -> dict[str, SmoothedMotion]:
+def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> dict[str, Motion]:
     """
     Return the motions of the neighbors, brought up to their newest estimates.
 
-    The smoothed velocity u follows the estimated one with du/dt = (v - u) / SMOOTHING; under a
-    constant acceleration it changes as fast as v does. An acceleration that the estimate has
-    itself is taken instead: it lags less.
+    The acceleration is that of the estimate, or the change of its velocity if it has none.
     """
     updated = {}
     for n in neighbors:
-        last = motions.get(n.name)
+        last, acceleration = motions.get(n.name), n.acceleration
         if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            last = SmoothedMotion(n.stamp, n.velocity, np.zeros(3)
-                                  if n.acceleration is None else n.acceleration)
+            last = Motion(n.stamp, n.velocity,
+                          np.zeros(3) if acceleration is None else acceleration)
         elif last.stamp != n.stamp:
             elapsed = n.stamp - last.stamp
-            change = -math.expm1(-elapsed / SMOOTHING) * (n.velocity - last.velocity)
-            acceleration = change / elapsed if n.acceleration is None else (
-                last.acceleration - math.expm1(-elapsed / SETTLING) * (
-                    n.acceleration - last.acceleration))
-            last = SmoothedMotion(n.stamp, last.velocity + change, acceleration)
+            if acceleration is None:
+                acceleration = (n.velocity - last.velocity) / elapsed
+            last = Motion(n.stamp, n.velocity, last.acceleration - math.expm1(
+                -elapsed / SETTLING) * (acceleration - last.acceleration))
         updated[n.name] = last
     return updated
 
@@ -96,17 +90,17 @@ class Loss(NamedTuple):
     origin: Array
     """Place of the follower at the loss, moved on along ``towards`` since (3,), m: origin of the
     retreat."""
-    free: float = math.inf
+    free: float
     """Coordinate along ``towards`` up to which the last line of sight was free, m, in the
     frame of the odometry."""
-    approach: float = 0.0
+    approach: float
     """Horizontal speed of approach at the loss, m/s."""
-    height: float = math.inf
+    height: float
     """Height of the neighbor at the loss, m."""
-    side: Array = np.zeros(3)
+    side: Array
     """Horizontal unit vector (3,) across the neighbor's path, towards the follower."""
-    name: str = ''
-    """Name of the lost neighbor; '' if unknown."""
+    name: str
+    """Name of the lost neighbor."""
 
     def retreated(self, position: Array) -> float:
         """Return the horizontal distance of a position (3,) from the origin, m."""
@@ -126,7 +120,7 @@ class Memory(NamedTuple):
     """The neighbors at hand and those lost since: to keep clear of."""
     ranged: Mapping[str, Neighbor] = NONE
     """The neighbors of which only the distance is known at present."""
-    motions: Mapping[str, SmoothedMotion] = NONE
+    motions: Mapping[str, Motion] = NONE
     """Motions of the flock."""
     shares: Mapping[str, float] = NONE
     """See ``Neighborhood``; of the last step with a followed neighbor, as are ``edges``."""
@@ -137,8 +131,6 @@ class Memory(NamedTuple):
     """Last estimate of a leader that it faced, seen or received."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
-    met: Mapping[str, Neighbor] = NONE
-    """Last estimate of each neighbor that could be followed since leaving IDLE."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
@@ -147,8 +139,6 @@ class Memory(NamedTuple):
     """Whether it had no neighbor for too long; then it sends no command until engaged again."""
     begun: float | None = None
     """Time at which it left IDLE, s."""
-    home: Array | None = None
-    """Place at which it left IDLE (3,), m."""
     altitude: Altitude | None = None
     """Altitude held since leaving IDLE."""
     yaw: float | None = None
@@ -165,8 +155,6 @@ class Memory(NamedTuple):
     """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
     occlusion: Occlusion | None = None
     """Whether the faced neighbor is occluded."""
-    slow: bool = False
-    """Whether odometry comes too slowly to fly on."""
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
@@ -193,7 +181,7 @@ class Memory(NamedTuple):
     def begun_afresh(self) -> Memory:
         """Return it without anything of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
-                      slow=self.slow, jumped=self.jumped, given_up=self.given_up)
+                      jumped=self.jumped, given_up=self.given_up)
 
 
 def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable[Neighbor],
@@ -214,8 +202,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
-                memory = memory._replace(neighbors={}, flock={}, ranged={}, met={}, altitude=None,
-                                         home=None, lost=None, leader=None, looking=False)
+                memory = memory._replace(neighbors={}, flock={}, ranged={}, altitude=None,
+                                         lost=None, leader=None, looking=False)
             if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
                 memory = memory._replace(drag=_drag(memory, me, own, params))
             me = own

@@ -57,7 +57,7 @@ import math
 import re
 from typing import NamedTuple
 
-from flock_follower.planner.inputs import overdue, OwnState, untimely
+from flock_follower.planner.inputs import OwnState, untimely
 from flock_follower.planner.params import PlannerParams
 
 
@@ -114,14 +114,27 @@ def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> s
     return f'odometry {fault.reason} ({fault.detail})' if fault else ''
 
 
-def late(own: OwnState | None, slow: float | None, now: float, params: PlannerParams) -> str:
-    """Return that odometry is too old to fly on, or will be soon, or ''."""
+LATE = 0.5  # share of odom_timeout: younger odometry is never late
+LATEST = 0.8  # share of odom_timeout: older odometry always is, to brake before commands end
+OVERDUE = 1.2  # times the greatest age that the last messages reached
+
+
+def late(own: OwnState | None, now: float, params: PlannerParams) -> str:
+    """
+    Return that odometry is late, or that its source is too slow to fly on, or ''.
+
+    Between two messages odometry grows old by nature: at 10 Hz and 60 ms of latency it is 0.16 s
+    old just before the next message arrives. A fast source is late at ``LATE`` of the timeout, a
+    slow one if its message becomes older than the last ones did.
+    """
     if own is None:
         return ''
-    if slow is not None:
-        return f'odometry too slow ({slow:.2f} s old before the next comes)'
-    age = now - own.stamp
-    return f'odometry late ({age:.2f} s)' if overdue(age, own.spans, params.odom_timeout) else ''
+    age, latest = now - own.stamp, LATEST * params.odom_timeout
+    usual = sorted(own.ages)[len(own.ages) // 2] if own.ages else 0.0
+    if usual > latest:
+        return f'odometry too slow ({usual:.2f} s old before the next comes)'
+    longest = max(LATE * params.odom_timeout, OVERDUE * max(own.ages, default=0.0))
+    return f'odometry late ({age:.2f} s)' if age > min(longest, latest) else ''
 
 
 def blind(looked: float | None, now: float, params: PlannerParams) -> str:

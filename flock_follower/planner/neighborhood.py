@@ -24,8 +24,8 @@ it last looks where it was, to both sides, then all round. Meanwhile it follows 
 their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
 vehicle would turn to another follower, and the whole flock would hover without its leader.
 
-Warnings name motions that the follower cannot follow, and members of the flock whose position is
-unknown.
+Warnings name neighbors that the follower cannot follow, and vehicles of the neighbors' file whose
+position is unknown.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.limits import brake, limit_norm
-from flock_follower.planner.memory import Memory, SmoothedMotion
+from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
@@ -60,9 +60,7 @@ class Neighborhood(NamedTuple):
     faced: Neighbor | None
     """The neighbor that it faces and keeps in sight."""
     level: Neighbor | None
-    """The neighbor whose altitude it follows."""
-    peers: Sequence[Neighbor] = ()
-    """The neighbors at its edges, to meet at one altitude, if no leader is at hand."""
+    """The neighbor whose altitude it follows; None: it holds its altitude."""
 
 
 NOBODY = Neighborhood((), {}, frozenset(), None, None)
@@ -95,8 +93,9 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     seen = [[n for n in some if not n.received] for some in (leaders, ends)]
     # Never turn away from a neighbor in sight to one that is only received.
     faced = _nearest(me, memory.faced, next(filter(None, [*seen, leaders, ends]), []))
-    return Neighborhood(flock, shares, joined, faced, _nearest(me, memory.faced, leaders) or faced,
-                        () if leaders or len(ends) < 2 else ends)
+    # Several followers without a leader would follow their own motion if they followed each other.
+    level = _nearest(me, memory.faced, leaders) or (faced if len(ends) < 2 else None)
+    return Neighborhood(flock, shares, joined, faced, level)
 
 
 def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
@@ -125,35 +124,28 @@ def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]) -> Neighbor | N
         HELD if n.name == held else 1.0))
 
 
-KEPT_UP_WITH = 1.05  # times v_max: noise of a leader at v_max is no warning
-GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
-REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
+KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
 
 
-def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
+def reports(memory: Memory, neighbors: Neighborhood, me: OwnState,
             params: PlannerParams) -> list[str]:
-    """Return warnings of motions that the follower cannot follow."""
-    v_max, most = params.v_max, params.climb_rate
-    near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
+    """Return warnings of neighbors that it cannot follow, and of those whose place is unknown."""
+    v_max, near, far = params.v_max, math.sqrt(params.law.d0), math.sqrt(params.law.d1)
     found = list[str]()
     for n in neighbors.flock:
-        motion, edge = motions[n.name], n.name in neighbors.edges
-        speed, climb = math.hypot(*motion.velocity), float(motion.velocity[2])
-        rate, distance = math.hypot(*motion.acceleration), apart(n, me, params)
-        climbs = edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most
+        edge, distance, speed = n.name in neighbors.edges, apart(n, me, params), math.hypot(
+            *n.velocity.tolist())
         found += [f'{n.name} {text}' for applies, text in (
             (edge and speed > KEPT_UP_WITH * v_max,
              f'at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up'),
-            (climbs, f'{"climbs" if climb > 0.0 else "descends"} at {abs(climb):.1f} m/s, '
-                     f'followed at {most:g} m/s at most: may get out of sight'),
-            (rate > REPORTED_ACCELERATION,
-             f'accelerates at {rate:.1f} m/s^2: the band is held up to about '
-             f'{GUARDED_ACCELERATION:g} m/s^2'),
             (distance < near,
              f'{distance:.2f} m away, the band begins at {near:.2f} m: too close'),
             (edge and distance > far,
              f'{distance:.2f} m away, the band ends at {far:.2f} m: too far')) if applies]
-    return found
+    missing = {name for name, each in params.vehicles.items() if each.role != AVOID}
+    missing -= memory.flock.keys()  # with those lost a moment ago
+    return [*found, *(f'{name} neither seen nor received, not kept clear of'
+                      for name in sorted(missing))]
 
 
 def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
@@ -177,23 +169,6 @@ def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
     names = [each.name for each in (neighbors.faced, memory.leader) if each]
     return min((n for n in neighbors.flock if n.member.role == LEADER), default=memory.leader,
                key=lambda n: names.index(n.name) if n.name in names else len(names))
-
-
-def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
-            params: PlannerParams) -> list[str]:
-    """
-    Return a warning if a member of the flock has no known position, while others have.
-
-    Members are named by parameters, or were known in this flight up to ``resume_timeout`` ago.
-    """
-    missing = {name for name, member in params.vehicles.items() if member.role != AVOID}
-    missing.update(name for name, n in memory.met.items()
-                   if me.stamp - n.stamp <= params.resume_timeout)
-    missing -= memory.flock.keys()  # with those lost a moment ago
-    advice = '' if any(n.received for n in neighbors.flock) else (
-        ': more cameras or flock messages are needed for this formation')
-    return [f'{", ".join(sorted(missing))} neither seen nor received, not kept clear of{advice}'
-            ] if missing else []
 
 
 def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,

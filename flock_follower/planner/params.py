@@ -181,9 +181,6 @@ class PlannerParams(Checked):
         100.0, Range(-1000.0, 10000.0, 'm'),
         'greatest altitude above the same height; a value below the default permits a climb of at '
         'most 1 m out of the way of an approaching neighbor out of sight', live=True)
-    range_max: float = parameter(
-        500.0, Range(1.0, 100000.0, 'm'),
-        'greatest horizontal distance from the place where the planner became active', live=True)
     climb_rate_max: float = parameter(
         0.8, Range(0.05, 10.0, 'm/s'),
         'largest rate at which the altitude to hold changes', live=True)

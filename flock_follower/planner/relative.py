@@ -39,7 +39,9 @@ from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
 from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, untimely
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.scene import Decision
 from flock_follower.planner.vertical_yaw import Altitude, facing, THRUST_BIAS_MAX, turning
 
 #: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
@@ -90,24 +92,20 @@ class Disturbance(NamedTuple):
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
-         elapsed: float) -> tuple[Memory, Neighbor, float, float] | str:
-    """
-    Return the memory with the command, the neighbor followed, and yaw, rad, and yaw rate, rad/s.
-
-    :returns: the reason, if nothing can be commanded.
-    """
-    if fault := untimely(own.stamp, now, params.odom_timeout):
-        return f'no odometry, and the motion by attitude is {fault.detail} old'
+         elapsed: float) -> tuple[Memory, Decision]:
+    """Return the memory for the next step, and the decision: HOLD if nothing can be commanded."""
+    old = untimely(own.stamp, now, params.odom_timeout)
     seen = {name: n for name, n in memory.neighbors.items()
             if not n.received and now - n.stamp <= OLDEST_MARKER}
     leader = seen.get(memory.faced) or max(
         (n for n in seen.values() if n.member.role != AVOID), key=lambda n: n.stamp, default=None)
-    if leader is None:
-        return 'no odometry, and no neighbor in sight'
+    if old is not None or leader is None:
+        return _held(memory, 'no neighbor in sight' if old is None else (
+            f'the motion by attitude is {old.detail} old'))
     me, there = at(own, now), at(leader, now)
     gap, _ = _gap(there.position, me, leader, params)
     if gap > math.sqrt(params.law.d1) + FARTHEST:
-        return f'no odometry, and {leader.name} is {gap:.1f} m away'
+        return _held(memory, f'{leader.name} is {gap:.1f} m away')
     altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
         lowest=-math.inf, highest=math.inf)
     rising = me.velocity
@@ -132,7 +130,13 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
         faced=leader.name, followed=leader.stamp, altitude=altitude, yaw=yaw, command=command,
         disturbance=disturbance,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
-    ), leader, yaw, turning(last, yaw, me, params, elapsed)
+    ), Decision(State.RELATIVE, 'no odometry: flies by the marker alone', command, yaw,
+                turning(last, yaw, me, params, elapsed), stamp=leader.stamp, thrust_bias=up)
+
+
+def _held(memory: Memory, reason: str) -> tuple[Memory, Decision]:
+    return memory._replace(command=None, pending=np.zeros(3)), Decision(
+        State.HOLD, f'no odometry, and {reason}')
 
 
 def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighbor],

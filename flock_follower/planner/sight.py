@@ -113,14 +113,6 @@ def visible(view: View, offset: Array, yaw: float, forward: float, margin: float
         forward * math.cos(f.heading) / GRAVITY) <= f.up - edge for f in view)
 
 
-def all_round(view: View) -> bool:
-    """Return whether a neighbor that goes round is always in an image, without a turn."""
-    arcs = [(f.heading - f.right + MARGIN, f.heading + f.left - MARGIN) for f in view]
-    # At the left end of each image there is another one.
-    return all(any((end - right) % math.tau < left - right for right, left in arcs)
-               for _, end in arcs)
-
-
 def vertical(view: View, bearing: float) -> tuple[float, float]:
     """
     Return the largest angles up and down, rad, of the images nearest to a bearing.

@@ -34,7 +34,6 @@ The yaw turns the camera to the neighbor, or turns round to search for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -43,8 +42,6 @@ from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATI
 from flock_follower.planner.params import PlannerParams
 
 THRUST_BIAS_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
-MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
-MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
 INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
 INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
@@ -114,24 +111,6 @@ class Altitude(NamedTuple):
         climb = min(max(climb, min(self.climb, significant) - faster),
                     max(self.climb, significant) + faster)
         return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
-
-    def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
-                elapsed: float) -> Altitude:
-        """
-        Return the altitude after ``elapsed`` s of meeting other followers at one altitude.
-
-        The others follow this vehicle, too. If it took their mean at once, it would follow its own
-        motion, and all would drift together. With this slow rate and half of their climb, the
-        loop gain is below 1 at every frequency, for every neighbor graph.
-        """
-        height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
-            [n.position for n in others], [n.velocity for n in others]))
-        most = params.climb_rate
-        climb = min(max(MOVING_ALONG * along + MEETING * (height - self.held), -most), most)
-        held = self.held + climb * elapsed
-        within = min(max(held, self.lowest), self.highest)
-        return self._replace(held=within, climb=climb if within == held else 0.0,
-                       neighbor_climb=None)
 
     def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
                    least: float = -math.inf, most: float = math.inf,

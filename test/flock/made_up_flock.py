@@ -24,11 +24,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 import math
-from typing import Any
 
 import numpy as np
 
-from flock_follower.flock.alignment import turned
+from flock_follower.flock.alignment import Frame, turned
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, quaternion_from_yaw, wrap_angle
 from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
@@ -247,19 +246,16 @@ class MadeUpFlock:
             record.chi2.append(float(ahead @ np.linalg.solve(
                 state.pose_covariance[:3, :3], ahead)))
             record.ticks += 1
-        frames = self.sharing[name].frames
         for j, other in enumerate(self.names[1:], 1):
             sender = self.sharing[name].senders.get(other)
-            if other in frames and sender is not None and not (
-                    self.sharing[name].unusable(sender)):
-                self.nees.append(self.misfit(k, j, other, frames))
+            if sender is not None and sender.frame is not None and not sender.unusable(
+                    self.stamp(self.time, name)):
+                self.nees.append(self.misfit(k, j, sender.frame))
 
-    def misfit(self, k: int, j: int, other: str, frames: Any) -> float:
+    def misfit(self, k: int, j: int, frame: Frame) -> float:
         """Return chi^2 (4 degrees of freedom) of a frame's alignment."""
-        anchor = frames.frames[other].anchor
-        world = self.true[j] + turned(-self.turn[j]) @ (anchor - self.odometry[j])
+        world = self.true[j] + turned(-self.turn[j]) @ (frame.anchor - self.odometry[j])
         place = self.odometry[k] + turned(self.turn[k]) @ (world - self.true[k])
-        found = frames.located(other, anchor)[0]
-        error = np.concatenate([[wrap_angle(
-            frames.frames[other].yaw - (self.turn[k] - self.turn[j]))], found - place])
-        return float(error @ np.linalg.solve(frames.covariance(other), error))
+        error = np.array([wrap_angle(frame.yaw - (self.turn[k] - self.turn[j])),
+                          *(frame.place - place)])
+        return float(error @ np.linalg.solve(frame.covariance, error))

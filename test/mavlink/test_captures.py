@@ -17,6 +17,7 @@
 import math
 
 from captured import captured, decoded, link
+from embedded_flight import BLIND, Flight, odometry, setpoint
 import pytest
 
 from flock_follower.mavlink.bridge import Bridge
@@ -24,11 +25,6 @@ from flock_follower.mavlink.commands import arm, hold, offboard, Request, Vehicl
 from flock_follower.mavlink.dialects import PX4, VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.status_texts import StatusTexts
-
-BLIND = {
-    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
-    'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
-        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 
 
 def received(name, until=math.inf, **options):
@@ -64,6 +60,46 @@ def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
     assert [b for a, b in zip(['', *modes], modes) if a != b] == [
         'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']
+
+
+def flags(name, kind, end):
+    """Return the changes of an estimator's flags, and s since the vision ended."""
+    changes, known = [], None
+    for time, message in decoded(name):
+        if message.get_type() == kind and message.flags != known:
+            known = message.flags
+            changes.append((time - end, known))
+    return changes
+
+
+def lost(personality, seconds):
+    """Return a flight that was flown by vision, in the air, and s after it ended."""
+    flight = Flight(personality, parameters=BLIND[personality])
+    flight.fly(1.5, lambda: odometry(
+        flight.vehicle.position, flight.vehicle.rotation.T @ flight.vehicle.velocity), setpoint(),
+        rate=30.0)
+    flight.mode('OFFBOARD' if personality == 'px4' else 'GUIDED')
+    flight.messages.clear()
+    flight.fly(seconds, setpoint())
+    return flight
+
+
+@pytest.mark.parametrize(('personality', 'name', 'kind', 'end', 'seconds'), [
+    ('px4', 'px4_vision_lost', 'ESTIMATOR_STATUS', 63.63, 7.0),
+    ('arducopter', 'ardupilot_vision_lost', 'EKF_STATUS_REPORT', 41.06, 16.0)])
+def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
+        personality, name, kind, end, seconds):
+    real = flags(name, kind, end)
+    flight, states, known = lost(personality, 0.01), [], None
+    for step in range(round(seconds / 0.1)):
+        now = flight.autopilot.estimator_flags(flight.now)
+        if now != known:
+            states.append((step * 0.1, now))
+            known = now
+        flight.fly(0.1, setpoint())
+    assert [value for _, value in states] == [value for _, value in real]
+    for (ours, _), (theirs, _) in zip(states[1:], real[1:]):
+        assert ours == pytest.approx(theirs, abs=0.6)
 
 
 def test_ardupilots_words_say_why():

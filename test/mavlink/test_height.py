@@ -21,7 +21,13 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import HeightEstimator, pressure_altitude, STEP_PAUSE, TIMEOUT
+from flock_follower.mavlink.envelope import (
+    HeightEstimator,
+    MAX_CORRECTION,
+    pressure_altitude,
+    STEP_PAUSE,
+    TIMEOUT,
+)
 
 PERIOD = 0.05
 NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH
@@ -97,6 +103,40 @@ def test_a_height_that_is_old_or_has_no_reference_is_unknown():
     assert heights.height(9.0) == 3.5
     heights.refer(None, 9.0)
     assert not heights.referenced
+
+
+@pytest.mark.parametrize('referenced', [False, True])
+@pytest.mark.parametrize('first', [1, 4, 12])
+def test_another_sensor_takes_over_without_a_jump_of_height_or_climb_rate(first, referenced):
+    # A bridge restarted in flight: the rangefinder's messages come before the barometer's.
+    heights = HeightEstimator()
+    for k in range(200):
+        now, barometer = k * PERIOD, k >= first
+        rate = -0.7 if k > 2 else None  # the first odometry comes later than the first height
+        heights.take((490.0 if barometer else 0.0) + 2.0 - 0.7 * now, rate, now,
+                     'SCALED_PRESSURE' if barometer else 'DISTANCE_SENSOR')
+        if k == 0 and referenced:
+            heights.refer(2.0, now)
+        assert heights.corrected(-0.7, now) == pytest.approx(-0.7, abs=0.1)
+        if referenced:
+            assert heights.height(now) == pytest.approx(2.0 - 0.7 * now, abs=0.15)
+    assert math.isinf(heights.stepped)
+
+
+def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
+    heights = HeightEstimator()
+    heights.take(2.0, None, 0.0, 'DISTANCE_SENSOR')
+    heights.refer(2.0, 0.0)
+    heights.take(492.0, None, 0.1 + TIMEOUT, 'SCALED_PRESSURE')
+    assert not heights.referenced
+
+
+def test_a_jump_of_the_barometer_corrects_the_vertical_velocity_by_its_bound_at_most():
+    heights = HeightEstimator()
+    for k in range(100):
+        now = k * PERIOD
+        heights.take(2.0 + (30.0 if k >= 40 else 0.0) + 5.0 * max(now - 2.0, 0.0), 0.0, now)
+        assert abs(heights.corrected(0.0, now)) <= MAX_CORRECTION
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)

@@ -197,10 +197,7 @@ def test_a_command_leaves_in_ned_and_one_that_must_not_fly_is_counted(make_bench
 def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_brakes(make_bench):
     bench = make_bench()
     bench.fly()
-    for value, reason in ((1.5, ''), (2.0, 'in flight it can only be lowered'),
-                          (-1.0, 'must be a number in [0.01, 20]')):
-        refused = bench.set(a_max=value)
-        assert bool(refused) == bool(reason) and reason in refused
+    assert bench.set(a_max=1.5) == '' and 'can only be lowered' in bench.set(a_max=2.0)
     for number in (None, None, 5, 1):
         assert bench.node._flying()
         bench.command(number=number)

@@ -16,81 +16,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
-import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from std_srvs.srv import SetBool, Trigger
+from rclpy.node import Node
+from rclpy.task import Future
 
 from flock_follower.mavlink.commands import SLOWEST_CLIMB, TAKEOFF_DELAY
-from flock_follower.nodes.call import main, patience
+from flock_follower.nodes import call
 
 
-class Server:
-    """A node with a service that counts its requests; it spins in a thread."""
+class Client:
+    """A service that appears after some looks, and answers, or dies when it is called."""
 
-    def __init__(self) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node('server', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.asked: list[Any] = []
-        self.thread = threading.Thread(target=self._spin)
-        self.thread.start()
+    def __init__(self, looks: int, success: bool | None) -> None:
+        self.looks, self.success, self.asked = looks, success, []
 
-    def _spin(self) -> None:
-        while self.context.ok():
-            with suppress(Exception):  # rclpy cannot send the answer of a service that is gone
-                self.executor.spin_once(timeout_sec=0.02)
+    def service_is_ready(self) -> bool:
+        self.looks -= 1
+        return self.looks < 0 and not (self.asked and self.success is None)
 
-    def serve(self, kind: Any, name: str, success: bool = True, message: str = 'done',
-              vanish: bool = False) -> None:
-        def answer(request: Any, response: Any) -> Any:
-            self.asked.append(request)
-            if vanish:
-                self.node.destroy_service(service)
-            response.success, response.message = success, message
-            return response
-        service = self.node.create_service(kind, name, answer)
-
-    def close(self) -> None:
-        self.context.try_shutdown()
-        self.thread.join()
-        self.executor.shutdown()
-        self.node.destroy_node()
+    def call_async(self, request: Any) -> Future:
+        self.asked.append(request.data)
+        future = Future()
+        if self.success is not None:
+            future.set_result(SimpleNamespace(success=self.success, message='because'))
+        return future
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
-    made = Server()
-    yield made
-    made.close()
-
-
+@pytest.mark.parametrize(('looks', 'success', 'code', 'said', 'asked'), [
+    (1, True, 0, '/offboard: because', 1), (0, False, 1, 'error: /offboard: because', 1),
+    (10**9, True, 1, 'error: /offboard: no such service of type SetBool within 0.2 s', 0),
+    (0, None, 1, 'error: /offboard: no answer: the result is unknown', 1)])
 def test_a_request_is_made_once_and_its_answer_shown(
-        server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['late', 'false', '--timeout', '0.1']) == 1
-    assert capsys.readouterr().err == (
-        'error: /late: no such service of type SetBool within 0.1 s\n')
-    threading.Timer(0.3, server.serve, (SetBool, 'late')).start()
-    assert main(['late', 'false', '--timeout', '25']) == 0
-    assert capsys.readouterr() == ('/late: done\n', '')
-    server.serve(SetBool, 'offboard', success=False, message='the pilot has taken over')
-    assert main(['offboard', 'true']) == 1
-    assert capsys.readouterr().err == 'error: /offboard: the pilot has taken over\n'
-    assert main(['offboard', '--timeout', '0.3']) == 1
-    assert 'no such service of type Trigger' in capsys.readouterr().err
-    assert [request.data for request in server.asked] == [False, True]
-    server.serve(Trigger, 'takeoff', vanish=True)
-    assert main(['takeoff']) == 1
-    assert 'the result is unknown' in capsys.readouterr().err and len(server.asked) == 3
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], looks: int,
+        success: bool | None, code: int, said: str, asked: int) -> None:
+    client = Client(looks, success)
+    monkeypatch.setattr(Node, 'create_client', lambda *_: client)
+    assert call.main(['offboard', 'true', '--timeout', '0.2']) == code
+    assert ''.join(capsys.readouterr()).strip() == said
+    assert client.asked == [True] * asked
 
 
 def test_it_waits_longer_than_any_service_takes() -> None:
-    assert patience('/mavlink_bridge/takeoff') > TAKEOFF_DELAY + 30.0 / SLOWEST_CLIMB + 7.0
-    assert 8.0 < patience('/mavlink_bridge/offboard') < 20.0
+    assert call.patience('/mavlink_bridge/takeoff') > TAKEOFF_DELAY + 30.0 / SLOWEST_CLIMB + 7.0
+    assert 8.0 < call.patience('/mavlink_bridge/offboard') < 20.0

@@ -100,11 +100,11 @@ def test_a_start_that_fails_is_one_line_and_exit_code_1(
     assert not (tmp_path / 'bag').exists()
 
 
-def test_a_wrong_scenario_file_is_refused_with_file_line_and_the_valid_values(
+def test_a_wrong_scenario_file_is_refused_with_file_key_and_the_valid_values(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('summary: mine\nleader:\n  motion: loop\n')
-    assert f"{path}:3: leader.motion = 'loop': must be one of legs, circle" in refused(
+    assert f"{path}: leader.motion = 'loop': must be one of legs, circle" in refused(
         capfd, 'simulator', '--ros-args', '-p', f'scenario:={path}')
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The layouts of viewers and the page about security name the topics and fields of the nodes."""
+"""The layouts of viewers and the page about security name the topics of the nodes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ import json
 from pathlib import Path
 import re
 from typing import Any
-import xml.etree.ElementTree as ElementTree
 
 from driven import overrides
 import pytest
@@ -31,12 +30,9 @@ import yaml
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.visualizer import Visualizer
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
-#: What PlotJuggler makes of every quaternion.
-ANGLES = {'roll', 'pitch', 'yaw'}
 PAGE = CONFIG.parent / 'docs' / 'deploy.md'
 OF_ALL = {'rosout', 'parameter_events', 'diagnostics'}
 OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_type_description')
@@ -81,30 +77,5 @@ def named_topics() -> list[str]:
             *(shown['Topic']['Value'] for shown in rviz['Displays'] if 'Topic' in shown)]
 
 
-def named_fields() -> list[tuple[str, str]]:
-    """Return paths of a topic and its fields, and what separates them."""
-    panels = json.loads((CONFIG / 'foxglove.json').read_text())['configById'].values()
-    return [*((line['value'], '.') for panel in panels for line in panel.get('paths', [])),
-            *((panel['topicPath'], '.') for panel in panels if 'topicPath' in panel),
-            *((curve.get('name'), '/') for curve in ElementTree.parse(
-                CONFIG / 'plotjuggler.xml').getroot().iter('curve'))]
-
-
 def test_every_topic_of_a_layout_is_there(topics: dict[str, Any]) -> None:
     assert len(named_topics()) > 5 and set(named_topics()) <= topics.keys()
-
-
-@pytest.mark.parametrize(('path', 'separator'), named_fields())
-def test_every_field_of_a_layout_is_there(
-        path: str, separator: str, topics: dict[str, Any]) -> None:
-    topic = max((t for t in topics if path.startswith(t + separator)), key=len)
-    kind = f'{topics[topic].__module__.split(".")[0]}/msg/{topics[topic].__name__}'
-    for part in path[len(topic) + 1:].split(separator):
-        if kind.endswith('Quaternion') and part in ANGLES:
-            return
-        known = message_class(kind).get_fields_and_field_types()[part.partition('[')[0]]
-        many = re.fullmatch(r'sequence<(.+?)(?:, \d+)?>|(.+)\[\d+\]', known)
-        assert bool(many) == ('[' in part), f'{part} is {known}'
-        kind = (many[1] or many[2]) if many else known
-        kind = kind.replace('/', '/msg/')
-    assert '/' not in kind, f'{path} is {kind}'

@@ -40,33 +40,14 @@ from std_msgs.msg import String
 
 from flock_desk import recorder_node
 from flock_desk.runs.processes import wait_until
+from flock_follower import nodes
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.messages import NANOSECONDS
-from flock_follower.nodes import black_box, SHUTDOWN_TIMEOUT
+from flock_follower.nodes import black_box
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.parameters.files import parameters_flown, TABLE
 from flock_follower.perception.images import decode_compressed
 
-#: A node as a program, after some lines of Python.
-PROGRAM = """
-import sys
-sys.argv = ['flock_follower/{name}', *sys.argv[1:]]
-from {package} import {name}
-{patch}
-sys.exit({name}.main(sys.argv[1:]))
-"""
-#: A bag that takes long to close, as one of some gigabytes does.
-SLOW = f"""
-import time
-from flock_follower.bags import writer
-finish = writer.finish
-
-def slow(folder, files):
-    time.sleep({SHUTDOWN_TIMEOUT} + 0.5)
-    finish(folder, files)
-
-writer.finish = slow
-"""
 PIXELS = (np.add.outer(np.arange(480), np.arange(640)) // 5 % 256).astype(np.uint8)
 
 
@@ -77,7 +58,6 @@ class Vehicle:
         self.node = Node('vehicle')
         self.odom = self.node.create_publisher(Odometry, '/vio/odom', 10)
         self.sent = 0
-        self.processes: list[subprocess.Popen[str]] = []
 
     def publish(self) -> None:
         message = Odometry()
@@ -92,21 +72,11 @@ class Vehicle:
             self.publish()
             time.sleep(0.01)
 
-    def start(self, package: str, name: str, patch: str,
-              *arguments: str) -> subprocess.Popen[str]:
-        self.processes.append(subprocess.Popen(
-            [sys.executable, '-c', PROGRAM.format(package=package, name=name, patch=patch),
-             *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
-        return self.processes[-1]
-
 
 @pytest.fixture
 def vehicle(ros: None) -> Iterator[Vehicle]:
     made = Vehicle()
     yield made
-    for process in made.processes:
-        process.kill()
-        process.communicate()
     made.node.destroy_node()
 
 
@@ -131,21 +101,23 @@ def numbers(path: Path) -> list[int]:
         return []
 
 
-def test_a_killed_black_box_has_all_but_the_last_second(
-        vehicle: Vehicle, tmp_path: Path) -> None:
-    process = vehicle.start(
-        'flock_follower.nodes', 'black_box', '', '--ros-args', '-r', 'odom:=/vio/odom',
-        '-p', f'record_folder:={tmp_path}', '-p', 'disk_free:=10.0')
+@pytest.mark.parametrize('end', [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_black_box_has_all_but_the_last_second_and_an_interrupted_one_all(
+        vehicle: Vehicle, tmp_path: Path, end: signal.Signals) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'flock_follower.nodes.black_box', '--ros-args', '-r',
+         'odom:=/vio/odom', '-p', f'record_folder:={tmp_path}', '-p', 'disk_free:=10.0'])
     vehicle.fly(20.0, lambda: any(
         file.stat().st_size > 20_000 for file in tmp_path.glob('*/*.mcap')))
     vehicle.fly(random.uniform(0.0, 0.8))
-    process.kill()
-    killed = time.time()
-    process.wait()
+    process.send_signal(end)
+    ended = time.time()
+    process.wait(20.0)
     path, = tmp_path.iterdir()
     with open_bag(path) as bag:
-        assert bag.incomplete.startswith('still being written')
-        assert killed - bag.end_ns / NANOSECONDS < 1.0
+        assert bag.incomplete.startswith('still being written' if end == signal.SIGKILL else '')
+        assert bool(bag.incomplete) == (end == signal.SIGKILL)
+        assert ended - bag.end_ns / NANOSECONDS < 1.0
     found = numbers(path)
     assert found == list(range(found[0], found[-1] + 1))
 
@@ -217,18 +189,16 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
     assert values is not None and values['planner']['v_max'] == 0.5
 
 
-def test_a_bag_that_takes_longer_to_close_than_a_shutdown_may_is_closed(
-        vehicle: Vehicle, tmp_path: Path) -> None:
-    process = vehicle.start('flock_desk', 'recorder_node', SLOW, str(tmp_path / 'bag'),
-                            '/vio/odom:nav_msgs/msg/Odometry')
-    wait_until(vehicle.odom.get_subscription_count, 20.0, 'the recorder')
-    vehicle.fly(1.0)
-    process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=20.0)
-    assert (process.returncode, 'Traceback' in error) == (0, False), error
-    assert f'closing {tmp_path / "bag"}' in out
-    with open_bag(tmp_path / 'bag') as bag:
-        assert bag.incomplete == '' and bag.message_count > 5
+def test_no_deadline_ends_a_process_that_finishes_its_files(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    deadlines: list[float] = []
+    monkeypatch.setattr(nodes, '_AS_A_PROGRAM', True)
+    monkeypatch.setattr(signal, 'setitimer', lambda _, seconds: deadlines.append(seconds))
+    with nodes.unhurried():
+        nodes.set_deadline()
+    assert deadlines == []
+    nodes.set_deadline()
+    assert deadlines == [nodes.SHUTDOWN_TIMEOUT]
 
 
 def test_a_full_disk_ends_the_recorder_and_keeps_what_it_holds(

@@ -22,13 +22,12 @@ import re
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 from driven import Driven, overrides, START
 from geometry_msgs.msg import TransformStamped
-from marker_images import make_camera, render, SIDE
+from marker_images import make_camera, render
 import numpy as np
 import pytest
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, Image, Range, RegionOfInterest
 
 from flock_follower.geometry import (
     quaternion_from_rpy,
@@ -47,7 +46,6 @@ from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
 
@@ -199,17 +197,6 @@ def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
     assert r.counters['no odometry yet'] == 1 and 'no /odom for' in r.problems(ahead=4.0)
 
 
-def test_compressed_images_are_taken_by_parameter(
-        rig: Callable[..., Rig], image: GrayImage) -> None:
-    r = rig(image_transport='compressed')
-    r.odom(0.0)
-    message = CompressedImage(format='jpeg', data=array(
-        'B', cv2.imencode('.jpg', image)[1].tobytes()))
-    message.header.stamp = nanoseconds_to_stamp(START)
-    r.give('image_raw/compressed', message)
-    np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
-
-
 def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(max_wait=0.05)
@@ -270,17 +257,13 @@ def test_the_debug_image_is_drawn_only_while_someone_looks(
     r.image(0.05, image)
     (message,) = shown
     assert message.header.stamp == nanoseconds_to_stamp(START + 50_000_000)
-    assert (message.height, message.width, message.step) == (480, 640, 1920)
-    assert message.encoding == 'bgr8'
-    drawn = np.frombuffer(message.data, dtype=np.uint8).reshape(480, 640, 3).astype(int)
-    # The outline's colour is at the marker's corners.
-    T_camera_marker = camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0]).inverse() @ AHEAD @ TAIL
-    for u, v in np.rint(CAMERA.project(T_camera_marker.apply(marker_corners(SIDE)))).astype(int):
-        patch = drawn[v - 2:v + 3, u - 2:u + 3]
-        assert (patch.max(axis=2) - patch.min(axis=2)).max() > 60
+    assert (message.height, message.width, message.step, message.encoding) == (
+        480, 640, 1920, 'bgr8')
+    pixels = np.frombuffer(message.data, dtype=np.uint8).reshape(-1, 3)
+    assert np.ptp(pixels, axis=1).max() > 60  # it is drawn in colour
 
 
-def test_out_of_sight_its_distance_goes_on_as_told_by_ranges(
+def test_out_of_sight_the_neighbour_goes_on_by_ranges(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     true = float(np.linalg.norm(AHEAD.translation))
@@ -290,18 +273,12 @@ def test_out_of_sight_its_distance_goes_on_as_told_by_ranges(
             if k <= 80:
                 r.image(k / 40, image)
             r.range(k / 40, true + 0.2)
-    assert r.counters == {} and len(r.frames) == 41
-    assert len(r.found) == 41 + 30  # half a second later it begins
+    assert r.counters == {} and len(r.frames) == 41 and len(r.found) == 41 + 30
     state = from_odometry(r.found[-1])
     assert state.stamp == START + 4_000_000_000
-    sight = state.position - OWN.translation - 4.0 * VELOCITY
-    distance = float(np.linalg.norm(sight))
-    assert distance == pytest.approx(true, abs=0.05)
-    along = sight / distance
-    assert along @ state.pose_covariance[:3, :3] @ along < 0.1 ** 2
-    assert np.trace(state.pose_covariance[:3, :3]) > 0.5 ** 2
+    assert np.linalg.norm(state.position - OWN.translation - 4.0 * VELOCITY) == pytest.approx(
+        true, abs=0.05)
     assert float(r.values['range_bias_leader_m']) == pytest.approx(0.2, abs=0.03)
-    assert float(r.values['range_outliers_leader_percent']) == 0.0
 
 
 def test_inputs_that_cannot_be_used_are_counted_by_their_reason(rig: Callable[..., Rig]) -> None:
@@ -352,27 +329,10 @@ def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
     np.testing.assert_allclose(place, LEADER.translation - OWN.translation, atol=0.03)
 
 
-def test_with_two_cameras_a_neighbour_is_found_in_either_image_and_every_image_counts(
-        rig: Callable[..., Rig]) -> None:
-    r, beside = rig(**TWO), AHEAD @ Transform(translation=np.array([0.0, 1.5, 0.0]))
-    shown = r.watch('debug_image/left')
-    for k in range(60):  # it is in no image for a while, and then in that to the left
-        r.odom(0.05 * k, velocity=np.zeros(3))
-        if k < 4 or k > 52:
-            r.image(0.05 * k, EMPTY if k > 4 else view(), 'front/image_raw')
-            r.image(0.05 * k, view(leader=beside, camera='left') if k > 4 else EMPTY,
-                    'left/image_raw')
-    assert [m.header.stamp.nanosec for m in r.found[:4]] == [0, 50_000_000, 10**8, 150_000_000]
-    for found, leader in ((r.found[0], AHEAD), (r.found[-1], beside)):
-        np.testing.assert_allclose(from_odometry(found).position, (OWN @ leader).translation,
-                                   atol=0.03)
-    assert len(r.found) > 5 and len(r.frames) == 22 and len(shown) == 11
-    assert r.counters == {}
-
-
 def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_on(
         ros: None) -> None:
     r = Rig(max_wait=0.0, **TWO)
+    shown = r.watch('debug_image/left')
     r.give('front/camera_info', calibration())
     r.odom(0.0)
     r.image(0.0, EMPTY, 'left/image_raw')
@@ -387,7 +347,12 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
     assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
     assert 'no image of camera front processed' not in reported
     assert r.values['camera front'] == '640x480 plumb_bob' and 'camera left' not in r.values
-    assert r.values['time_offset front'].startswith('0.0 +- ') and 'time_offset left' in r.values
+    assert {'time_offset front', 'time_offset left'} <= r.values.keys()
+    r.give('left/camera_info', calibration())
+    r.odom(0.2)
+    r.image(0.2, view(leader=AHEAD @ Transform(translation=np.array([0.0, 1.5, 0.0])),
+                      camera='left'), 'left/image_raw')
+    assert len(r.frames) == 4 and len(shown) == 1
     r.close()
 
 

@@ -50,7 +50,8 @@ def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_end
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
     def received():
-        executor.spin_once(timeout_sec=0.05)
+        for _ in range(100):
+            executor.spin_once(timeout_sec=0.001)
         return len(raw['image_raw']) >= 20 and len(raw['odom']) >= 150
     try:
         wait_until(received, DEADLINE, 'images and odometry')

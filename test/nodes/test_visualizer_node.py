@@ -41,6 +41,7 @@ from flock_follower.nodes.visualizer import (
 
 LEADER, OTHER, OWN = (2.0, 0.0, 1.5), (3.0, 1.0, 1.5), (0.0, 0.0, 1.5)
 STILL = (0.0, 0.0, 0.0)
+BAND = {'nearest_m': '1.2', 'farthest_m': '3.0'}
 
 
 class Rig(Driven):
@@ -51,7 +52,6 @@ class Rig(Driven):
             namespace='one', parameter_overrides=overrides(use_sim_time=True)))
         self.viewers = 1
         self.node._markers.get_subscription_count = lambda: self.viewers
-        self.node._planner.values = {'d0': 1.0, 'd1': 8.0, 'radius': 0.2}
         self.pass_time(START)
         self.state('odom', 'base_link', OWN)
         self.state('neighbors', 'leader', LEADER, (0.5, 0.0, 0.0))
@@ -69,7 +69,7 @@ class Rig(Driven):
     def report(self, vehicle: str, **values: str) -> None:
         self.give('/diagnostics', DiagnosticArray(status=[DiagnosticStatus(
             name=f'{vehicle}/planner', values=[
-                KeyValue(key=key, value=value) for key, value in values.items()])]))
+                KeyValue(key=key, value=value) for key, value in {**BAND, **values}.items()])]))
 
     def draw(self, age: float = 0.0) -> dict[str, Marker]:
         self.pass_time(START + round(age * 1e9))
@@ -92,7 +92,7 @@ def test_it_draws_each_vehicle_where_it_is_and_the_band_of_the_one_in_the_graph(
     drawn = rig.draw()
     assert set(drawn) == {
         'follower', 'state', 'command', 'leader', 'leader name', 'leader velocity',
-        'leader covariance', 'leader d0', 'leader d1', 'leader edge',
+        'leader covariance', 'leader nearest_m', 'leader farthest_m', 'leader edge',
         'other', 'other name', 'other covariance'}  # what stands still has no arrow
     assert {(one.header.frame_id, one.action) for one in drawn.values()} == {('odom', Marker.ADD)}
     for name, place in (('follower', OWN), ('leader', LEADER), ('other', OTHER)):
@@ -101,14 +101,15 @@ def test_it_draws_each_vehicle_where_it_is_and_the_band_of_the_one_in_the_graph(
                         ('command', [OWN, (0.0, ACCELERATION_SCALE, 1.5)]),
                         ('leader edge', [OWN, LEADER])):
         np.testing.assert_allclose(points(drawn[name]), along)
-    for name, radius in (('leader d0', 1.2), ('leader d1', np.sqrt(8.0) + 0.2)):
+    for name, radius in (('leader nearest_m', 1.2), ('leader farthest_m', 3.0)):
         np.testing.assert_allclose(
             np.linalg.norm(points(drawn[name]) - LEADER, axis=1), radius)
     assert drawn['state'].text == 'TRACK'
 
 
 @pytest.mark.parametrize(('limits', 'thick', 'thin'), [
-    ('a_max, separation', 'leader d0', 'leader d1'), ('cohesion', 'leader d1', 'leader d0')])
+    ('a_max, separation', 'leader nearest_m', 'leader farthest_m'),
+    ('cohesion', 'leader farthest_m', 'leader nearest_m')])
 def test_the_bound_that_the_guard_holds_is_thick(
         rig: Rig, limits: str, thick: str, thin: str) -> None:
     assert rig.draw()['command'].color.r == pytest.approx(COMMAND[0])
@@ -133,7 +134,7 @@ def test_old_states_are_marked_and_forgotten_and_nothing_is_drawn_without_a_view
 @given(strategies.lists(strategies.floats(-1.0, 1.0), min_size=9, max_size=9))
 def test_an_ellipsoid_has_the_covariance_it_is_made_of(values: list[float]) -> None:
     root = np.reshape(values, (3, 3))
-    shape = ellipsoid('odom', 'x', np.zeros(3), root @ root.T)
+    shape = ellipsoid('x', np.zeros(3), root @ root.T)
     turn = shape.pose.orientation
     axes = quaternion_to_matrix([turn.x, turn.y, turn.z, turn.w])
     again = axes @ np.diag(np.square(to_array(shape.scale) / (2.0 * DEVIATIONS))) @ axes.T

@@ -18,7 +18,6 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
 from typing import Any
 
 from hypothesis import given
@@ -268,11 +267,3 @@ def test_whatever_comes_what_is_returned_is_finite(numbers: list[float], sec: in
     for state in states:
         if state is not None:
             assert all(np.isfinite(value).all() for value in state[3:11])
-
-
-def test_wrong_parameters_are_named() -> None:
-    for wrong, words in (({'child_position': (20.0, 0.0, 0.0)}, 'child_position = 20.0'),
-                         ({'std': (0.0, 1.0, 1.0, 1.0)}, 'std = 0.0'),
-                         ({'twist_frame': 'body'}, 'twist_frame')):
-        with pytest.raises(ValueError, match=words):
-            replace(SourceParams(), **wrong)

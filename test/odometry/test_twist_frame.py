@@ -77,12 +77,6 @@ def test_steps_of_the_position_contradict_nothing(twist: str, seed: int) -> None
     assert watched.frame == twist
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_noise_of_one_at_rest_decides_nothing(seed: int) -> None:
-    watched, _ = flown(600.0, CHILD, 0.01, speed=0.0, seed=seed)
-    assert watched.found == ''
-
-
 def test_a_velocity_that_is_no_such_thing_is_dropped_in_spite_of_steps() -> None:
     watched = TwistFrame()
     for k in range(200):

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from marker_images import DICTIONARY, Hovering, SIDE, TAIL
 import numpy as np
 import pytest
-from warped_marker import Sensor, Shade, WarpedMarker
+from warped_marker import Shade, WarpedMarker
 
 from flock_follower.geometry import (
     Array,
@@ -90,7 +90,7 @@ def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
                                                                    gamma: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         shade = Shade(0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light)
-        return world.image([pose], k, shades=[shade], sensor=Sensor(gamma))
+        return world.image([pose], k, shade=shade, gamma=gamma)
 
     flight = Flight(show, seed=0)
     assert flight.recall >= 0.98

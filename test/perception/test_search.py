@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import cv2
 from marker_images import DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
 import pytest
@@ -114,25 +113,3 @@ def test_a_thorough_search_reads_a_marker_in_uneven_light(kind: str, least: int)
         found.append(detections.ids.tolist() == [3] and np.abs(
             detections.corners[0] - corners_of(CAMERA, pose)).max() < 3.0)
     assert sum(found) >= least
-
-
-@pytest.mark.parametrize('kind', ['shadow', 'reflex', 'spot'])
-def test_no_other_marker_in_uneven_light_is_taken_for_the_one_sought(kind: str) -> None:
-    for other in range(4, 14):
-        pose = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.2 * other))
-        image = in_uneven_light(render(CAMERA, {other: pose}), pose, other, kind)
-        assert 3 not in search.everywhere(image, DICTIONARY, LEADER.markers).ids
-
-
-@pytest.mark.parametrize('bitten', [
-    [], [(20, 20, 18)], [(110, 60, 22)], [(110, 110, 20)], [(65, 20, 15), (110, 20, 10)]])
-def test_an_outline_is_whole_although_reflexes_hide_a_corner_and_parts_of_sides(
-        bitten: list[tuple[int, int, int]]) -> None:
-    image = np.full((140, 150), 190, dtype=np.uint8)
-    image[20:111, 20:111] = 30
-    for x, y, radius in bitten:
-        cv2.circle(image, (x, y), radius, 255, -1)
-    corners = np.array([[20.0, 20.0], [110.0, 20.0], [110.0, 110.0], [20.0, 110.0]])
-    errors = [np.abs(np.roll(outline, k, axis=0) - corners).max()
-              for outline in search.quadrilaterals(image) for k in range(4)]
-    assert min(errors) < 2.0

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -39,8 +39,8 @@ A_MAX, V_MAX, T = 2.5, 0.5, 0.1
 
 Vector = tuple[float, float, float]
 ANYTHING = st.tuples(*[st.floats()] * 3)  # NaN, infinities, 1e308 and denormals among them
-NEAR = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
-SPEED = st.tuples(*[st.floats(-0.8, 0.8)] * 3)
+
+
 SEED = st.integers(0, 2 ** 32)
 
 
@@ -82,16 +82,6 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
     if speed < 100.0:
         reached = np.linalg.norm(np.array(v) + command.acceleration * period)
         assert reached <= max(v_max, speed * (1.0 + 1e-15))
-
-
-@settings(max_examples=150)
-@given(SEED, st.integers(1, 3))
-def test_near_the_band_the_limits_hold_and_the_vertical_part_stays(seed: int, count: int) -> None:
-    a, v, around = situation(seed, count)
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
-    assert np.linalg.norm(command.acceleration) <= A_MAX
-    assert np.linalg.norm(v + command.acceleration * T) <= max(V_MAX, np.linalg.norm(v))
-    assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
 
 
 @given(SEED, st.integers(0, 3))
@@ -170,16 +160,6 @@ def test_bounds_are_those_of_the_formula() -> None:
         common - (rate - far_speed) / PARAMS.T_g - far_slope * rate)
 
 
-@given(st.floats(-0.5, 3.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
-def test_the_slope_is_the_derivative_of_the_closing_speed(gap: float, tau: float,
-                                                          b: float) -> None:
-    params, step = GuardParams(tau=tau, b=b), 1e-7
-    corners = 0.0, -RETURN_SPEED * tau  # where the slope itself, or the speed, changes at once
-    assume(all(abs(gap - corner) > 1e-5 for corner in corners))
-    rise = params.closing(gap + step)[0] - params.closing(gap - step)[0]
-    assert params.closing(gap)[1] == pytest.approx(rise / (2.0 * step), rel=1e-3, abs=1e-5)
-
-
 def test_one_that_may_be_anywhere_in_a_growing_sphere_is_kept_clear_of_earlier() -> None:
     known = bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0))
     unsure = radial_bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0),
@@ -198,24 +178,6 @@ def test_the_margin_leaves_room_in_a_narrow_band() -> None:
         assert lower.least < -upper.least
 
 
-def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
-    above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
-    command = guard(np.zeros(3), np.zeros(3), ordered(above), A_MAX, V_MAX, T)
-    assert np.array_equal(command.acceleration, np.zeros(3))
-
-
 @pytest.mark.parametrize('p', [(0.0, 0.0, 0.0), (math.nan, 1.0, 0.0), (1e308, 1e308, 0.0)])
 def test_a_neighbor_without_a_direction_bounds_nothing(p: Vector) -> None:
     assert bounds(p, (0.0, 0.0, 0.0)) == []
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'tau': 0.0}, r'^tau = 0\.0: must be a number in \[0\.05, 5\] s$'),
-    ({'b': math.nan}, r'^b = nan: must be a number in \[0\.1, 10\] m/s\^2$'),
-    ({'T_g': 3.0}, r'^T_g = 3\.0: must be a number in \[0\.02, 2\] s$'),
-    ({'m': -0.1}, r'^m = -0\.1: must be a number in \[0, 5\] m$'),
-])
-def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
-                                                       message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        GuardParams(**change)

@@ -23,8 +23,8 @@ import pytest
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.modes import next_state, State
-from flock_follower.planner.params import Member, PlannerParams
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision, step
 
 
@@ -70,15 +70,6 @@ def test_words_are_used_up_to_their_own_age() -> None:
     assert [r.reason for r in late.rejected] == ['received estimate too old']
 
 
-@pytest.mark.parametrize(('seen', 'received', 'state', 'reason'), [
-    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'no neighbor in sight'),
-    (0.6, 0.9, State.TRACK, 'no neighbor in sight'), (None, 1.1, State.COAST, 'no neighbor seen')])
-def test_the_state_says_whether_somebody_is_seen(seen: float | None, received: float | None,
-                                                 state: State, reason: str) -> None:
-    now, why = next_state(True, '', seen, 1.1, PARAMS, received=received)
-    assert now is state and why.startswith(reason) and bool(why) == bool(reason)
-
-
 def command(variance: float) -> Array:
     decision = decide(Memory(), 0.0, reported(0.0, 1.6, variance=variance, speed=-0.1))[1]
     assert decision.acceleration is not None
@@ -91,23 +82,3 @@ def test_the_less_sure_a_word_the_farther_away_it_stays() -> None:
     assert np.all(np.diff(pushed[:3]) < 0.0) and max(pushed[2:]) < -1.0
     refused = decide(Memory(), 0.0, reported(0.0, variance=0.09))[1]
     assert [r.reason for r in refused.rejected] == ['received estimate too uncertain']
-
-
-def test_one_heard_is_kept_clear_of_beside_one_that_is_seen() -> None:
-    near = seen(0.0, (0.0, 1.1, 2.0), (0.0, -0.2, 0.0), 'follower_2', received=True)
-    decision = decide(Memory(), 0.0, reported(0.0, 2.0, received=False), near)[1]
-    assert decision.acceleration is not None and decision.acceleration[1] < -1.0
-    assert 'separation' in decision.limits and decision.reason == ''
-    known = {each.name: each for each in decision.known}
-    assert (known['leader'].received, known['follower_2'].received) == (False, True)
-    assert (known['leader'].member.role, known['follower_2'].member.role) == ('leader', 'follower')
-
-
-def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
-    params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
-    ahead = reported(0.0, 2.0, received=False, name='follower_2')
-    aside = seen(0.0, (0.0, 2.0, 2.0), received=True)
-    memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
-    assert memory.faced == 'follower_2' and decision.yaw == pytest.approx(0.0)
-    memory, decision = decide(Memory(), 0.0, aside, params=params)
-    assert memory.faced == 'leader' and decision.yaw is not None and decision.yaw > 0.05

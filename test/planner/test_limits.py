@@ -38,7 +38,8 @@ T = 0.1
 
 Vector = tuple[float, float, float]
 ANYTHING = st.tuples(*[st.floats()] * 3)  # NaN, infinities, 1e308 and denormals among them
-FINITE = st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3)
+
+
 FLYABLE = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 LIMIT = st.floats(0.01, 100.0)
 PERIOD = st.floats(0.01, 1.0)
@@ -87,14 +88,6 @@ def test_what_is_sent_in_single_precision_is_within_a_max_too(
                                   period).acceleration,
                  brake(v, a_max)):
         assert np.linalg.norm(sent.astype(np.float32).astype(float)) <= a_max
-
-
-@given(st.tuples(*[st.floats(-1e6, 1e6)] * 3))
-def test_a_limited_vector_keeps_its_direction(vector: Vector) -> None:
-    limited = limit_norm(vector, A_MAX)
-    assert np.cross(limited, vector) == pytest.approx(np.zeros(3), abs=1e-9 * (1 + max(map(
-        abs, vector))))
-    assert limited @ np.array(vector) >= 0.0
 
 
 @pytest.mark.parametrize(('a', 'v', 'expected', 'reason'), [

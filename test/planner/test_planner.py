@@ -33,12 +33,13 @@ from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.modes import next_state, odometry_fault, State
+from flock_follower.planner.modes import late, next_state, odometry_fault, State
 from flock_follower.planner.params import ALTITUDE_MODES, AVOID, Member, PlannerParams, ROLES
 from flock_follower.planner.step import Decision, step
 
 PARAMS = flown.PARAMS
-LOOSE = PlannerParams(a_max=20.0, v_max=20.0)  # limits that bind nowhere below
+
+
 # The law as it is, at once, within limits.
 LAW = PlannerParams(guard=False, handover_time=0.0, yaw_rate_max=6.0, period=1.0)
 FREE = replace(LAW, a_max=20.0, v_max=20.0, altitude_mode='hold')
@@ -213,15 +214,6 @@ def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
     assert np.array_equal(commanded(with_bad), commanded(good))
 
 
-def test_the_newest_estimate_of_a_name_counts_whatever_the_order_of_arrival() -> None:
-    old, new = leader(0.1, (1.5, 0.0, 2.0)), leader(0.2, (2.5, 0.0, 2.0))
-    me = own(0.2, velocity=(0.0, 0.1, 0.0))
-    forward, backward, alone = (
-        commanded(decide(0.2, *order, me=me)) for order in ((old, new), (new, old), (new,)))
-    assert np.array_equal(forward, backward)
-    assert np.array_equal(forward, alone)
-
-
 def test_neighbors_drop_out_one_by_one_as_they_grow_old() -> None:
     near, far = leader(0.0, name='near'), leader(0.3, (0.0, 2.5, 2.0), name='far')
     me = own(0.4, velocity=(0.1, 0.1, 0.0))
@@ -245,47 +237,12 @@ def test_a_jump_back_in_time_forgets_the_inputs_of_before() -> None:
         assert decision.state is State.SEARCH
 
 
-@pytest.mark.parametrize('age', [0.1, 1.0, 3.0])  # TRACK, COAST then HOLD, HOLD
-def test_altitude_hold_acts_in_every_state_and_damps_out(age: float) -> None:
-    memory, z, vz = tracking(params=LOOSE), 1.8, 0.1
-    heights = []
-    for tick in range(2500):
-        now = age + 0.01 * tick
-        seen = [leader(now)] if age == 0.1 else []
-        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z), (0.0, 0.0, vz)), seen,
-                                LOOSE)
-        vz += 0.01 * commanded(decision)[2]
-        z += 0.01 * vz
-        heights.append(z)
-    assert heights[-1] == pytest.approx(2.0, abs=1e-2)
-    assert max(heights) < 2.05  # of 0.2 m; without the integral nothing
-
-
-def test_v_max_limits_what_the_law_asks_for_and_is_reported() -> None:
-    far = leader(0.0, (6.0, 0.0, 2.0), (1.5, 0.0, 0.0))
-    decision = decide(0.0, far, me=own(velocity=(0.5, 0.0, 0.0)), params=LAW)
-    assert commanded(decision) == pytest.approx(np.zeros(3), abs=1e-6)
-    assert decision.limits == 'a_max, v_max'
-
-
 def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
     memory, decision = step(Memory(), 0.0, True, own(), [leader(0.0, (0.0, -2.0, 2.0))], LAW)
     assert decision.yaw == pytest.approx(-math.pi / 2)
     for now, seen in ((0.2, [leader(0.2, (0.05, 0.05, 4.0))]), (1.5, [])):
         memory, decision = step(memory, now, True, own(now, yaw=2.0), seen, LAW)
         assert decision.yaw == pytest.approx(-math.pi / 2)
-
-
-def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
-    memory, yaws = Memory(), []
-    for tick in range(40):
-        now = 0.1 * tick
-        memory, decision = step(memory, now, True, own(now, yaw=3.0),
-                                [leader(now, (-2.0, -1.0, 2.0))], PARAMS)
-        yaws.append(decision.yaw)
-    turned = np.mod(np.diff([3.0, *yaws]), 2.0 * math.pi)
-    assert np.max(turned) == pytest.approx(PARAMS.yaw_rate_max * PARAMS.period)
-    assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
 
 
 def test_seen_again_during_a_turn_it_turns_back_from_where_it_points() -> None:
@@ -359,18 +316,6 @@ def test_with_nothing_at_risk_guard_and_law_command_the_same_bit_for_bit() -> No
         assert commanded(law).tobytes() == commanded(guarded).tobytes()
 
 
-def test_the_guard_keeps_clear_of_a_near_neighbor_though_a_far_one_leaves() -> None:
-    near = leader(0.0, (1.15, 0.0, 2.0), (-0.2, 0.0, 0.0), name='near')
-    # Not behind the near one, which then is nearer to both, so that the far one is nobody's task.
-    far = leader(0.0, (0.5, 2.72, 2.0), (0.1, 0.4, 0.0), name='far')
-    alone, both = decide(0.0, near), decide(0.0, near, far)
-    assert commanded(both)[0] == pytest.approx(commanded(alone)[0], abs=1e-6)
-    assert commanded(both)[0] < -1.0
-    assert commanded(decide(0.0, far))[0] > 0.1
-    assert both.edges == ('far', 'near')
-    assert both.limits.endswith('separation, cohesion')
-
-
 @pytest.mark.parametrize(('speed', 'clear'), [(-0.3, False), (1.3, True)])
 def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(
         speed: float, clear: bool) -> None:
@@ -434,19 +379,6 @@ def test_drag_does_not_keep_it_below_its_largest_speed() -> None:
 def test_what_the_follower_cannot_help_is_said(it: Neighbor, said: str) -> None:
     assert decide(0.0, it).warnings == (said,)
     assert decide(0.0, leader()).warnings == ()
-
-
-@pytest.mark.parametrize(('rate', 'said'), [(1.0, False), (1.6, True)])
-def test_a_leader_that_accelerates_beyond_what_the_guard_holds_is_reported(rate: float,
-                                                                           said: bool) -> None:
-    memory, params = Memory(), replace(PARAMS, v_max=20.0)
-    for tick in range(25):
-        now = 0.1 * tick
-        it = leader(now, (2.0, 0.0, 2.0), (rate * now, 0.0, 0.0))
-        memory, decision = step(memory, now, True, own(now), [it], params)
-    expected = ('leader accelerates at 1.6 m/s^2: the band is held up to about 1 m/s^2',)
-    assert decision.warnings == (expected if said else ())
-    assert memory.motions['leader'].acceleration == pytest.approx([rate, 0.0, 0.0], rel=0.02)
 
 
 WILD = [math.nan, math.inf, -math.inf, 1e308, -1e308, 60.0, 0.0]
@@ -521,8 +453,8 @@ def test_default_law_is_that_of_the_papers_flights() -> None:
     assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
 
 
-def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clear() -> None:
-    memory, here = tracking(), (1.2, 0.0, 2.0)
+def test_a_leader_suddenly_elsewhere_is_not_believed_until_the_old_one_is_too_old() -> None:
+    memory = tracking()
     for tick in range(1, 4):
         memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),
                          [leader(0.1 * tick, (2.0 - 0.2 * tick, 0.0, 2.0))], PARAMS)
@@ -533,7 +465,6 @@ def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clea
         now = 0.1 * tick
         memory, decision = step(memory, now, True, own(now), [leader(now, far)], PARAMS)
     assert memory.neighbors['leader'].position == pytest.approx(far)
-    assert memory.flock['leader before'].position[0] == pytest.approx(here[0], abs=0.3)
 
 
 def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() -> None:
@@ -578,3 +509,18 @@ def test_braking_and_separation_keep_the_limits_of_the_start() -> None:
         _, decision = step(Memory(), 0.0, True, own(velocity=fast), [], params)
         assert decision.state is State.SEARCH
         assert commanded(decision)[0] == pytest.approx(-0.4 / 0.3, rel=1e-3)
+
+
+FAST, SLOW, TOO_SLOW = (0.03,) * 20, (0.16,) * 20, (0.26,) * 20
+
+
+@pytest.mark.parametrize(('age', 'ages', 'reason'), [
+    (0.15, (), ''), (0.16, (), 'odometry late (0.16 s)'),
+    (0.15, FAST, ''), (0.16, FAST, 'odometry late (0.16 s)'),
+    (0.19, SLOW, ''), (0.20, SLOW, 'odometry late (0.20 s)'),  # 1.2 times what is usual
+    (0.19, (*FAST[1:], 0.16), ''), (0.24, (*FAST[1:], 0.5), ''),  # after one hiccup
+    (0.25, (*FAST[1:], 0.5), 'odometry late (0.25 s)'),
+    (0.02, TOO_SLOW, 'odometry too slow (0.26 s old before the next comes)')])
+def test_odometry_is_late_by_the_age_that_its_messages_usually_reach(
+        age: float, ages: tuple[float, ...], reason: str) -> None:
+    assert late(own(1.0)._replace(ages=ages), 1.0 + age, PARAMS) == reason

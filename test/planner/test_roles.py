@@ -16,8 +16,6 @@
 
 from __future__ import annotations
 
-import math
-
 import flown
 from flown import commanded, own, STILL
 import numpy as np
@@ -116,10 +114,12 @@ def test_hulls_that_overlap_are_driven_apart() -> None:
         -RETURN_SPEED / params.guarding.T_g, rel=1e-3)
 
 
-@pytest.mark.parametrize(('changes', 'message'), [
-    ({'role': 'boss'}, "^role = 'boss': must be one of leader, follower, avoid$"),
-    ({'radius': -0.1}, r'^radius = -0\.1: must be a number in \[0, 5\] m$'),
-    ({'radius': math.nan}, r'^radius = nan: must be a number in \[0, 5\] m$')])
-def test_what_a_vehicle_cannot_be_is_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Member(**changes)  # type: ignore[arg-type]
+def test_each_vehicle_of_the_file_that_is_neither_seen_nor_received_is_reported() -> None:
+    params = PlannerParams(vehicles={
+        'leader': Member(), 'a': Member('follower'), 'b': Member('follower'), **STRANGER})
+    leader, beside = seen('leader', 0.0, 2.0), seen('a', 0.0, 1.0, 1.8)
+    heard = beside._replace(received=True)
+    for around, missing in (([leader, beside], 'b'), ([leader, heard], 'b'),
+                            ([leader], 'ab')):
+        assert decide(*around, params=params)[1].warnings == tuple(
+            f'{name} neither seen nor received, not kept clear of' for name in missing)

@@ -40,31 +40,11 @@ def fly(seconds: float, in_sight: str, received: str, follower: Follower | None 
     return follower, decisions
 
 
-def test_it_looks_where_the_leader_was_then_to_both_sides_then_all_round() -> None:
-    follower, _ = fly(1.0, 'leader', 'behind')
-    follower, there = fly(2.0, '', 'behind', follower)
-    assert max(abs(d.yaw or 0.0) for d in there) < 0.1
-    follower, round_about = fly(16.0, '', 'behind', follower)
-    yaws = np.unwrap([d.yaw for d in round_about])
-    assert 0.7 < yaws.max() < np.pi and yaws.min() < -1.5 and np.ptp(yaws) > 4.5
-    assert all(d.state.value == 'TRACK' for d in there + round_about)
-    assert any(w.startswith('looks for leader, not known of for 1.') for w in there[-1].warnings)
-
-
 def test_after_resume_timeout_it_turns_to_whom_it_hears_of() -> None:
     follower, _ = fly(1.0, 'leader', 'behind')
     follower, decisions = fly(PARAMS.resume_timeout + 8.0, '', 'behind', follower)
     assert abs(decisions[-1].yaw or 0.0) == pytest.approx(np.pi, abs=0.05)
     assert not any('looks for' in warning for warning in decisions[-1].warnings)
-
-
-def test_one_that_comes_into_view_meanwhile_does_not_end_it() -> None:
-    follower, _ = fly(1.0, 'leader', 'behind')
-    follower, _ = fly(3.0, '', 'behind', follower)
-    follower, _ = fly(1.0, 'behind', '', follower)
-    assert follower.memory.looking
-    follower, decisions = fly(4.0, 'leader', 'behind', follower)
-    assert not follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 0.05
 
 
 def test_it_looks_for_a_leader_that_it_only_received_if_nobody_is_in_view() -> None:

@@ -84,8 +84,9 @@ class BridgeReport:
         self._states = node.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
         self._armed_at = node.create_publisher(
             PointStamped, 'mavlink_bridge/armed_at', LATCHED_QOS)
-        node.create_timer(PLANNER_PERIOD, lambda: self.planner.ask(LIMITS))
-        self._diagnostics.sources.append(self._values)
+        node.create_timer(PLANNER_PERIOD, self.planner.ask)
+        self._diagnostics.sources += [
+            self._vehicle_values, self._gate_values, self._link_values]
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
@@ -147,7 +148,7 @@ class BridgeReport:
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
         for text in self._bridge.texts.new():
-            log = (self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info)
+            log = self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
     def _send_arming(self, now: float) -> None:
@@ -212,9 +213,6 @@ class BridgeReport:
             if not result.lines:
                 self._info(f'{result.answered} parameters of the autopilot are as recommended')
         return None
-
-    def _values(self, now: float) -> dict[str, object]:
-        return {**self._vehicle_values(now), **self._gate_values(now), **self._link_values(now)}
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
         """Return the state of autopilot and flight; why offboard, and arming, would be refused."""

@@ -159,9 +159,7 @@ class OwnOdometry:
                     f'{what}: {instead}' for what, instead in sorted(source.missing.items()))}
 
     def _problem(self, now: float) -> Problem | None:
-        twist, fault = self.source.twist, self.source.up.fault
-        if fault:
-            return WARN, f'axes of odom: {fault}'
+        twist = self.source.twist
         if twist.found not in ('', twist.wanted) and twist.wanted != NONE and (
                 twist.found == NONE or twist.wanted != AUTO):
             return WARN, f'velocity of odom: {twist.describe}'

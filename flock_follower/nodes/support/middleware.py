@@ -27,9 +27,6 @@ from flock_follower.files import resource
 
 #: The shared memory of Fast DDS without a profile, bytes.
 DEFAULT_SEGMENT: Final = 512 * 1024
-HERE: Final = 'this computer'
-PEERS: Final = 'named peers'
-NETWORK: Final = 'the network'
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -69,19 +66,18 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
         environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
 
 
-def reach(environment: Mapping[str, str]) -> str:
+def open_to_network(environment: Mapping[str, str]) -> bool:
     """
-    Return how far a node started with an environment is found: HERE, PEERS or NETWORK.
+    Return whether the network finds a node started with an environment.
 
-    A computer that names this one as its peer finds the node, too.
+    Otherwise this computer does, and with ROS_STATIC_PEERS one that names this one as its peer.
     """
     get = environment.get
     if get('RMW_IMPLEMENTATION', _FAST_DDS).startswith('rmw_fastrtps') and (
             _is_own(get(_PROFILE, ''))):
-        return HERE  # it has no other network than the loopback
-    if get('ROS_LOCALHOST_ONLY') != '1' and get(_RANGE, '').upper() not in ('LOCALHOST', 'OFF'):
-        return NETWORK
-    return PEERS if get('ROS_STATIC_PEERS') else HERE
+        return False  # it has no other network than the loopback
+    return get('ROS_LOCALHOST_ONLY') != '1' and (
+        get(_RANGE, '').upper() not in ('LOCALHOST', 'OFF'))
 
 
 def avoid_shared_memory_for_images(environment: MutableMapping[str, str], most: int) -> bool:

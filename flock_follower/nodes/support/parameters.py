@@ -26,7 +26,7 @@ taken whole or refused with a reason that names the parameter, its value and the
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 import math
 from pathlib import Path
@@ -35,7 +35,6 @@ from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
@@ -137,29 +136,21 @@ class RemoteParameters:
     def __init__(self, node: Node, other: str,
                  changed: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
         self.values: dict[str, Any] | None = None
-        self._node, self._other, self._changed = node, other, changed
+        self._changed = changed
+        self._list = node.create_client(ListParameters, f'{other}/list_parameters')
         self._get = node.create_client(GetParameters, f'{other}/get_parameters')
-        self._list: Client | None = None  # each client costs time whenever the executor waits
 
-    def ask(self, names: Collection[str] = ()) -> bool:
-        """
-        Ask for parameters, for all if no names are given.
-
-        Returns False if the other node was not found; one just started is found a moment later.
-        """
-        if not names and self._list is None:
-            self._list = self._node.create_client(
-                ListParameters, f'{self._other}/list_parameters')
-        if not self._get.service_is_ready() or not (
-                names or (self._list and self._list.service_is_ready())):
+    def ask(self) -> bool:
+        """Ask for all; return False if the node was not found, as one that has just started."""
+        if not (self._list.service_is_ready() and self._get.service_is_ready()):
             return False
-        if names:
-            self._get.call_async(GetParameters.Request(names=[*names])).add_done_callback(
-                partial(self._take_values, [*names]))
-        elif self._list:
-            self._list.call_async(ListParameters.Request()).add_done_callback(
-                lambda future: self.ask(future.result().result.names))
+        self._list.call_async(ListParameters.Request()).add_done_callback(self._take_names)
         return True
+
+    def _take_names(self, future: Any) -> None:
+        names = future.result().result.names
+        self._get.call_async(GetParameters.Request(names=names)).add_done_callback(
+            partial(self._take_values, names))
 
     def _take_values(self, names: list[str], future: Any) -> None:
         found = map(parameter_value_to_python, future.result().values)

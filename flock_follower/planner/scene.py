@@ -1,0 +1,174 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The scene of one step, and the decision that the step makes.
+
+The scene is the own state, the neighbors at hand, and those lost that may still be near.
+
+``survey`` also updates the memory: the neighbors to keep clear of, their motions, and the loss of
+sight of the neighbor that the vehicle followed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.inputs import (
+    at,
+    expected,
+    Neighbor,
+    OwnState,
+    Rejection,
+    TRUSTED_TIME,
+)
+from flock_follower.planner.limits import REASONS
+from flock_follower.planner.memory import Loss, Memory, observed
+from flock_follower.planner.modes import State
+from flock_follower.planner.neighborhood import gathered, Neighborhood, NOBODY, sought
+from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.vertical_yaw import OVERHEAD
+
+
+class Decision(NamedTuple):
+    """The outcome of one step."""
+
+    state: State
+    reason: str = ''
+    """Why this state, unless it is TRACK of a neighbor in sight."""
+    acceleration: Array | None = None
+    """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
+    yaw: float | None = None
+    """Commanded yaw, rad, ENU; None exactly if the acceleration is None."""
+    yaw_rate: float = 0.0
+    """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
+    separation_axis: Array | None = None
+    """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
+    stamp: float | None = None
+    """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
+    limits: str = ''
+    """The limits that bound: those of 'a_max', 'v_max', and of the guard's reasons, that did."""
+    rejected: tuple[Rejection, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """Motions of the neighbors that are beyond the follower's means."""
+    thrust_bias: float = 0.0
+    """The part of the vertical acceleration that only makes up for a wrong hover thrust, m/s^2."""
+    edges: tuple[str, ...] = ()
+    """The neighbors at the ends of its edges; others are only kept clear of."""
+
+    @property
+    def guarded(self) -> bool:
+        """Return whether the guard altered the command."""
+        return any(reason in self.limits for reason in REASONS)
+
+
+class Scene(NamedTuple):
+    """The vehicle and its surroundings at the time of one step."""
+
+    state: State
+    me: OwnState
+    """Own state, predicted to now."""
+    blinded: bool
+    """Whether no images are processed."""
+    neighbors: Neighborhood
+    """The neighbors at hand in TRACK, else none."""
+    leader: Neighbor | None
+    """The leader to look for while others are followed."""
+    missed: Neighbor | None
+    """The lost neighbor: ``leader``, or the newest one of those lost if none is followed."""
+
+
+def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: PlannerParams,
+           elapsed: float) -> tuple[Memory, Scene]:
+    """Return the memory with all to keep clear of, and the scene ``elapsed`` s after the last."""
+    neighbors, leader = NOBODY, None
+    if state is State.TRACK:
+        here = [at(n, me.stamp) for n in memory.neighbors.values()]
+        neighbors = gathered(memory, me, here, params, elapsed)
+        leader = sought(memory, neighbors, me, params)
+    flock = _flock(memory, me.stamp, state, leader, params)
+    missed = leader
+    if leader is None and neighbors.faced is None:
+        missed = max((n for n in flock.values() if n.member.role != AVOID),
+                     key=lambda n: n.stamp, default=None)
+    scene = Scene(state, me, blinded, neighbors, leader, missed)
+    return memory._replace(
+        flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
+        lost=_loss(memory, flock, scene, params)), scene
+
+
+def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
+           params: PlannerParams) -> Mapping[str, Neighbor]:
+    """
+    Return those at hand, and those lost that may still be near: to keep clear of.
+
+    :param leader: the leader to look for.
+    """
+    # The vehicle always keeps clear of vehicles to avoid; without TRACK no other estimate ages.
+    flock = {name: n for name, n in memory.flock.items() if now - n.stamp <= params.coast_timeout
+             or (state is not State.TRACK and n.member.role != AVOID)
+             or (leader is not None and leader.name == name)}
+    return flock | {n.name: n for n in memory.neighbors.values()
+                    if state is State.TRACK or n.member.role == AVOID}
+
+
+def awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
+    """Return a lost neighbor where it is expected, predicted by at most ``coast_timeout``."""
+    age = min(now - n.stamp, params.coast_timeout)
+    it = expected(n, memory.acceleration(n), age, params)
+    return n._replace(stamp=n.stamp + age, position=it.position, velocity=it.velocity)
+
+
+def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
+          params: PlannerParams) -> Loss | None:
+    """Return the loss of the neighbor that it followed or looks for."""
+    me, leader = scene.me, scene.leader
+    if (scene.state is State.TRACK and leader is None) or memory.followed is None:
+        return None
+    if memory.lost is not None:
+        along = memory.lost.towards
+        ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
+        return memory.lost._replace(origin=memory.lost.origin + ahead * along)
+    near = [leader] if leader else [n for n in flock.values() if n.member.role != AVOID]
+    if not near:
+        return None
+    n = min(near, key=lambda n: math.dist(n.position, me.position))
+    x, y, _ = awaited(n, memory, me.stamp, params).position - me.position
+    towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
+    if math.hypot(x, y) > OVERHEAD:
+        towards = np.array([x, y, 0.0]) / math.hypot(x, y)
+    soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)
+    approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
+    return Loss(towards, me.position, float(towards @ n.position), approach,
+                float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
+
+
+def beside(velocity: Array, offset: Array) -> Array:
+    """
+    Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
+
+    :param velocity: of the neighbour (3,), m/s.
+    :param offset: own position minus the neighbour's (3,), m.
+    """
+    x, y, _ = velocity.tolist()
+    length = math.hypot(x, y)
+    if length < 1e-6:
+        return np.zeros(3)
+    across = np.array([-y, x, 0.0]) / length
+    return math.copysign(1.0, float(across @ offset)) * across
