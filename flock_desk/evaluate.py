@@ -19,7 +19,7 @@ Run perception, planner and setpoint gate over a bag, and report their errors.
 ROS and runs in the bag's own time, as fast as the machine allows. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
-  them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
+  them, and ``setpoint``, the output of the gate to the autopilot, in the format of a command
   (acceleration, yaw and yaw rate in the axes of odom; NaN if it gives none);
 - ``summary.json``: the figures; null if the bag lacks the data, as errors without truth. Two runs
   differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;

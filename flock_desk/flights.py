@@ -165,7 +165,7 @@ def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int
     """
     Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
-    Return what each task gave, by scenario and controller.
+    Return the results of the tasks, by scenario and controller.
     """
     first = seed * 1_000_000
     tasks = [Task(scenario, controller, range(first + k, first + min(k + size, runs)))

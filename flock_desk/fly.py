@@ -62,7 +62,7 @@ from flock_follower.ranges import Range
 
 FOLLOWERS = Range(1, 8, whole=True)
 BUSY = 0.02  # of the images, not rendered in time: the machine was too slow
-SPEED_TOLERANCE = 0.05  # m/s: what noise and gusts add to a speed that is held at v_max
+SPEED_TOLERANCE = 0.05  # m/s: added by noise and gusts to a speed that is held at v_max
 SAFE = 0.9  # of sqrt(d0): nearer than this no follower may come
 DURATION_SHORT = 0.1  # s by which a flight may be shorter than requested
 AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
@@ -156,7 +156,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
 
 
 def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[FigureBound]:
-    """Return what `fly` demands; an outrun follower must warn instead of holding the band."""
+    """Return the bounds of `fly`; an outrun follower must warn instead of holding the band."""
     params = flight.scenario.flight
     demanded = bounds('external' if flight.external else 'fly', {
         'near': nearest_allowed(flight.scenario), 'far': round(math.sqrt(params.d1), 2),

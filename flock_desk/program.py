@@ -38,13 +38,13 @@ PROGRAMS: Final = {
 
 
 def usage() -> str:
-    """Return how to use the command, and what can be started."""
+    """Return the usage of the command, with the programs."""
     names = textwrap.fill(' '.join(PROGRAMS), initial_indent='  ', subsequent_indent='  ')
     return f'usage: flock_follower NAME [ARGUMENT ...], where NAME is one of\n{names}'
 
 
 def main() -> int:
-    """Start what the first argument names, and return its exit code."""
+    """Start the program that the first argument names, and return its exit code."""
     name = sys.argv[1] if len(sys.argv) > 1 else '--help'
     if name in ('-h', '--help'):
         print(usage())

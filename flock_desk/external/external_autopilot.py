@@ -93,7 +93,7 @@ class ExternalAutopilot:
         self._thread.start()
 
     def receive(self, wait: float) -> None:
-        """Take what has arrived into ``motion``; wait for it for ``wait`` seconds at most."""
+        """Take the arrived messages into ``motion``; wait for it for ``wait`` seconds at most."""
         if wait > 0.0 and not self._arrived:
             self._news.wait(wait)
         self._news.clear()
@@ -230,7 +230,7 @@ class ExternalVehicles:
         self.start_ns = self.follower.motion.newest or time.monotonic_ns()
 
     def receive(self, wait: float) -> None:
-        """Take what has arrived; wait for the follower for ``wait`` seconds at most."""
+        """Take the arrived messages; wait for the follower for ``wait`` seconds at most."""
         for _, link in self._links:
             link.receive(wait)
             wait = 0.0

@@ -57,8 +57,8 @@ Table = Mapping[str, Array]
 MAX_GAP = NANOSECONDS // 2
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
-#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of what an
-#: image gives: stage, position, velocity, rotation matrix, covariance (6, 6).
+#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of the
+#: result of an image: stage, position, velocity, rotation matrix, covariance (6, 6).
 _STATE, _SEEN = 14, 52
 
 

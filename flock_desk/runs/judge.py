@@ -14,7 +14,7 @@
 
 
 """
-Bounds on the figures of a summary: what makes ``evaluate``, ``demo`` and ``fly`` pass or fail.
+Bounds on the figures of a summary: ``evaluate``, ``demo`` and ``fly`` fail if one is broken.
 
 Each bound names a figure, dots leading into the summary, with a least or a greatest value, or
 both. ``evaluate --expect`` reads them from a YAML file::
@@ -104,7 +104,7 @@ def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> 
 
 
 def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[Judgement]:
-    """Return what became of every bound; a figure that is None or not finite breaks its bound."""
+    """Return the verdict on every bound; a figure that is None or not finite breaks its bound."""
     figures, judgements = dict(flat(summary)), []
     for bound in bounds:
         key, least, most = bound

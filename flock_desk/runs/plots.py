@@ -50,7 +50,7 @@ TIME = 'time [s]'
 
 
 def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
-    """Return what the report of ``evaluate`` shows: of each neighbour, flight and errors."""
+    """Return the chapters of ``evaluate``: flight and errors of each neighbour."""
     ticks, setpoints = evaluation.ticks, evaluation.setpoints
     return [chapter for name, table in evaluation.tables.items() for chapter in chapters(Flight(
         name=name, duration=evaluation.duration, params=evaluation.params,
@@ -62,7 +62,7 @@ def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
 
 
 def scenario_chapters(flight: LiveFlight) -> list[Chapter]:
-    """Return what the report of ``fly`` shows: plots, and images of the follower's camera."""
+    """Return the chapters of ``fly``: plots, and images of the follower's camera."""
     log = flight.log
     epoch = int(log['image_stamp'][0]) - round(float(flight.table['time'][0]) * 1e9)
     return [

@@ -111,7 +111,7 @@ def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None
     """
     Wait until the condition holds, looking every 20 ms.
 
-    :raises TimeoutError: naming ``what`` was waited for, after ``timeout`` seconds.
+    :raises TimeoutError: naming ``what`` is missing, after ``timeout`` seconds.
     """
     deadline = time.monotonic() + timeout
     while not condition():
@@ -201,7 +201,7 @@ class Processes:
         return child
 
     def log(self, name: str) -> str:
-        """Return what a child has printed so far."""
+        """Return the output of a child so far."""
         return (self.log_folder / f'{name}.log').read_text(errors='replace')
 
     def last_line(self, name: str) -> str:
@@ -304,7 +304,7 @@ class Processes:
 def computed(function: Callable[[Given], Result], tasks: Sequence[Given], jobs: int = 1,
              scheduler: str = '') -> Iterator[Result]:
     """
-    Yield what a function makes of each task, in their order.
+    Yield the results of a function of each task, in their order.
 
     :param jobs: processes that compute; 1: this one.
     :param scheduler: of a cluster that computes instead, such as ``tcp://192.168.1.5:8786``.

@@ -90,7 +90,7 @@ def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[s
 def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
              pages: Sequence[Path], logs: Path | None = None) -> int:
     """
-    Print the table, what failed and where to look for more; return the exit code.
+    Print the table, the broken bounds and the files to look at; return the exit code.
 
     :param logs: the folder to look at if something failed.
     """
