@@ -55,3 +55,9 @@ class LiveLine:
         """Leave the line on the terminal as it is."""
         if self.on_terminal:
             print(file=self._stream, flush=True)
+
+
+def bar(share: float, width: int = 20) -> str:
+    """Return a bar of characters that is filled up to a share, 0 to 1."""
+    filled = round(width * min(1.0, max(0.0, share)))
+    return f'[{"#" * filled}{"." * (width - filled)}]'

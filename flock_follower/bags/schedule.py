@@ -22,20 +22,30 @@ nanoseconds.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 NANOSECONDS = 1_000_000_000
 
 
-def start_in(bag_start_ns: int, bag_end_ns: int, start: float) -> int:
-    """
-    Return the time ``start`` s into the bag [ns].
+class Section(NamedTuple):
+    """The part of a bag to play: ``start_ns <= stamp < stop_ns``."""
 
-    :raises ValueError: the bag ends before that.
+    start_ns: int
+    stop_ns: int
+
+
+def section(bag_start_ns: int, bag_end_ns: int, start: float, duration: float) -> Section:
+    """
+    Return the part that begins ``start`` s into the bag and lasts ``duration`` s (0: all).
+
+    :raises ValueError: the bag ends before the part begins.
     """
     length = (bag_end_ns - bag_start_ns) / NANOSECONDS
     if not 0.0 <= start <= length:
         raise ValueError(f'start = {start:g}: must be in [0, {length:g}] s, the length of the bag')
-    return bag_start_ns + round(start * NANOSECONDS)
+    start_ns = bag_start_ns + round(start * NANOSECONDS)
+    last_ns = start_ns + round(duration * NANOSECONDS)
+    return Section(start_ns, min(bag_end_ns + 1, last_ns) if duration else bag_end_ns + 1)
 
 
 class Timeline:

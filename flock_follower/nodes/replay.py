@@ -39,7 +39,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
-from flock_follower.bags.schedule import NANOSECONDS, start_in, Timeline
+from flock_follower.bags.live_line import bar, LiveLine
+from flock_follower.bags.schedule import NANOSECONDS, section, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
@@ -62,7 +63,10 @@ SPECS = [
     Spec('bag', '', 'bag to play: .bag, .mcap, .db3 or a ROS 2 bag folder'),
     Spec('rate', 1.0, 'speed of playback', Range(0.1, 100.0), live=True),
     Spec('start', 0.0, 'start of the playback, from the start of the bag', Range(0.0, 1e9, 's')),
+    Spec('duration', 0.0, 'duration of the playback; 0: to the end of the bag',
+         Range(0.0, 1e9, 's')),
     Spec('loop', False, 'repeat the bag', live=True),
+    Spec('clock', True, 'publish /clock'),
     Spec('topics', [''], 'topics of the bag to play; empty: all'),
     # Discovery takes DDS up to 2.5 s; a later subscriber misses the first messages.
     Spec('wait_for_subscribers', 3.0,
@@ -87,15 +91,18 @@ class Replay(FlockNode):
         self.bag = open_bag(values['bag'])
         if self.bag.incomplete:
             self.get_logger().warning(f'{self.bag.path} is incomplete: {self.bag.incomplete}')
-        self._start_ns = start_in(self.bag.start_ns, self.bag.end_ns, values['start'])
+        self._section = section(
+            self.bag.start_ns, self.bag.end_ns, values['start'], values['duration'])
         self._outputs = {
             topic: self._create_output(self.bag.topics[topic]) for topic in self._choose_topics()}
-        self._clock_output = self.create_publisher(Clock, '/clock', 10)
-        self._timeline = Timeline(self._start_ns, values['rate'], time.monotonic())
+        self._clock_output = (
+            self.create_publisher(Clock, '/clock', 10) if values['clock'] else None)
+        self._timeline = Timeline(self._section.start_ns, values['rate'], time.monotonic())
         self._clock_ns = -1
         self._next_service = 0.0
         self._sent: Counter[str] = Counter()
         self._lateness = self.diagnostics.latency('lateness')
+        self._line = LiveLine()
         self.diagnostics.sources.append(self._values)
         self.create_service(SetBool, 'replay/pause', self._on_pause)
 
@@ -115,15 +122,17 @@ class Replay(FlockNode):
                     self._send(message)
                 if not self._sent:
                     raise BagError(f'{self.bag.path}: no message of {", ".join(self._outputs)} '
-                                   'after start')
+                                   'between start and end')
             # Reliable subscribers receive the last messages.
             for output in self._outputs.values():
                 output.wait_for_all_acked(Duration(seconds=1.0))
-            print(f'replayed {self._sent.total()} messages of {len(self._outputs)} topics '
-                  f'in {time.monotonic() - began:.1f} s, p99 '
-                  f'{self._lateness.values("late")["late_p99_ms"]} ms late', flush=True)
+            self._line.say(
+                f'replayed {self._sent.total()} messages of {len(self._outputs)} topics '
+                f'in {time.monotonic() - began:.1f} s, p99 '
+                f'{self._lateness.values("late")["late_p99_ms"]} ms late')
             return 0
         except BagError as error:
+            self._line.end()
             print(f'error: {error}', file=sys.stderr)
             return 1
         finally:
@@ -135,8 +144,8 @@ class Replay(FlockNode):
             self.get_logger().warning(f'topic {name} is not played: {reason}')
         named = [name for name in self._settings.values['topics'] if name]
         topics = self.bag.select(named)
-        if named and '/clock' in topics:
-            raise ValueError('topics: /clock is that of the playback, not the recorded one')
+        if named and '/clock' in topics and self._settings.values['clock']:
+            raise ValueError('topics: the recorded /clock can only be played with clock:=false')
         left_out = [] if named else [topic for topic in topics if topic in INFRASTRUCTURE
                                      or topic.endswith(COMMANDS)]
         if left_out:
@@ -169,7 +178,7 @@ class Replay(FlockNode):
 
     def _begin(self) -> None:
         """Go to the start; publish the clock before any message."""
-        start_ns = self._start_ns
+        start_ns = self._section.start_ns
         self._timeline.jump(start_ns, time.monotonic() + LEAD_IN)
         self._clock_ns = -1  # the one place where the clock may go back
         self._publish_clock(start_ns)
@@ -179,9 +188,9 @@ class Replay(FlockNode):
                 self._outputs[message.topic].publish(message.data)
 
     def _messages(self) -> Iterator[BagMessage]:
-        if self._start_ns == self.bag.start_ns:
+        if self._section == (self.bag.start_ns, self.bag.end_ns + 1):
             return self.bag.messages([*self._outputs])  # unbounded, so that losses are noticed
-        return self.bag.messages([*self._outputs], self._start_ns)
+        return self.bag.messages([*self._outputs], *self._section)
 
     def _wait_until_due(self, stamp_ns: int, executor: SingleThreadedExecutor) -> None:
         """Wait until a stamp is due; serve the clock and the services meanwhile."""
@@ -193,6 +202,8 @@ class Replay(FlockNode):
                 rate = self._settings.values['rate']
                 if rate != self._timeline.rate:
                     self._timeline.change(now, rate, self._timeline.paused)
+                if self._line.due(now):
+                    self._show_progress(now)
                 now = time.monotonic()
             due = self._timeline.due(stamp_ns)
             if now >= due:
@@ -204,7 +215,7 @@ class Replay(FlockNode):
         self._timeline.limit_lateness(stamp_ns, now, MAX_LATENESS)
 
     def _publish_clock(self, stamp_ns: int) -> None:
-        if stamp_ns > self._clock_ns:
+        if self._clock_output is not None and stamp_ns > self._clock_ns:
             self._clock_ns = stamp_ns
             self._clock_output.publish(Clock(clock=nanoseconds_to_stamp(stamp_ns)))
 
@@ -224,8 +235,17 @@ class Replay(FlockNode):
 
     def _seconds(self, now: float) -> float:
         """Return the bag time reached, s from the start of the bag."""
-        position = min(self._timeline.position(now), self.bag.end_ns)
+        position = min(self._timeline.position(now), self._section.stop_ns - 1)
         return (position - self.bag.start_ns) / NANOSECONDS
+
+    def _show_progress(self, now: float) -> None:
+        start_ns, stop_ns = self._section
+        end = (stop_ns - 1 - self.bag.start_ns) / NANOSECONDS
+        share = (self._timeline.position(now) - start_ns) / (stop_ns - start_ns)
+        self._line.show(
+            f'{bar(share) + " " if self._line.on_terminal else ""}{self._seconds(now):.1f} of '
+            f'{end:.1f} s, {self._sent.total()} messages'
+            f'{", paused" if self._timeline.paused else ""}')
 
     def _values(self, now: float) -> dict[str, Any]:
         return {'position_s': f'{self._seconds(now):.2f}', 'paused': self._timeline.paused,

@@ -44,8 +44,6 @@ REMOVED = {
     'range_max': 'the bridge bounds the distance: set radius_max of mavlink_bridge',
     'silent_at_rest': 'the bridge requests hold mode 3 s after the last command',
     'paused': 'call replay/pause',
-    'clock': 'replay always publishes /clock: remove the line',
-    'duration': 'the playback ends with the bag: remove the line',
     'remap': 'remap as ROS does: -r odom:=vio',
     'wait_for': 'replay waits for a subscriber of each topic that it plays',
     'odom_tf': 'the visualizer broadcasts no transforms: remove the line',

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from flock_follower.bags.schedule import start_in, Timeline
+from flock_follower.bags.schedule import section, Timeline
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -79,10 +79,11 @@ def test_late_waits_never_add_up(rate, waits):
     assert timeline.due(START + 100 * SECOND) == pytest.approx(100.0 / rate, abs=1e-9)
 
 
-def test_the_start_is_within_the_bag():
+def test_the_part_to_play_is_within_the_bag():
     end = START + 10 * SECOND
-    assert start_in(START, end, 2.5) == START + 2_500_000_000
-    assert start_in(START, end, 10.0) == end
+    assert section(START, end, 2.5, 0.0) == (START + 2_500_000_000, end + 1)
+    assert section(START, end, 2.0, 3.0) == (START + 2 * SECOND, START + 5 * SECOND)
+    assert section(START, end, 10.0, 9.0) == (end, end + 1)
     for start in (10.5, math.nan):
         with pytest.raises(ValueError, match=r'start = (10.5|nan): must be in \[0, 10\] s'):
-            start_in(START, end, start)
+            section(START, end, start, 0.0)

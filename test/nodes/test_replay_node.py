@@ -138,6 +138,19 @@ def test_start_and_topics_choose_what_is_played_latched_messages_included(
     assert deserialize_message(p.sent['mode_out'][0], String).data == 'hover'
 
 
+def test_duration_and_clock_and_the_line_of_progress(
+        player: Callable[..., Player], bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    p = player(bag, 'start:=0.2', 'duration:=0.3', 'clock:=false')
+    assert p.node.play() == 0
+    assert p.stamps() == [START + i * PERIOD for i in range(10, 25)]
+    assert '/clock' not in {publisher.topic_name for publisher in p.node.publishers}
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].endswith(' of 0.5 s, 0 messages') and '[' not in out[0]  # no terminal, no bar
+    p.node._line.on_terminal = True
+    p.node._show_progress(1e9)  # long after the end
+    assert f'[{"#" * 20}] 0.5 of 0.5 s' in capsys.readouterr().out
+
+
 def test_pause_stops_messages_and_clock_and_resume_goes_on(
         player: Callable[..., Player], bag: Path) -> None:
     p = player(bag)
