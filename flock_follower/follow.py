@@ -41,6 +41,9 @@ def main(args: Sequence[str] | None = None) -> int:
         prog='follow', description='Check; then arm, take off, request offboard, engage: each '
         'step by its key. l lands; Ctrl-C, SIGTERM and a closed terminal brake and hand over.')
     parser.add_argument('--namespace', default='', help='of the nodes')
+    parser.add_argument('--yes', action='store_true', help='no keys, for a simulator: refused '
+                        'unless the bridge has a loopback connection. A router on this machine '
+                        'looks the same: never with a real vehicle')
     options = parser.parse_args(args)
     if not re.fullmatch(r'[\w/]*', options.namespace):
         parser.error(f'--namespace {options.namespace}: must be letters, digits, _ and /')
@@ -57,7 +60,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 130
     findings = judge_all(seen)
     print(table(seen, findings))
-    return fly(options.namespace) if ready(findings) else 1
+    return fly(options.namespace, not options.yes) if ready(findings) else 1
 
 
 if __name__ == '__main__':

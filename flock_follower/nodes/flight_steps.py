@@ -24,7 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 import math
+import re
 from typing import Final
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
@@ -43,6 +45,16 @@ SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = {
     'offboard': ('mavlink_bridge/offboard', True), 'engage': ('planner/engage', True),
     'disengage': ('planner/engage', False), 'hand over': ('mavlink_bridge/offboard', False),
     'land': ('mavlink_bridge/land', None)}
+
+
+def loopback(connection: str) -> bool:
+    """Return whether the bridge's ``connection`` is an address of this machine alone."""
+    network = re.fullmatch(r'(?:udpin|udpout|tcp):([^:\s]+):\d+', connection)
+    try:
+        return network is not None and (
+            network[1] == 'localhost' or ip_address(network[1]).is_loopback)
+    except ValueError:  # another name: it may be resolved to any address
+        return False
 
 
 @dataclass
@@ -91,9 +103,14 @@ class Reports:
 
 
 class Flight:
-    """Decides which requests to make; a method returns those to make now, keys of ``SERVICES``."""
+    """
+    Decides which requests to make; a method returns those to make now, keys of ``SERVICES``.
 
-    def __init__(self, now: float) -> None:
+    :param confirm: whether a key confirms each step. If not, each step is requested once, and a
+        refusal ends the flight.
+    """
+
+    def __init__(self, now: float, confirm: bool = True) -> None:
         self.code: int | None = None
         """The exit code, once the flight has ended."""
         self.lines: list[str] = []
@@ -103,9 +120,10 @@ class Flight:
         self._ending: int | None = None
         self._question: str | None = None
         self._pending: set[str] = set()
+        self._confirm, self._requested = confirm, set[str]()
 
-    def step(self, reports: Reports, now: float) -> None:
-        """Ask for the key of the step that is due; end after a landing or without a node."""
+    def step(self, reports: Reports, now: float) -> list[str]:
+        """Ask for the key of the step that is due, or request it; end after a landing."""
         missing = [node for node in NODES if node not in reports.nodes]
         if missing and now - self._start > DISCOVERY:
             self.lines.append(f'missing: {", ".join(missing)}: '
@@ -113,7 +131,7 @@ class Flight:
             self.code = 1
         if missing or self._pending or self._ending is not None or (
                 now - self._answered < SETTLING):
-            return
+            return []
         due = reports.due()
         if self._landing:
             if reports.value('mavlink_bridge', 'armed') == 'False':
@@ -121,9 +139,15 @@ class Flight:
                 self.code = 0
         elif due != self._question and not reports.bridge.startswith('NO_AUTOPILOT'):
             self._question = due
+            if due in self._requested and not self._confirm:
+                self.lines.append(f'{due} is due again, but --yes requests each step only once')
+                return self.end(1, reports)
+            if due and not self._confirm:
+                return self._request(due)
             self.lines.append(
                 f'{reports.bridge}: press {due[0]} for {due}' if due else
                 'the follower flies: press l to land; Ctrl-C brakes and hands over')
+        return []
 
     def press(self, key: str, reports: Reports) -> list[str]:
         """Take a key: the key of the step that is due confirms it; l lands at any step."""
@@ -137,7 +161,8 @@ class Flight:
             return self._request(self._question)
         return []
 
-    def answer(self, step: str, success: bool, message: str, now: float) -> None:
+    def answer(self, step: str, success: bool, message: str, reports: Reports,
+               now: float) -> list[str]:
         """Take the answer to a request."""
         self._pending.discard(step)
         self._answered, self._question = now, None
@@ -148,6 +173,9 @@ class Flight:
             self._ending = 1
         if self._ending is not None and not self._pending:
             self.code = self._ending
+        if self._ending is None and not (success or self._confirm or self._landing):
+            return self.end(1, reports)
+        return []
 
     def end(self, code: int, reports: Reports, insist: bool = True) -> list[str]:
         """
@@ -174,4 +202,5 @@ class Flight:
 
     def _request(self, *steps: str) -> list[str]:
         self._pending |= {*steps}
+        self._requested |= {*steps}
         return list(steps)

@@ -29,6 +29,7 @@ import math
 import os
 import select
 import signal
+import sys
 import termios
 import time
 import tty
@@ -43,20 +44,33 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.nodes.call import patience
-from flock_follower.nodes.flight_steps import Flight, INTERRUPTED, Reports, SERVICES
+from flock_follower.nodes.flight_steps import (
+    DISCOVERY,
+    Flight,
+    INTERRUPTED,
+    loopback,
+    Reports,
+    SERVICES,
+)
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
+from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
 
 
 class Pilot(Node):
-    """Flies by keys."""
+    """
+    Flies by keys.
 
-    def __init__(self, namespace: str) -> None:
+    :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
+    """
+
+    def __init__(self, namespace: str, confirm: bool = True) -> None:
         super().__init__('follow', namespace=namespace, start_parameter_services=False)
-        self._reports, self._flight = Reports(), Flight(time.monotonic())
+        self._reports, self._flight = Reports(), Flight(time.monotonic(), confirm)
+        self._confirm = confirm
         self._signals: list[int] = []
         self._keyboard = True
         self._line = LiveLine()
@@ -94,6 +108,9 @@ class Pilot(Node):
             signal.signal(number, lambda number, _: self._signals.append(number))
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        if not self._confirm and (refused := self._real_vehicle(executor)):
+            print(f'error: {refused}', file=sys.stderr)
+            return 1
         with _single_keys():
             while self._flight.code is None:
                 try:
@@ -104,6 +121,20 @@ class Pilot(Node):
                     self._request(self._flight.end(1, self._reports))
         return self._flight.code
 
+    def _real_vehicle(self, executor: SingleThreadedExecutor) -> str:
+        """Return the reason if the bridge's ``connection`` may lead to a real autopilot, or ''."""
+        bridge, asked = RemoteParameters(self, 'mavlink_bridge'), False
+        end = time.monotonic() + DISCOVERY
+        while bridge.values is None and not self._signals:
+            if time.monotonic() > end:
+                return 'missing: mavlink_bridge, whose connection --yes must know'
+            executor.spin_once(timeout_sec=POLL_PERIOD)
+            asked = asked or bridge.ask()
+        connection = str((bridge.values or {}).get('connection', 'unknown'))
+        return '' if loopback(connection) else (
+            f'--yes: connection = {connection!r} of mavlink_bridge: must be a loopback address, '
+            'such as udpin:127.0.0.1:14540 of a simulator')
+
     def _turn(self, now: float) -> None:
         received, self._signals = self._signals, []
         for number in received:  # a logout sends several: only Ctrl-C, pressed again, insists
@@ -112,7 +143,7 @@ class Pilot(Node):
         if self._keyboard:
             self._take_keys()
         self._take_answers(now)
-        self._flight.step(self._reports, now)
+        self._request(self._flight.step(self._reports, now))
         self._show(now)
 
     def _take_keys(self) -> None:
@@ -126,7 +157,7 @@ class Pilot(Node):
         for key in keys.decode('ascii', 'replace'):
             self._request(self._flight.press(key, self._reports))
         self._keyboard = bool(keys)
-        if not keys:
+        if not keys and self._confirm:  # --yes needs no keyboard
             self._flight.lines.append('the terminal is closed')
             self._request(self._flight.end(INTERRUPTED, self._reports, insist=False))
 
@@ -146,7 +177,7 @@ class Pilot(Node):
             else:
                 continue
             del self._calls[step]
-            self._flight.answer(step, success, message, now)
+            self._request(self._flight.answer(step, success, message, self._reports, now))
 
     def _show(self, now: float) -> None:
         """Print; an error of the terminal must not prevent the handing over."""
@@ -173,7 +204,7 @@ def _single_keys() -> Iterator[None]:
             termios.tcsetattr(0, termios.TCSANOW, before)
 
 
-def fly(namespace: str) -> int:
+def fly(namespace: str, confirm: bool = True) -> int:
     """Run the node in a namespace, and return the exit code."""
     never_block_output()  # a stopped terminal must not prevent the handing over
-    return run(lambda: Pilot(namespace), ['follow'], Pilot.spin)
+    return run(lambda: Pilot(namespace, confirm), ['follow'], Pilot.spin)

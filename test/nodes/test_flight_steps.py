@@ -20,7 +20,14 @@ from typing import Any
 
 import pytest
 
-from flock_follower.nodes.flight_steps import DISCOVERY, Flight, INTERRUPTED, NODES, Reports
+from flock_follower.nodes.flight_steps import (
+    DISCOVERY,
+    Flight,
+    INTERRUPTED,
+    loopback,
+    NODES,
+    Reports,
+)
 
 GROUND = {'armed': 'False', 'flying': 'False'}
 ARMED, AIR = {**GROUND, 'armed': 'True'}, {'armed': 'True', 'flying': 'True'}
@@ -53,7 +60,7 @@ class Desk:
         return [step for key in keys for step in self.flight.press(key, self.reports)]
 
     def answer(self, step: str, success: bool = True) -> None:
-        self.flight.answer(step, success, 'done', self.now)
+        self.flight.answer(step, success, 'done', self.reports, self.now)
 
     def end(self, insist: bool = True) -> list[str]:
         return self.flight.end(INTERRUPTED, self.reports, insist)
@@ -78,6 +85,31 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
         line = desk.report(*after)
     assert line.startswith('the follower flies') and desk.flight.code is None
     assert desk.report(AIR, TAKEN_OVER) == f'{TAKEN_OVER}: press o for offboard'
+
+
+def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight() -> None:
+    desk = Desk(GROUND, HOVER, False)
+    desk.flight = Flight(desk.now, confirm=False)
+    for step, before in (('arm', (GROUND, HOVER)), ('takeoff', (ARMED, HOVER)),
+                         ('offboard', (AIR, HOVER)), ('engage', (AIR, 'ACTIVE'))):
+        desk.report(*before)
+        assert desk.flight._pending == {step}
+        desk.answer(step)
+    assert desk.report(AIR, 'ACTIVE', True).startswith('the follower flies')
+    assert 'only once' in desk.report(AIR, TAKEN_OVER) and desk.flight.code is not None
+    refused = Desk(GROUND, HOVER, False)
+    refused.flight = Flight(refused.now, confirm=False)
+    refused.report(GROUND, HOVER)
+    refused.answer('arm', False)
+    assert refused.flight.code == 1
+
+
+@pytest.mark.parametrize(('connection', 'own'), [
+    ('udpin:127.0.0.1:14540', True), ('udpout:localhost:14540', True), ('tcp:127.0.0.2:1', True),
+    ('udpin:0.0.0.0:14540', False), ('/dev/ttyACM0:57600', False), ('udpin:drone:14540', False),
+    ('udpin:192.168.1.2:14540', False)])
+def test_only_an_address_of_this_machine_is_loopback(connection: str, own: bool) -> None:
+    assert loopback(connection) is own
 
 
 @pytest.mark.parametrize(('bridge', 'requested'), [
