@@ -44,6 +44,8 @@ from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 PERIOD: Final[float] = 1.0
 #: The answer with the shortest way among this many gives the offset: delay only ever adds.
 WINDOW: Final[int] = 10
+#: An autopilot that answers nothing for so long, s, does not receive our messages.
+UNANSWERED_MAX: Final[float] = 5.0
 #: Answers older than this no longer count, ns: clocks drift by 0.1 ms/s at the most.
 MEMORY: Final[int] = 30_000_000_000
 #: Two clocks of the same speed may contradict themselves by this in that time, ns.
@@ -82,6 +84,13 @@ class TimeSync:
         if message.ts1 in self._asked:  # else another system has sent the request
             self._samples.append(Sample(message.tc1 - message.ts1, message.tc1 - now, now))
         return None
+
+    def unanswered(self, now: int) -> float:
+        """Return for how long, s, no question has been answered; 0 if none waits."""
+        # Copies: diagnostics read them from another thread.
+        answered = max((sample.time for sample in self._samples.copy()), default=0)
+        waiting = (now - time for time in self._asked.copy() if time > answered)
+        return max(waiting, default=0) * 1e-9
 
     def age(self, time_boot_ms: int, now: int) -> float:
         """
@@ -220,6 +229,14 @@ class Housekeeping:
             self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
             needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
+
+    def unreceived(self, now: float) -> str:
+        """Return why the autopilot does not receive our messages, or ''."""
+        if self._link.signing or not self._link.autopilot_signs or (  # USB needs no signature
+                self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
+            return ''
+        return ('the autopilot signs its messages and answers none of ours: '
+                'set signing_key_file')
 
     def rates(self, now: float) -> dict[str, float]:
         """Return how often the estimate comes, Hz, by the message's name."""

@@ -225,6 +225,8 @@ class Link:
         self.bytes_received = 0
         self.bytes_sent = 0
         self.signing = signing
+        #: Whether the autopilot's newest message was signed.
+        self.autopilot_signs = False
         self._framers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
@@ -254,6 +256,7 @@ class Link:
                 if unfit := self._unfit(message, peer, now):
                     self.ignored[unfit] += 1
                     continue
+                self.autopilot_signs = bool(message.get_header().incompat_flags & _SIGNED)
                 self.telemetry.update(message, now)
                 messages.append(message)
         return messages

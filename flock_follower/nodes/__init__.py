@@ -21,6 +21,7 @@ from pathlib import Path
 import signal
 import sys
 import threading
+from types import TracebackType
 
 #: A signalled process has ended after this, s; the bridge has braked and ended its stream before.
 SHUTDOWN_TIMEOUT = 1.8
@@ -85,7 +86,17 @@ def _runs_as_a_program() -> bool:
             or Path(__file__).with_name(f'{path.name}.py').exists())
 
 
+def _report_missing_package(kind: type[BaseException], error: BaseException,
+                            trace: TracebackType | None) -> None:
+    if isinstance(error, ModuleNotFoundError):
+        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
+              'package in package.xml', file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
 _AS_A_PROGRAM = _runs_as_a_program()
 if _AS_A_PROGRAM:
     signal.signal(signal.SIGINT, _handle)
     signal.signal(signal.SIGTERM, _handle)
+    sys.excepthook = _report_missing_package

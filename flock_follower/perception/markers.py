@@ -53,6 +53,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+import difflib
 from functools import lru_cache
 import math
 from pathlib import Path
@@ -341,8 +342,10 @@ def _check_keys(where: str, entry: Any, keys: set[str],
         raise ValueError(f'{where} lacks {key}')
     unknown = sorted(map(str, set(entry) - keys - {*optional}))
     if unknown:
-        known = ', '.join(sorted({*keys, *optional}))
-        raise ValueError(f'{where} has an unknown key {unknown[0]}: must be one of {known}')
+        known = sorted({*keys, *optional})
+        near = difflib.get_close_matches(unknown[0], known, n=1)
+        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + (
+            f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:

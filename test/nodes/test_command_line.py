@@ -19,6 +19,8 @@ from __future__ import annotations
 from importlib import import_module
 import os
 from pathlib import Path
+import subprocess
+import sys
 from unittest import mock
 
 import pytest
@@ -117,3 +119,11 @@ def test_a_parameter_file_that_misses_the_node_ends_it_or_is_a_warning(
         '/planner, or /**/planner')
     assert run('simulator', '--ros-args', '--params-file', str(path), '-p', 'seed:=-1') == 1
     assert 'holds no parameters for /simulator, only for /planners' in capfd.readouterr().err
+
+
+def test_a_missing_package_of_ros_is_one_line() -> None:
+    script = ('import sys; sys.argv = ["planner"]; sys.modules["std_srvs"] = None; '
+              'import flock_follower.nodes.planner')
+    ended = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
+    assert ended.returncode == 1 and ended.stderr.count('\n') == 1
+    assert 'std_srvs' in ended.stderr and 'source ROS 2' in ended.stderr

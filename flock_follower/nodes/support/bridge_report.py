@@ -90,7 +90,8 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, self._ended),
+                (ERROR, self._link_fault), (ERROR, bridge.housekeeping.unreceived),
+                (ERROR, self._ended),
                 (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.gate.misaligned),
                 (WARN, bridge.gate.thrust_error),
