@@ -45,6 +45,7 @@ from flock_desk.runs.console import guarded, within
 from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
 from flock_desk.runs.judge import FigureBound
+from flock_desk.runs.moving_picture import moving_picture
 from flock_desk.runs.plots import scenario_chapters
 from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
@@ -58,6 +59,7 @@ from flock_desk.runs.summary import (
 )
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
+from flock_follower.files import whole_file
 from flock_follower.ranges import Range
 
 FOLLOWERS = Range(1, 8, whole=True)
@@ -85,6 +87,8 @@ def main(args: Sequence[str] | None = None) -> int:
                         'takes about one core')
     parser.add_argument('--output', type=Path, default='build/fly',
                         help='folder for report and logs (%(default)s)')
+    parser.add_argument('--moving', type=Path, metavar='FILE',
+                        help='also write a moving picture of the flight, an animated WebP')
     external = parser.add_argument_group('an autopilot that runs already, see docs/desk.md')
     external.add_argument('--autopilot', default='', metavar='URL',
                           help='where the bridge finds it: udp:HOST:PORT where it sends to, '
@@ -103,6 +107,8 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
     if options.autopilot and options.followers > 1:
         parser.error('--followers: not with --autopilot')
+    if options.moving and options.followers > 1:
+        parser.error('--moving: not with --followers')
     return guarded(partial(_fly, options),
                    hint=f'; the logs of every process are in {options.output}')
 
@@ -120,7 +126,11 @@ def _fly(options: argparse.Namespace) -> int:
             clear(options.output / namespace)
         cores, exit_codes = fly(scenario, options.scenario, options.seed, duration,
                                 options.output, external, options.followers)
-        return conclude(scenario, options.output, options.followers, cores, exit_codes)
+        code = conclude(scenario, options.output, options.followers, cores, exit_codes)
+        if options.moving:
+            with whole_file(options.moving) as file:
+                file.write(moving_picture(read_flown(scenario, options.output)))
+        return code
 
 
 def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, float],

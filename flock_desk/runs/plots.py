@@ -100,8 +100,8 @@ def _flight_picture(flight: Flight) -> Illustration:
     axes: dict[str, Axes] = figure.subplot_mosaic(
         [['distance', 'above'], ['setpoint', 'speed'], ['state', 'state']],
         height_ratios=[1.2, 1.2, 0.7])
-    _draw_above(axes['above'], flight)
-    _draw_distance(axes['distance'], flight)
+    draw_above(axes['above'], flight)
+    draw_distance(axes['distance'], flight)
     _draw_setpoints(axes['setpoint'], flight)
     v_max = flight.params.v_max
     _draw_limit(axes['speed'], v_max, f'v_max\n{v_max:g} m/s')
@@ -149,7 +149,7 @@ def _error_picture(flight: Flight) -> Illustration:
     return _illustration(figure, 'errors and their deviations')
 
 
-def _draw_distance(axis: Axes, flight: Flight) -> None:
+def draw_distance(axis: Axes, flight: Flight) -> None:
     """Draw the estimated and the true distance in the band."""
     table, law = _with_gaps(flight.table), flight.params.law
     low, high = np.sqrt(law.d0), np.sqrt(law.d1)
@@ -169,7 +169,7 @@ def _draw_distance(axis: Axes, flight: Flight) -> None:
                    max(1.05 * high, 1.08 * np.max(shown, initial=0.0))))
 
 
-def _draw_above(axis: Axes, flight: Flight) -> None:
+def draw_above(axis: Axes, flight: Flight) -> None:
     """
     Draw the paths from above, and lines between leader and follower at the same times.
 
