@@ -68,7 +68,7 @@ ROOMS = {
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
              'parameters perception planner scenarios sensors',
-             'cv2 distributed matplotlib numpy tqdm yaml'),
+             'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
                    'mavlink messages nodes parameters perception planner runs scenarios '
