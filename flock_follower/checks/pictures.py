@@ -108,9 +108,14 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     share = sum(map(bool, found)) / len(pictures)
     side = float(np.median([side for each in found for side in each] or [0.0]))
     measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
+    others = sorted({number for picture in pictures for number in picture.markers})
+    unseen = f'not in sight in {len(pictures)} images'
     return first(
         'marker', f'{ours}, {SMALL:.0f} px, most of the time',
-        (share == 0.0, WARNING, f'not in sight in {len(pictures)} images',
+        (share == 0.0 and bool(others), WARNING,
+         f'{unseen}, but {", ".join(map(str, others))}',
+         'set marker_id in neighbors_file, or show the right print'),
+        (share == 0.0, WARNING, unseen,
          'hold the leader before the camera; is it the dictionary and id of the print, flat, its '
          'margin white?'),
         (side < TINY, ERROR, measured,
