@@ -25,6 +25,7 @@ import pytest
 
 from flock_follower.geometry import (
     Array,
+    matrix_to_rotation_vector,
     rotation_vector_to_matrix,
     Transform,
 )
@@ -40,9 +41,9 @@ HERE = facing((0.02, -0.01, 1.5), (0.1, 0.3, 0.05))  # T_camera_marker
 
 
 def smeared(pose: Transform, cells: float, direction: float, seed: int = 0, *,
-            marker_id: int = 3, codes: Array | None = None) -> GrayImage:
+            marker_id: int = 3, codes: Array | None = None, gamma: float = 1.0) -> GrayImage:
     length = cells * CELL * CAMERA.matrix[0, 0] / pose.translation[2]
-    return render(CAMERA, {marker_id: pose}, seed=seed,
+    return render(CAMERA, {marker_id: pose}, seed=seed, gamma=gamma,
                   motion=(length * math.cos(direction), length * math.sin(direction)),
                   codes=None if codes is None else {marker_id: codes})
 
@@ -51,11 +52,37 @@ def body(pose: Transform) -> Transform:
     return pose @ MOUNTED.inverse()
 
 
+def off(pose: Transform, seed: int) -> Transform:
+    """Return a pose off by up to two cells across the line of sight, and a little in all else."""
+    rng = np.random.default_rng(seed)
+    aside = np.append(rng.uniform(-1.4, 1.4, 2) * CELL, rng.uniform(-0.03, 0.03))
+    return Transform(rotation_vector_to_matrix(rng.normal(0.0, 0.03, 3)) @ pose.rotation,
+                     pose.translation + aside)
+
+
+@pytest.mark.parametrize('gamma', [1.0, 2.2])
+@pytest.mark.parametrize('cells', [0.6, 1.0, 1.5])
+def test_a_smeared_marker_has_an_honest_covariance(cells: float, gamma: float) -> None:
+    squares = []
+    for k in range(4):
+        pose = facing((0.02 * k, -0.02, 1.2 + 0.25 * k), (0.1, 0.15 * k - 0.3, 0.05))
+        found = fit_smeared(smeared(pose, cells, 0.6 * k, k, gamma=gamma), CAMERA, MODEL,
+                            off(body(pose), k))
+        assert found is not None
+        error = np.concatenate([
+            pose.translation - found.pose.apply(MOUNTED.translation), matrix_to_rotation_vector(
+                body(pose).rotation @ found.pose.rotation.T)])
+        assert np.linalg.norm(error[:2]) < 0.001 * pose.translation[2]
+        assert abs(error[2]) < 0.012 * pose.translation[2]
+        assert np.linalg.norm(error[3:]) < 0.15
+        np.linalg.cholesky(found.covariance)
+        squares.append(error @ np.linalg.solve(found.covariance, error) / 6.0)
+    assert np.mean(squares) < 1.5
+
+
 @pytest.mark.parametrize('cells', [0.0, 1.0, 1.5])
 def test_no_other_marker_is_taken_for_it(cells: float) -> None:
-    found = fit_smeared(smeared(HERE, max(cells, 0.3), 0.4), CAMERA, MODEL, body(HERE))
-    assert found is not None
-    assert np.linalg.norm(HERE.translation - found.pose.apply(MOUNTED.translation)) < 0.02
+    assert fit_smeared(smeared(HERE, max(cells, 0.3), 0.4), CAMERA, MODEL, body(HERE)) is not None
     for marker_id in range(0, 50, 3):
         if marker_id != 3:
             image = smeared(HERE, cells, 0.4, marker_id=marker_id)
