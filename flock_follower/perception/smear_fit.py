@@ -61,8 +61,9 @@ _WHITE = 3  # cells around, in the print
 LENSES = np.array([0.07, 0.11, 0.17, 0.27, 0.4])  # with less, the instants were steps in the image
 FOCUSED = 3  # so many of them are
 _SHARP = 1
-#: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees.
-_LENGTHS = (0.5, 1.0, 1.45)
+#: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees. None is 0,
+#: where the squares have no slope by the vector and the descent stays.
+_LENGTHS = (0.2, 0.5, 1.0, 1.45)
 
 
 class SmearModel:
@@ -93,10 +94,10 @@ class SmearModel:
         self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
             level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
         angles = np.arange(4) * np.pi / 4
-        self.smears = np.array([[0.0, 0.0], *(length * np.array([np.cos(a), np.sin(a)])
-                                              for length in _LENGTHS for a in angles),
+        self.smears = np.array([*(length * np.array([np.cos(a), np.sin(a)])
+                                  for length in _LENGTHS for a in angles),
                                 *np.zeros((len(LENSES) - FOCUSED, 2))])
-        self.lenses = (_SHARP,) * (1 + len(_LENGTHS) * len(angles)) + tuple(
+        self.lenses = (_SHARP,) * (len(_LENGTHS) * len(angles)) + tuple(
             range(FOCUSED, len(LENSES)))
         size = n * PER_CELL + 2 * MARGIN
         self.smeared: Any = np.array([

@@ -60,8 +60,8 @@ def off(pose: Transform, seed: int) -> Transform:
                      pose.translation + aside)
 
 
-@pytest.mark.parametrize('gamma', [1.0, 2.2])
-@pytest.mark.parametrize('cells', [0.6, 1.0, 1.5])
+@pytest.mark.parametrize('cells, gamma', [
+    (0.3, 1.0), (0.6, 1.0), (1.0, 1.0), (1.5, 1.0), (0.6, 2.2), (1.0, 2.2), (1.5, 2.2)])
 def test_a_smeared_marker_has_an_honest_covariance(cells: float, gamma: float) -> None:
     squares = []
     for k in range(4):
