@@ -218,7 +218,7 @@ class Housekeeping:
 
     def has_reasons(self, now: float) -> bool:
         """Return whether the autopilot was asked what keeps it from arming, and had the time."""
-        return now - self._why_asked >= WHY_WAIT
+        return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
@@ -244,21 +244,17 @@ class Housekeeping:
                 for name, message_id in ESTIMATE.items()}
 
     def _request_streams(self, now: float) -> None:
-        """Request all messages once, and again those that come too seldom."""
-        telemetry, dialect = self._link.telemetry, self._link.telemetry.dialect
+        """Request each message once, and again if it comes too seldom."""
+        arrivals, dialect = self._link.telemetry.arrivals, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
-        # What permission, braking and the pilot's switch rest on, and the least rate, Hz.
-        watched = {**{message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status,
-            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)},
-            dialect.mode_message: dialect.least_mode_rate}
+        # Permission, braking and heights rest on them, and a request may be lost.
+        least = {**wanted, dialect.mode_message: dialect.least_mode_rate}
         due = {message_id: wanted[message_id] for message_id in wanted
                if message_id not in self._requested or (
-                   message_id in watched and telemetry.arrivals.too_seldom(
-                       message_id, watched[message_id], now)
-                   and now - self._requested[message_id] >= STREAM_REQUEST_PERIOD)}
+                   now - self._requested[message_id] >= STREAM_REQUEST_PERIOD
+                   and arrivals.too_seldom(message_id, least[message_id], now))}
         self._link.request_streams(due)
         self._requested.update(dict.fromkeys(due, now))
 
