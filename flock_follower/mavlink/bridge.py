@@ -274,8 +274,9 @@ class Bridge:
             heights.refer(None, now)
         elif armed_now or (not heights.referenced and flying is False):
             heights.refer(0.0, now)
-        elif not heights.referenced and flying:
-            heights.refer(self.telemetry.height_above_home(now), now)
+        elif not heights.referenced and flying and (
+                (above := self.telemetry.height_above_home(now)) is not None):
+            heights.refer(above, now)
 
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""

@@ -253,6 +253,7 @@ class HeightEstimator:
         self._sensor = ''
         self._zero = 0.0  # altitude of the sensor at altitude 0
         self._reference: float | None = None
+        self._referred = False  # whether there was a reference since the last ``refer``
         self._differences: deque[tuple[float, float]] = deque()
 
     def take(self, altitude: float, climb_rate: float | None, now: float, sensor: str = ''
@@ -347,10 +348,11 @@ class HeightEstimator:
         """Take the present height, m, as known; None forgets the reference."""
         altitude = self.altitude(now)
         self._reference = None if height is None or altitude is None else altitude - height
+        self._referred = self.referenced
 
     def missing(self, now: float) -> bool:
         """Return whether a height that was known is not received any more."""
-        return self._reference is not None and now - self._time > TIMEOUT
+        return self._referred and self.height(now) is None
 
     def lost(self, now: float) -> str:
         """Return why a height that was known cannot be used at ``now``, or ''."""

@@ -128,7 +128,9 @@ def test_a_sensor_that_takes_over_from_one_long_silent_has_no_reference():
     heights.take(2.0, None, 0.0, 'DISTANCE_SENSOR')
     heights.refer(2.0, 0.0)
     heights.take(492.0, None, 0.1 + TIMEOUT, 'SCALED_PRESSURE')
-    assert not heights.referenced
+    assert not heights.referenced and heights.height(0.1 + TIMEOUT) is None
+    # The vehicle must not fly on without its bounds.
+    assert heights.missing(0.1 + TIMEOUT) and heights.lost(0.1 + TIMEOUT) == 'height stale'
 
 
 def test_a_jump_of_the_barometer_corrects_the_vertical_velocity_by_its_bound_at_most():
