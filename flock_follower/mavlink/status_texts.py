@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Texts of the autopilot: STATUSTEXT messages, and the EVENTs of PX4.
+Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
@@ -149,13 +149,17 @@ class ArmingChecks:
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
+#: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
+CHUNK: Final[int] = 50
+#: A text whose next chunk does not come within this, s, is taken as it is.
+CHUNK_TIMEOUT: Final[float] = 0.4
 
 
 class AutopilotText(NamedTuple):
-    """One text, or one chunk of 50 characters of a longer one."""
+    """One whole text."""
 
     time: float
-    """Time of reception, s."""
+    """Time of reception of its end, s."""
     severity: int
     """MAV_SEVERITY: the smaller, the worse."""
     text: str
@@ -169,23 +173,36 @@ class StatusTexts:
         self._has_texts = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
+        self._begun: AutopilotText | None = None  # a text whose end has not come
+        self._due = 0, 0  # id and number of its next chunk
 
     def add(self, message: Any, now: float) -> None:
         """Take a STATUSTEXT."""
         self._has_texts = True
-        self._take(message.severity, str(message.text), now)
+        if (message.id, message.chunk_seq) != self._due:
+            self._end()
+        text = str(message.text)
+        before = '' if self._begun is None else self._begun.text
+        self._begun = AutopilotText(now, message.severity, before + text)
+        self._due = message.id, message.chunk_seq + 1
+        if not message.id or len(text) < CHUNK:
+            self._end()
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its text is used only if no STATUSTEXTs come."""
         text = self.checks.take(message)
         if text and not self._has_texts:
-            self._take(message.log_levels & 0xF, text, now)
+            self._begun = AutopilotText(now, message.log_levels & 0xF, text)
+            self._end()
 
-    def _take(self, severity: int, text: str, now: float) -> None:
-        # PX4 ends texts with a tab if it also sends them as events.
-        taken = AutopilotText(now, severity, text.strip('\x00\t\n '))
-        self._texts.append(taken)
-        self._new.append(taken)
+    def _end(self) -> None:
+        """Take the text that has begun as it is."""
+        if self._begun is not None:
+            # PX4 ends texts with a tab if it also sends them as events.
+            whole = self._begun._replace(text=self._begun.text.strip('\x00\t\n '))
+            self._texts.append(whole)
+            self._new.append(whole)
+        self._begun = None
 
     def why(self, time: float, mode: str) -> list[str]:
         """Return the texts since ``time``, and the newest failed checks for a mode."""
@@ -202,8 +219,10 @@ class StatusTexts:
         return list(dict.fromkeys(
             text for t, severity, text in self._texts if t >= time and severity <= worst))
 
-    def new(self) -> list[AutopilotText]:
-        """Return the texts since the last call."""
+    def new(self, now: float) -> list[AutopilotText]:
+        """Return the texts since the last call; one without its end after CHUNK_TIMEOUT."""
+        if self._begun is not None and now - self._begun.time > CHUNK_TIMEOUT:
+            self._end()
         texts = list(self._new)
         self._new.clear()
         return texts

@@ -148,7 +148,7 @@ class BridgeReport:
             self._publish(self._states, lambda: String(data=state))
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
-        for text in self._bridge.texts.new():
+        for text in self._bridge.texts.new(now):
             log = self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
