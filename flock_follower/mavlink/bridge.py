@@ -330,10 +330,8 @@ class Bridge:
             make = commands.land if self.requests.landing else commands.hold
             goal = make(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)
-        if self.withheld():
-            return
         setpoint, _ = self.gate.decide(
-            now, self.telemetry.silence(now), distrusted=self.distrusted(now))
+            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 

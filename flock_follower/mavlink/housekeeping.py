@@ -36,6 +36,7 @@ from typing import Any, Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect
+from flock_follower.mavlink.estimator_health import RECENT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
@@ -130,6 +131,10 @@ RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 20.0,
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 20.0,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5})
+#: An estimate at less than this share of the requested rate is reported, and a longer pause in all
+#: messages, s: the largest age of a velocity for braking.
+FEW: Final[float] = 0.5
+PAUSE: Final[float] = 0.3
 #: An origin is sent again after this, s, until the autopilot reports one.
 ORIGIN_PERIOD: Final[float] = 5.0
 #: Latitude, longitude, deg, and height, m, of the origin sent to PX4 if none is configured: the
@@ -175,6 +180,7 @@ class Housekeeping:
         self._timesync_sent = self._why_asked = -math.inf
         self._reboots = 0
         self._was_alive = False
+        self._alive_since = math.inf
         self._requested: dict[int, float] = {}  # when each message was requested last, s
 
     def take_timesync(self, message: Any, now: float) -> None:
@@ -192,7 +198,7 @@ class Housekeeping:
             self._heartbeat_sent = now
         reboots = self._link.telemetry.reboots
         if reboots != self._reboots or (alive and not self._was_alive):
-            self._reboots = reboots
+            self._reboots, self._alive_since = reboots, now
             self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._requested, self.parameters = {}, self._new_check()
         self._was_alive = alive
@@ -242,6 +248,19 @@ class Housekeeping:
         """Return how often the estimate comes, Hz, by the message's name."""
         return {name: self._link.telemetry.arrivals.rate(message_id, now)
                 for name, message_id in ESTIMATE.items()}
+
+    def too_slow(self, now: float) -> str:
+        """Return that the estimate comes too seldom, or that the link stalls, or ''."""
+        if not self._was_alive or now - self._alive_since < RECENT + PERIOD:
+            return ''  # the requested messages have not come for so long
+        problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} asked for'
+                    for name, rate in self.rates(now).items()
+                    if 0.0 < rate < FEW * self._estimate_rate]
+        pause = self._link.telemetry.arrivals.longest_pause(now)
+        if pause > PAUSE:
+            problems.append(f'nothing came from the autopilot for {pause:.2f} s in the last '
+                            f'{RECENT:g} s')
+        return '; '.join(problems)
 
     def _request_streams(self, now: float) -> None:
         """Request each message once, and again if it comes too seldom."""

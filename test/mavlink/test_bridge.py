@@ -59,6 +59,17 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
 
 
 @BOTH
+def test_a_pilot_who_has_taken_over_is_left_alone_at_the_end_of_the_bridge(personality):
+    flight = Flight(personality).follow(1.0)
+    flight.controller.pilot_switches(flight.modes.manual)
+    flight.fly(1.2)  # HEARTBEAT comes at 1 Hz
+    flight.bridge.stop(flight.now)
+    flight.wire.written = []
+    flight.bridge.finish(flight.now)
+    assert flight.bridge.stopped(flight.now) and flight.wire.written == []
+
+
+@BOTH
 def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
     flight = Flight(personality)
     flight.engage()

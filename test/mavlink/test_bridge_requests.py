@@ -123,6 +123,16 @@ def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, n
     assert flight.kinds(40) == {'none'}
 
 
+def test_a_request_ends_with_the_permission_and_its_reason():
+    flight = Flight()
+    flight.fly(1.5)
+    request = flight.bridge.requests.offboard(True, flight.now)
+    flight.fly(0.5)
+    flight.autopilot.reboot(flight.now, 0.2)
+    flight.fly(0.5)
+    assert request.outcome == (False, 'offboard refused: disarmed')
+
+
 @pytest.mark.parametrize(('options', 'reported'), [
     ({'personality': 'arducopter', 'arming_denial': 'Compass not calibrated'},
      'failed: Arm: Compass not calibrated'),

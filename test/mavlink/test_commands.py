@@ -128,10 +128,25 @@ def test_what_is_sent_and_how_often():
         # What ends a flight is sent again though it was acknowledged.
         sent = play(goal, every(OFFBOARD, 3.4, *answers))[1]
         assert [count for _, _, count in sent] == [0, 1, 2, 3]
+    # What is accepted and not shown in time is replaced by the next mode.
+    sent = play(commands.hold, every(OFFBOARD, 3.8, ACCEPTED))[1]
+    assert [count for _, _, count in sent] == [0, 1, 2, 3, 0]
     assert play(climb, [(0.0, HOLD)])[1] == [(0.0, TAKEOFF, 0)] and climb(PX4).params[6] == 490.0
     sent = play(climb, [(0.0, STABILIZE, ACCEPTED), (0.5, GUIDED), (0.6, GUIDED)],
                 dialect=ARDUPILOT)[1]
     assert sent == [(0.0, SET_MODE, 0), (0.6, TAKEOFF, 0)]
+
+
+def test_what_was_shown_before_the_command_was_sent_does_not_count():
+    request = Request(PX4, commands.land(PX4), 0.0)
+    for now, shown, sent in ((0.0, -0.1, 0), (0.3, -0.1, None), (0.6, 0.5, None)):
+        assert request.outcome is None
+        assert request.step(Vehicle(shows('AUTO.LAND'), None, shown), streaming_for=0.0,
+                            texts=StatusTexts(), now=now) == sent
+    assert request.outcome.success
+    # Nor does a mode that a request under way is about to change.
+    hold = Request(PX4, commands.hold(PX4), 0.0, superseded=commands.offboard(PX4))
+    assert hold.step(Vehicle(HOLD), streaming_for=0.0, texts=StatusTexts(), now=0.0) == 0
 
 
 def test_acks_of_other_commands_are_not_taken():

@@ -14,6 +14,8 @@
 
 """Rates and pauses of what arrives, and asking again for what comes too seldom."""
 
+import re
+
 from bridge_flight import Flight
 from faulty_autopilot import Fault
 import numpy as np
@@ -101,3 +103,18 @@ def test_requests_that_are_lost_are_repeated():
            if arrivals.too_seldom(message_id, hertz, flight.now)}
     assert low == NEVER | {PX4.mode_message}  # which is sent at changes
     assert flight.ask('offboard', True).success
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('fault', 'reported'), [
+    # Below half of what was asked for; none at all has other causes than the link.
+    ({'message': 'LOCAL_POSITION_NED', 'share': 0.7},
+     r'LOCAL_POSITION_NED comes at 1[2-8] Hz of 50 asked for'),
+    ({'at': 6.5, 'duration': 0.6},
+     r'nothing came from the autopilot for 0.6[0-3] s in the last 5 s')])
+def test_a_slow_or_stalling_link_is_reported(fault, reported):
+    flight = Flight(faults=[Fault('drop', direction='sent', **{'at': 0.0, **fault})])
+    flight.fly(5.9)
+    assert flight.bridge.housekeeping.too_slow(flight.now) == ''
+    flight.fly(3.1)
+    assert re.fullmatch(reported, flight.bridge.housekeeping.too_slow(flight.now))

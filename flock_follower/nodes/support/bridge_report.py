@@ -93,7 +93,8 @@ class BridgeReport:
                 (ERROR, self._link_fault), (ERROR, bridge.housekeeping.unreceived),
                 (ERROR, self._ended),
                 (ERROR, self._forwarding_fault),
-                (WARN, self._estimate_fault), (WARN, bridge.gate.misaligned),
+                (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
+                (WARN, bridge.gate.misaligned),
                 (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
 
@@ -333,7 +334,8 @@ class BridgeReport:
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard
+        # ArduPilot takes off in its offboard mode.
+        unserved = status is not None and status.offboard and bridge.requests.pending is None
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
