@@ -185,14 +185,14 @@ class Request:
         self._superseded = superseded
         self._refused: list[str] = []
         self._next = goal if goal.before is not None else None
-        self._begin(goal.before or goal, now)
+        self._begin(goal.before or goal, now, '')
 
-    def _begin(self, goal: Goal, now: float) -> None:
+    def _begin(self, goal: Goal, now: float, mode: str) -> None:
         self.current = goal
         """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
         self._since = self._last_sent = now  # since the beginning, then since the first command
         self._attempts = 0
-        self._mode = ''  # the vehicle's at the beginning
+        self._mode = mode  # the vehicle's at the beginning
         self._result: int | None = None
         self._refused_at: float | None = None
 
@@ -227,11 +227,12 @@ class Request:
             return None
         waited = now - self._since
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._fail(self._refusal(texts), self.current.instead, now)
+            self._fail(self._refusal(texts), self.current.instead, vehicle, now)
         elif waited >= (CONFIRM_TIMEOUT if self._result is None else self.current.timeout):
             holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
             late = None if holds else self.current.too_late
-            self._fail(self._unconfirmed(vehicle, texts), late or self.current.instead, now)
+            instead = None if vehicle is None else self.current.instead  # it may have been reached
+            self._fail(self._unconfirmed(vehicle, texts), late or instead, vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
                 # An ACK of a mode command may answer an earlier one: it does not say. If it was
                 # this one's, the pilot may have left the mode between two HEARTBEATs: only what
@@ -263,18 +264,18 @@ class Request:
     def _reached(self, vehicle: Vehicle, now: float) -> None:
         if self._next is not None:
             goal, self._next = self._next, None
-            self._begin(goal, now)
+            self._begin(goal, now, vehicle.status.mode)
             return
         duration = f'after {now - self._since:.1f} s' if self._attempts else 'already'
         self._finish(True, f'{self.current.name}: {_status(vehicle)}, {duration}')
 
-    def _fail(self, why: str, instead: Goal | None, now: float) -> None:
+    def _fail(self, why: str, instead: Goal | None, vehicle: Vehicle | None, now: float) -> None:
         """Request something else after a refusal or in vain, or end."""
         if instead is None or self._result is None:
             self._finish(False, why)
             return
         self._refused.append(why)
-        self._begin(instead, now)
+        self._begin(instead, now, self._mode if vehicle is None else vehicle.status.mode)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""

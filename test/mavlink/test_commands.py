@@ -137,6 +137,20 @@ def test_what_is_sent_and_how_often():
     assert sent == [(0.0, SET_MODE, 0), (0.6, TAKEOFF, 0)]
 
 
+@pytest.mark.parametrize(('goal', 'script', 'modes', 'reason'), [
+    # Accepted, and perhaps reached: no other mode is requested of a vehicle that is not received.
+    (commands.hold, [(0.0, OFFBOARD, ACCEPTED), *((t, None) for t in (2.0, 3.6, 5.0))],
+     ['AUTO.LOITER', 'AUTO.LOITER'], 'hold not reached within 3.5 s: no HEARTBEAT comes'),
+    # A pilot has taken over meanwhile.
+    (climb, [(0.0, shows('AUTO.TAKEOFF'), ACCEPTED), (16.8, None), (16.9, None),
+             (18.0, shows('POSCTL')), (19.0, shows('POSCTL'))],
+     ['AUTO.LAND'], 'takeoff refused: the mode was changed to POSCTL meanwhile')])
+def test_no_mode_is_requested_against_what_was_not_received(goal, script, modes, reason):
+    request, sent = play(goal, script)
+    assert [request.current.modes[0] for _, command, _ in sent if command == SET_MODE] == modes
+    assert not request.outcome.success and request.outcome.message.endswith(reason)
+
+
 def test_what_was_shown_before_the_command_was_sent_does_not_count():
     request = Request(PX4, commands.land(PX4), 0.0)
     for now, shown, sent in ((0.0, -0.1, 0), (0.3, -0.1, None), (0.6, 0.5, None)):
