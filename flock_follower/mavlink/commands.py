@@ -160,12 +160,6 @@ def takeoff(dialect: Dialect, height: float, altitude: float, sea_level_altitude
         too_late=land(dialect))
 
 
-def result_text(result: int) -> str:
-    """Return a MAV_RESULT in words: 'temporarily rejected'."""
-    name = enum_name('MAV_RESULT', result) or f'result {result}'
-    return name.lower().replace('_', ' ')
-
-
 class Request:
     """
     One request to the autopilot, stepped until it has an ``outcome``.
@@ -299,8 +293,9 @@ class Request:
         modes = (*self.current.modes, '' if self.current.ends_flight else self._mode)
         reasons = '; '.join(texts.why(self._since, modes[0])) or (
             '' if self.current.instead else self._dialect.no_reason)
+        result = enum_name('MAV_RESULT', self._result) or f'result {self._result}'
         return ': '.join(filter(None, (
-            f'{self.current.name} refused', result_text(self._result or 0), reasons)))
+            f'{self.current.name} refused', result.lower().replace('_', ' '), reasons)))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         shown = 'no HEARTBEAT comes' if vehicle is None else _status(vehicle)

@@ -355,13 +355,13 @@ class Gate:
 
     def _known(self, now: float) -> KnownMotion:
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
-        yaw, time = odom.newest_yaw
+        yaw, time = odom.yaw()
         # Compared at the same time: at 1 rad/s odometry 0.25 s late would seem turned by 0.25 rad.
-        then, _ = autopilot.yaw(time) if math.isfinite(time) else autopilot.newest_yaw
+        then, _ = autopilot.yaw(time)
         return known_motion(
             self.limits, Motion(odom.velocity, now - odom.velocity_time, yaw, now - time),
             Motion(autopilot.velocity, now - autopilot.velocity_time, then,
-                   now - autopilot.newest_yaw[1]),
+                   now - autopilot.yaw()[1]),
             source=self._source(), disagreeing_for=self._comparison.disagreeing_for(now),
             distrusted_for=now - self._distrusted_since)
 
@@ -391,7 +391,7 @@ class Gate:
             self._held = self._held._replace(height=held_height)
             return
         # The autopilot's own yaw first: it is the one that will obey.
-        yaws = [self._sources[source].newest_yaw for source in (AUTOPILOT, ODOM)]
+        yaws = [self._sources[source].yaw() for source in (AUTOPILOT, ODOM)]
         fresh = [yaw for yaw, time in yaws if now - time <= self.limits.odom_timeout]
         self._last_yaw = fresh[0] if fresh else self._last_yaw
         self._held = Held(self._last_yaw, height)

@@ -110,42 +110,6 @@ class Failure(NamedTuple):
     """MAV_SEVERITY."""
 
 
-class ArmingChecks:
-    """The newest report of the arming checks of PX4."""
-
-    def __init__(self) -> None:
-        self._failures: tuple[Failure, ...] = ()
-        self._coming: list[Failure] | None = None
-
-    def take(self, message: Any) -> str:
-        """Take an EVENT; return its text if it has one by itself, or ''."""
-        name = _BY_NUMBER.get(message.number % 2**24, '')
-        level, arguments = message.log_levels & 0xF, bytes(message.arguments)
-        if name == _BEGIN:
-            self._coming = []
-        elif name == _END:
-            if self._coming is not None:
-                self._failures = tuple(self._coming)
-            self._coming = None
-        elif name in _ENTERS:
-            return f'failsafe: action {arguments[4]} of PX4'
-        elif name.startswith('commander_'):
-            return _TEXTS[name]
-        elif self._coming is not None and len(self._coming) < MOST_FAILURES:
-            self._coming.append(Failure(_TEXTS.get(name, f'event {message.number % 2**24}'),
-                                        int.from_bytes(arguments[:4], 'little'), level))
-        return ''
-
-    def against(self, mode: str) -> list[str]:
-        """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
-        return [failure.text for failure in self._failures
-                if mode in _MODES and failure.modes >> _MODES[mode] & 1
-                # For every mode come remarks, too, that keep it from nothing,
-                and (failure.modes != _EVERY_MODE or failure.level < _WARNING
-                     # and this one, which keeps it from the pilot's.
-                     or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
-
-
 #: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
@@ -166,10 +130,11 @@ class AutopilotText(NamedTuple):
 
 
 class StatusTexts:
-    """The recent texts; ``add`` takes messages, ``since`` and ``new`` return texts."""
+    """The recent texts, and the newest report of the arming checks of PX4."""
 
     def __init__(self) -> None:
-        self.checks = ArmingChecks()
+        self._failures: tuple[Failure, ...] = ()
+        self._coming: list[Failure] | None = None
         self._has_texts = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
@@ -190,10 +155,29 @@ class StatusTexts:
 
     def add_event(self, message: Any, now: float) -> None:
         """Take an EVENT; its text is used only if no STATUSTEXTs come."""
-        text = self.checks.take(message)
+        text = self._check(message)
         if text and not self._has_texts:
             self._begun = AutopilotText(now, message.log_levels & 0xF, text)
             self._end()
+
+    def _check(self, message: Any) -> str:
+        """Take an EVENT; return its text if it has one by itself, or ''."""
+        name = _BY_NUMBER.get(message.number % 2**24, '')
+        level, arguments = message.log_levels & 0xF, bytes(message.arguments)
+        if name == _BEGIN:
+            self._coming = []
+        elif name == _END:
+            if self._coming is not None:
+                self._failures = tuple(self._coming)
+            self._coming = None
+        elif name in _ENTERS:
+            return f'failsafe: action {arguments[4]} of PX4'
+        elif name.startswith('commander_'):
+            return _TEXTS[name]
+        elif self._coming is not None and len(self._coming) < MOST_FAILURES:
+            self._coming.append(Failure(_TEXTS.get(name, f'event {message.number % 2**24}'),
+                                        int.from_bytes(arguments[:4], 'little'), level))
+        return ''
 
     def _end(self) -> None:
         """Take the text that has begun as it is."""
@@ -204,20 +188,30 @@ class StatusTexts:
             self._new.append(whole)
         self._begun = None
 
+    def against(self, mode: str) -> list[str]:
+        """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
+        return [failure.text for failure in self._failures
+                if mode in _MODES and failure.modes >> _MODES[mode] & 1
+                # For every mode come remarks, too, that keep it from nothing,
+                and (failure.modes != _EVERY_MODE or failure.level < _WARNING
+                     # and this one, which keeps it from the pilot's.
+                     or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
+
     def why(self, time: float, mode: str) -> list[str]:
         """Return the texts since ``time``, and the newest failed checks for a mode."""
-        return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
+        return list(dict.fromkeys([*self.since(time), *self.against(mode)]))
 
     def unready(self, now: float, mode: str) -> str:
         """Return recent texts and the newest failed checks against arming in a mode, or ''."""
         reported = [text.text.partition(PREARM)[2] for text in list(self._texts)
                     if PREARM in text.text and now - text.time <= PREARM_PERIOD]
-        return '; '.join(dict.fromkeys([*reported, *self.checks.against(mode)]))
+        return '; '.join(dict.fromkeys([*reported, *self.against(mode)]))
 
-    def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
-        """Return the distinct texts from ``time`` on, of the given severity or worse."""
+    def since(self, time: float) -> list[str]:
+        """Return the distinct texts from ``time`` on that are more than information."""
         return list(dict.fromkeys(
-            text for t, severity, text in self._texts if t >= time and severity <= worst))
+            text for t, severity, text in self._texts
+            if t >= time and severity < mavlink.MAV_SEVERITY_INFO))
 
     def new(self, now: float) -> list[AutopilotText]:
         """Return the texts since the last call; one without its end after CHUNK_TIMEOUT."""

@@ -127,7 +127,8 @@ def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: st
     first, velocity, other = (odom, by_odom, by_autopilot) if source == ODOM else (
         autopilot, by_autopilot, by_odom)
     braking, contradiction = velocity or other, ''
-    turned = yaw_difference(odom.fresh_yaw(limits), autopilot.fresh_yaw(limits))
+    yaw, own = odom.fresh_yaw(limits), autopilot.fresh_yaw(limits)
+    turned = None if yaw is None or own is None else wrap_angle(yaw - own)
     if turned is not None and abs(turned) > limits.yaw_disagreement:
         # The frames are turned against one another: braking would accelerate. The autopilot's own
         # frame is the one in which it obeys.
@@ -146,11 +147,6 @@ def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: st
     unusable = disagreeing_for > LOSS_TIMEOUT or distrusted_for > LOSS_TIMEOUT
     return KnownMotion(source, velocity, math.isinf(first.velocity_age), braking, contradiction,
                        braking is None and (lost or unusable), turned, difference)
-
-
-def yaw_difference(yaw: float | None, other: float | None) -> float | None:
-    """Return a yaw minus another one, rad; None if one is None."""
-    return None if yaw is None or other is None else wrap_angle(yaw - other)
 
 
 def fresh(age: float, timeout: float) -> bool:
@@ -321,18 +317,13 @@ class Source:
             while time - self.yaws[0][0] > YAW_MEMORY:
                 self.yaws.popleft()
 
-    def yaw(self, time: float) -> tuple[float, float]:
-        """Return the yaw nearest to a time, rad, and the time at which it was so."""
-        if not self.yaws:
+    def yaw(self, time: float = math.inf) -> tuple[float, float]:
+        """Return the yaw nearest to a time, rad, and the time at which it was so; the newest."""
+        yaws = tuple(self.yaws)  # a copy: diagnostics read it from another thread
+        if not yaws:
             return 0.0, -math.inf
-        # A copy: diagnostics read it from another thread.
-        near = min(tuple(self.yaws), key=lambda known: abs(known[0] - time))
-        return near[1], near[0]
-
-    @property
-    def newest_yaw(self) -> tuple[float, float]:
-        """Return the newest yaw, rad, and the time at which it was so."""
-        return self.yaw(math.inf) if not self.yaws else self.yaws[-1][::-1]
+        time = min(time, yaws[-1][0])
+        return min(reversed(yaws), key=lambda known: abs(known[0] - time))[::-1]
 
 
 def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,

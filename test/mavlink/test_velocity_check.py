@@ -221,13 +221,13 @@ def test_displacements_that_differ_beyond_their_deviations_are_reported(
 
 def test_the_yaw_nearest_to_a_time_is_returned_and_old_ones_are_forgotten():
     source = Source()
-    assert source.yaw(1.0) == (0.0, -math.inf)
+    assert source.yaw(1.0) == source.yaw() == (0.0, -math.inf)
     for step in range(31):
         source.take_yaw(0.1 * step, 0.1 * step)
     for refused, time in ((1.0, 2.95), (math.nan, 3.1)):  # out of order, not finite
         source.take_yaw(refused, time)
-    assert source.newest_yaw == pytest.approx((3.0, 3.0))
+    assert source.yaw() == pytest.approx((3.0, 3.0))
     assert source.yaw(2.52) == pytest.approx((2.5, 2.5))
     assert source.yaw(0.0) == pytest.approx((3.0 - YAW_MEMORY, 3.0 - YAW_MEMORY))
     source.take_yaw(3.0 + math.pi, 3.0)  # of the same time: the later report, wrapped
-    assert source.newest_yaw == pytest.approx((3.0 - math.pi, 3.0))
+    assert source.yaw() == pytest.approx((3.0 - math.pi, 3.0))

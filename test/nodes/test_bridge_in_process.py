@@ -238,7 +238,7 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
     known = bench.bridge.gate._sources['odom']
     bench.wait(lambda: known.velocity_time > 0.0)
     # Both the velocity and the yaw: lost odometry brakes no later for having been polled.
-    for age in (known.velocity_time, known.newest_yaw[1]):
+    for age in (known.velocity_time, known.yaw()[1]):
         assert age == pytest.approx(time.monotonic() - 0.15, abs=0.05)
 
 
