@@ -34,6 +34,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect, enum_name, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
+from flock_follower.ranges import first_reason
 
 #: How long to wait for HEARTBEAT (1 Hz) to show the result, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
@@ -212,20 +213,24 @@ class Request:
         if self.outcome is not None or (vehicle is not None and self._shown(vehicle, now)):
             return None
         if not self._attempts:
-            if streaming_for >= self.current.stream:
+            missing = first_reason(
+                (vehicle is None and not self.current.ends_flight, NOT_RECEIVED),
+                (streaming_for < self.current.stream,
+                 f'no setpoint stream has been running for {self.current.stream} s'))
+            if not missing:
                 self._since = now
                 return self._send(now)
             if now - self._since >= STREAM_TIMEOUT:
-                self._finish(False, f'{self.current.name}: no setpoint stream has been running '
-                                    f'for {self.current.stream} s')
+                self._finish(False, f'{self.current.name}: {missing}')
             return None
         waited = now - self._since
+        # Of a vehicle that is not received no other mode is requested: a pilot may have switched.
+        instead = None if vehicle is None else self.current.instead
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._fail(self._refusal(texts), self.current.instead, vehicle, now)
+            self._fail(self._refusal(texts), instead, vehicle, now)
         elif waited >= (CONFIRM_TIMEOUT if self._result is None else self.current.timeout):
             holds = vehicle is not None and vehicle.status.mode == self._dialect.hold
             late = None if holds else self.current.too_late
-            instead = None if vehicle is None else self.current.instead  # it may have been reached
             self._fail(self._unconfirmed(vehicle, texts), late or instead, vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
                 # An ACK of a mode command may answer an earlier one: it does not say. If it was

@@ -86,8 +86,9 @@ def every(status, seconds, *answers):
      (False, 'arm not reached within 3.5 s: HEARTBEAT shows AUTO.LOITER, disarmed')),
     (commands.hold, {}, every(OFFBOARD, 3.6),
      (False, 'hold: no answer to 4 commands: HEARTBEAT shows OFFBOARD, armed')),
-    (climb, {}, every(None, 3.6),
-     (False, 'takeoff: no answer to 4 commands: no HEARTBEAT comes')),
+    (commands.hold, {}, every(None, 3.6),
+     (False, 'hold: no answer to 4 commands: no HEARTBEAT comes')),
+    (climb, {}, every(None, 3.2), (False, 'takeoff: no HEARTBEAT from the autopilot')),
     (commands.hold, {}, every(OFFBOARD, 4.0, REJECTED), (False, '; '.join(
         f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND'))
         + f': {PX4.no_reason}')),
@@ -141,6 +142,8 @@ def test_what_is_sent_and_how_often():
     # Accepted, and perhaps reached: no other mode is requested of a vehicle that is not received.
     (commands.hold, [(0.0, OFFBOARD, ACCEPTED), *((t, None) for t in (2.0, 3.6, 5.0))],
      ['AUTO.LOITER', 'AUTO.LOITER'], 'hold not reached within 3.5 s: no HEARTBEAT comes'),
+    (commands.hold, [(0.0, OFFBOARD, REJECTED), (0.6, None), (1.2, None)],
+     ['AUTO.LOITER'], 'hold refused: temporarily rejected'),
     # A pilot has taken over meanwhile.
     (climb, [(0.0, shows('AUTO.TAKEOFF'), ACCEPTED), (16.8, None), (16.9, None),
              (18.0, shows('POSCTL')), (19.0, shows('POSCTL'))],

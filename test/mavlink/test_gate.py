@@ -130,6 +130,14 @@ def test_the_yaw_is_held_from_the_moment_braking_begins_once_it_is_obeyed(flown,
         assert decide(gate, now).yaw == pytest.approx(expected)
 
 
+def test_yaws_are_compared_at_the_time_of_the_odometry():
+    gate = Gate()
+    for now in np.arange(10.0, 10.5, 0.02):
+        gate.update_yaw('autopilot', now - 10.0, now)  # it turns at 1 rad/s
+    gate.update_yaw('odom', 0.23, 10.23)
+    assert gate.yaw_difference(10.48) == pytest.approx(0.0, abs=0.02)
+
+
 def test_a_height_that_ceases_hands_the_vehicle_over():
     gate = fresh_gate()
     for now in np.arange(10.0, 11.0, 0.05):
@@ -141,10 +149,12 @@ def test_a_height_that_ceases_hands_the_vehicle_over():
         assert gate.handover(now) == ('no height from the autopilot' if now > 14.5 else '')
 
 
-@pytest.mark.parametrize(('axis', 'fused', 'other'), [
-    (0, False, 'autopilot'), (2, True, 'barometer'),
-    (0, True, '')])  # an estimate that rests on the odometry proves nothing
-def test_displacements_that_differ_brake_and_hand_the_vehicle_over(axis, fused, other):
+@pytest.mark.parametrize(('axis', 'fused', 'distrusted', 'other'), [
+    (0, False, '', 'autopilot'), (2, True, '', 'barometer'),
+    # An estimate that rests on the odometry, or on nothing, proves nothing.
+    (0, True, '', ''), (0, False, 'rests on GPS, whose fix is lost', '')])
+def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
+        axis, fused, distrusted, other):
     gate = fresh_gate()
     gate.fused = fused
     for now in np.arange(10.0, 20.0, 0.05):
@@ -153,7 +163,7 @@ def test_displacements_that_differ_brake_and_hand_the_vehicle_over(axis, fused, 
         gate.update_position('autopilot', np.zeros(3), now)
         gate.update_height(2.0, now)
         gate.take_command(Command(FORWARD, 1.0), 0.0, now)
-        decision = decide(gate, now)
+        decision = decide(gate, now, distrusted=distrusted)
     assert (decision.kind == 'brake') == bool(other)
     assert other in decision.reason and other in gate.handover(now)
 
