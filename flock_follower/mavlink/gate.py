@@ -52,6 +52,7 @@ from flock_follower.mavlink.velocity_check import (
     Source,
     VELOCITIES_DISAGREE,
     VelocityComparison,
+    YAWS_DISAGREE,
 )
 from flock_follower.messages import Command, OdometryState, SANE
 from flock_follower.ranges import first_reason
@@ -230,18 +231,15 @@ class Gate:
 
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
-        what = self._known(now).contradiction
-        more = (f' by {self._comparison.difference:.2f} m/s, more than '
-                f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
+        known, turned = self._known(now), math.degrees(self.yaw_difference(now) or 0.0)
+        more = {
+            YAWS_DISAGREE: f' by {turned:.0f} deg: their frames are not aligned, commands would '
+                           'go the wrong way',
+            VELOCITIES_DISAGREE: f' by {self._comparison.difference:.2f} m/s, more than '
+                                 f'{self.limits.velocity_tolerance:.2f} m/s '
+                                 '(velocity_disagreement)'}
         # Displacements are compared in each cycle.
-        return f'{what}{more}' if what == VELOCITIES_DISAGREE else what or self._displaced
-
-    def misaligned(self, now: float) -> str:
-        """Return that the frames do not fit together, and what that would do, or ''."""
-        difference = self.yaw_difference(now) or 0.0
-        return '' if abs(difference) <= self.limits.yaw_disagreement else (
-            f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
-            'their frames are not aligned, commands would go the wrong way')
+        return known.contradiction + more.get(known.contradiction, '') or self._displaced
 
     @property
     def wind(self) -> float:

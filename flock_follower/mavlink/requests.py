@@ -201,7 +201,7 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self._status(now) is None:
             return NOT_RECEIVED
-        reasons = [gate.permission.taken_over(now), gate.misaligned(now), gate.contradiction(now)]
+        reasons = [gate.permission.taken_over(now), gate.contradiction(now)]
         if gate.speed(now) is None:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:

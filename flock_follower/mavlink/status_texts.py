@@ -171,7 +171,8 @@ class StatusTexts:
                 self._failures = tuple(self._coming)
             self._coming = None
         elif name in _ENTERS:
-            return f'failsafe: action {arguments[4]} of PX4'
+            action = arguments[4]
+            return f'failsafe: {_TEXTS.get(f"failsafe_action_{action}", f"action {action}")}'
         elif name.startswith('commander_'):
             return _TEXTS[name]
         elif self._coming is not None and len(self._coming) < MOST_FAILURES:

@@ -55,7 +55,7 @@ def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, r
 
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
     bridge = received('px4_refusals', 60.8)
-    assert bridge.texts.since(60.0) == ['failsafe: action 2 of PX4']
+    assert bridge.texts.since(60.0) == ['failsafe: Position']
     modes = [bridge.telemetry.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
     assert [b for a, b in zip(['', *modes], modes) if a != b] == [
@@ -113,7 +113,7 @@ def test_ardupilots_words_say_why():
      'arm refused: temporarily rejected: no valid position estimate; no global position (neither '
      'GPS nor an origin)'),
     (offboard(PX4), 'AUTO.LOITER', 60.6,
-     'offboard refused: temporarily rejected: failsafe: action 2 of PX4; no setpoint stream'),
+     'offboard refused: temporarily rejected: failsafe: Position; no setpoint stream'),
     (hold(PX4), 'OFFBOARD', 58.0,
      'hold refused: temporarily rejected; POSCTL refused: temporarily rejected: no transmitter; '
      'AUTO.LAND refused: temporarily rejected: PX4 sends the cause only to a ground station: look '

@@ -94,7 +94,7 @@ class BridgeReport:
                 (ERROR, self._ended),
                 (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
-                (WARN, bridge.gate.misaligned),
+                (WARN, bridge.gate.contradiction),
                 (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
 
