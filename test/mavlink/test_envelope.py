@@ -39,56 +39,48 @@ from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, Held
 from flock_follower.messages import Command
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
-STEP, CYCLE, SENSOR = 0.01, 5, 5  # 20 Hz each
+STEP, CYCLE = 0.01, 5  # 20 Hz
 NOISE = 0.09
 
 
 class FlownGate:
-    """A gate, and a vehicle with a lag of 0.25 s that obeys it; odometry may lie."""
+    """A gate, and a vehicle with a lag of 0.25 s that obeys it."""
 
-    def __init__(self, limits, height=3.0, thrust_error=0.0, climb_error=0.0, seed=0,
-                 noise=NOISE):
+    def __init__(self, limits, height=3.0, thrust_error=0.0):
         self.gate = Gate(limits, 'odom')
         self.gate.permit(Permission().requested(-1.0))
         self.gate.see(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
-        self.response, self.thrust_error = np.zeros(3), thrust_error
-        self.climb_error, self.now, self.steps = climb_error, 0.0, 0
-        self.rng, self.noise = np.random.default_rng(seed), noise
-        self.commander, self.setpoint, self.kinds = None, np.zeros(3), []
-        self.odometry = self.position.copy()
-        self.trace = []
+        self.response, self.error = np.zeros(3), np.array([0.0, 0.0, thrust_error])
+        self.commander, self.setpoint = None, None
+        self.kinds, self.trace, self.rng = [], [], np.random.default_rng(3)
         self.handed_over = math.inf
 
     def fly(self, seconds):
         for _ in range(round(seconds / STEP)):
-            self._step()
+            self._step(STEP * len(self.trace), len(self.trace))
         return np.array(self.trace)
 
-    def _step(self):
-        gate, now, error = self.gate, self.now, np.array([0.0, 0.0, self.climb_error])
-        if self.steps % 2 == 0:
-            gate.update_velocity('odom', self.velocity + error, 0.02, now)
-            gate.update_position('odom', self.odometry, now)
-        if self.steps % SENSOR == 0:
-            gate.update_height(self.position[2] + self.noise * self.rng.normal(), now)
-            if self.steps == 200 // SENSOR * SENSOR:
+    def _step(self, now, steps):
+        gate = self.gate
+        if steps % 2 == 0:
+            gate.update_velocity('odom', self.velocity, 0.02, now, position=self.position)
+        if steps % CYCLE == 0:
+            gate.update_height(self.position[2] + NOISE * self.rng.normal(), now)
+            if steps == 200:
                 gate.heights.refer(self.position[2], now)
-        if self.commander is not None and self.steps % 10 == 0:
-            gate.take_command(Command(self.commander(self), 0.0), 0.0, now)
-        if self.steps % CYCLE == 0:
-            setpoint, _ = gate.decide(now)
-            self.setpoint = setpoint.acceleration
-            self.kinds.append(setpoint.kind)
+            if self.commander is not None and steps % 10 == 0:
+                gate.take_command(Command(self.commander(self), 0.0), 0.0, now)
+            self.setpoint, _ = gate.decide(now)
+            self.kinds.append(self.setpoint.kind)
             if gate.handover(now):
                 self.handed_over = min(self.handed_over, now)
-        self.response = self.response + (self.setpoint - self.response) * STEP / 0.25
+        self.response = self.response + (
+            self.setpoint.acceleration - self.response) * STEP / 0.25
         self.velocity = self.velocity + STEP * (
-            self.response + np.array([0.0, 0.0, self.thrust_error]) - 0.1 * self.velocity)
+            self.response + self.error - 0.1 * self.velocity)
         self.position = self.position + STEP * self.velocity
-        self.odometry = self.odometry + STEP * (self.velocity + error)
-        self.now, self.steps = self.now + STEP, self.steps + 1
-        self.trace.append(self.position.copy())
+        self.trace.append(self.position)
 
 
 def push(*acceleration):
@@ -113,7 +105,7 @@ def test_a_commander_that_keeps_pushing_stays_inside_by_a_margin(
 
 @pytest.mark.parametrize('thrust_error', [-1.0, 0.0, 1.0])
 def test_braking_holds_the_height_though_the_thrust_is_wrong(thrust_error):
-    vehicle = FlownGate(GateLimits(), 3.0, thrust_error, seed=3)
+    vehicle = FlownGate(GateLimits(), 3.0, thrust_error)
     # A planner that closes the height itself, as ours does.
     integral = [0.0]
 
@@ -134,7 +126,7 @@ def test_a_thrust_that_cannot_be_offset_is_handed_over(thrust_error):
     vehicle = FlownGate(GateLimits(), 5.0, thrust_error)
     vehicle.fly(8.0)
     assert vehicle.handed_over < 8.0
-    assert 'hover thrust is wrong' in vehicle.gate.thrust_error(vehicle.now)
+    assert 'hover thrust is wrong' in vehicle.gate.thrust_error(8.0)
 
 
 @pytest.mark.parametrize(('place', 'reason'), [

@@ -309,7 +309,7 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
         assert part in found
     bench.receive()
     bench.odometry(yaw=0.0)
-    bench.wait(lambda: 'differ by' in bench.problems())
+    bench.wait(lambda: 'disagree by' in bench.problems())
     assert not bench.ask('offboard', True).success
     bench.node._stream.stop()
     # Neither does anything leave, nor does anything come.
