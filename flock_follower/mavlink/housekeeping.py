@@ -179,8 +179,7 @@ class Housekeeping:
         self._origin_sent = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._why_asked = -math.inf
         self._reboots = 0
-        self._was_alive = False
-        self._alive_since = math.inf
+        self._alive_since = math.inf  # s; infinite: it is not connected
         self._requested: dict[int, float] = {}  # when each message was requested last, s
 
     def take_timesync(self, message: Any, now: float) -> None:
@@ -196,14 +195,14 @@ class Housekeeping:
         """Send HEARTBEAT and due requests; ``alive``: whether the autopilot is connected."""
         if now - self._heartbeat_sent >= HEARTBEAT_PERIOD - 1e-3 and self._link.send_heartbeat():
             self._heartbeat_sent = now
+        if not alive:
+            self._alive_since = math.inf
+            return
         reboots = self._link.telemetry.reboots
-        if reboots != self._reboots or (alive and not self._was_alive):
+        if reboots != self._reboots or math.isinf(self._alive_since):
             self._reboots, self._alive_since = reboots, now
             self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._requested, self.parameters = {}, self._new_check()
-        self._was_alive = alive
-        if not alive:
-            return
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now
@@ -251,7 +250,7 @@ class Housekeeping:
 
     def too_slow(self, now: float) -> str:
         """Return that the estimate comes too seldom, or that the link stalls, or ''."""
-        if not self._was_alive or now - self._alive_since < RECENT + PERIOD:
+        if now - self._alive_since < RECENT + PERIOD:
             return ''  # the requested messages have not come for so long
         problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} asked for'
                     for name, rate in self.rates(now).items()
