@@ -232,8 +232,7 @@ class SimulatedFollower(Listener):
             return
         self._beat = now
         obeyed = self._status is not None and self._status.offboard
-        self._status = VehicleStatus(self._armed, self._mode, 'active',
-                                     self._mode == PX4.offboard)
+        self._status = VehicleStatus(self._armed, self._mode, self._mode == PX4.offboard)
         if obeyed and not self._status.offboard:
             self._asked = False
         self._follower.vehicle(to_nanoseconds(now), self._status, not on_ground)

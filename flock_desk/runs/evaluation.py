@@ -79,7 +79,7 @@ from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
 #: What the autopilot is taken to be while the bag was recorded.
-FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
+FLYING: Final = VehicleStatus(True, 'OFFBOARD', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
 IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')

@@ -298,9 +298,8 @@ class Request:
         modes = (*self.current.modes, '' if self.current.ends_flight else self._mode)
         reasons = '; '.join(texts.why(self._since, modes[0])) or (
             '' if self.current.instead else self._dialect.no_reason)
-        result = enum_name('MAV_RESULT', self._result) or f'result {self._result}'
-        return ': '.join(filter(None, (
-            f'{self.current.name} refused', result.lower().replace('_', ' '), reasons)))
+        result = enum_name('MAV_RESULT', self._result).lower().replace('_', ' ')
+        return ': '.join(filter(None, (f'{self.current.name} refused', result, reasons)))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         shown = 'no HEARTBEAT comes' if vehicle is None else _status(vehicle)

@@ -36,9 +36,9 @@ _MULTIROTORS: Final[frozenset[int]] = frozenset({
 
 
 def enum_name(enum: str, value: int | None) -> str:
-    """Return the name of a value of an enum of MAVLink, without the name of the enum, or ''."""
+    """Return the name of a value of an enum of MAVLink, without the name of the enum."""
     entry = mavlink.enums[enum].get(value)
-    return entry.name.removeprefix(f'{enum}_') if entry else ''
+    return entry.name.removeprefix(f'{enum}_') if entry else f'{enum} {value}'
 
 
 class VehicleStatus(NamedTuple):
@@ -46,8 +46,6 @@ class VehicleStatus(NamedTuple):
 
     armed: bool
     mode: str
-    system_status: str
-    """MAV_STATE in lower case: 'standby', 'active', 'critical' (in a failsafe) and so on."""
     offboard: bool
     """Whether the mode obeys our setpoints: OFFBOARD, GUIDED."""
 
@@ -154,7 +152,6 @@ class Dialect:
         mode = self.mode_name(heartbeat.custom_mode)
         return VehicleStatus(
             bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
-            (enum_name('MAV_STATE', heartbeat.system_status) or 'unknown').lower(),
             mode == self.offboard)
 
 
@@ -227,6 +224,5 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
 
 def describe(heartbeat: Any) -> str:
     """Return the firmware and vehicle type in a HEARTBEAT: 'ARDUPILOTMEGA FIXED_WING'."""
-    return ' '.join(
-        enum_name(enum, value) or f'{enum} {value}' for enum, value in (
-            ('MAV_AUTOPILOT', heartbeat.autopilot), ('MAV_TYPE', heartbeat.type)))
+    return ' '.join((enum_name('MAV_AUTOPILOT', heartbeat.autopilot),
+                     enum_name('MAV_TYPE', heartbeat.type)))

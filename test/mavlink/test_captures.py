@@ -119,7 +119,7 @@ def test_ardupilots_words_say_why():
      'AUTO.LAND refused: temporarily rejected: PX4 sends the cause only to a ground station: look '
      'there, or set announce_as_gcs')])
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
-    status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')
+    status = VehicleStatus(goal.name != 'arm', mode, mode == 'OFFBOARD')
     request, texts = Request(PX4, goal, since), StatusTexts()
     vehicle = Vehicle(status, None, since)
     now = since

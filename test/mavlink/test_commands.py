@@ -35,7 +35,7 @@ def arm(dialect, mode='', streaming=False):
 
 
 def shows(mode, armed=True):
-    return VehicleStatus(armed, mode, 'active', mode in ('OFFBOARD', 'GUIDED'))
+    return VehicleStatus(armed, mode, mode in ('OFFBOARD', 'GUIDED'))
 
 
 HOLD, OFFBOARD, DISARMED = shows('AUTO.LOITER'), shows('OFFBOARD'), shows('AUTO.LOITER', False)

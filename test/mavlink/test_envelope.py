@@ -38,7 +38,7 @@ from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, Held
 from flock_follower.messages import Command
 
-FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
+FLOWN = VehicleStatus(True, 'OFFBOARD', True)
 STEP, CYCLE = 0.01, 5  # 20 Hz
 NOISE = 0.09
 

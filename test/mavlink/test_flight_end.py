@@ -33,8 +33,8 @@ from flock_follower.mavlink.flight_end import (
     RETRY_PERIOD,
 )
 
-OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
-HELD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
+OURS = VehicleStatus(True, 'OFFBOARD', True)
+HELD = VehicleStatus(True, 'AUTO.LOITER', False)
 NEVER = -math.inf
 
 

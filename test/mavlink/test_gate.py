@@ -26,8 +26,8 @@ from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()
-FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
-NOT_FLOWN = VehicleStatus(True, 'POSCTL', 'active', False)
+FLOWN = VehicleStatus(True, 'OFFBOARD', True)
+NOT_FLOWN = VehicleStatus(True, 'POSCTL', False)
 
 
 def fly(gate, now, status=FLOWN):

@@ -26,7 +26,7 @@ from flock_follower.mavlink.permission import (
 from flock_follower.mavlink.setpoint_rules import NONE
 
 pytestmark = pytest.mark.slow
-OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
+OURS = VehicleStatus(True, 'OFFBOARD', True)
 
 
 def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):

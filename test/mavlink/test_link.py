@@ -58,7 +58,7 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
     bench = Bench()
     link = bench.link
     assert not link.send_heartbeat() and bench.beats('vehicle') == ['HEARTBEAT']
-    assert link.telemetry.status == (False, 'OFFBOARD', 'active', True)
+    assert link.telemetry.status == (False, 'OFFBOARD', True)
     assert link.send_heartbeat()
     answer = bench.written()
     assert (answer.type, answer.autopilot, answer.get_srcSystem(), answer.get_srcComponent()) == (

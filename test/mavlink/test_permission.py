@@ -31,10 +31,10 @@ from flock_follower.mavlink.permission import (
 )
 
 DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'fly.md'
-OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
+OURS = VehicleStatus(True, 'OFFBOARD', True)
 DISARMED = OURS._replace(armed=False)
-HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
-PILOT = VehicleStatus(True, 'POSCTL', 'active', False)
+HOLD = VehicleStatus(True, 'AUTO.LOITER', False)
+PILOT = VehicleStatus(True, 'POSCTL', False)
 # Events: the name of the transition, and its arguments.
 ASKED = 'requested', 1.0
 ENDED = 'ended', 'hold requested'
@@ -156,7 +156,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert after(ASKED, seen(HOLD, 1.5), seen(OURS, 20.0)).phase is Phase.ACTIVE
 
 
-STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
+STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
 EVENTS = [('requested', 1.0), ('blinded', 'no velocity'), ('failed', 'late'),
           LANDED, ENDED, REBOOTED, SECOND,

@@ -41,8 +41,8 @@ from flock_follower.messages import Command
 LIMITS = GateLimits(relative_flight=True)
 LOST = Motion((0.3, 0.0, 0.0), 9.0), Motion(), ODOM
 FORWARD = Command((0.6, 0.0, 0.0), 1.0, relative=True)
-OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active', True)
-MANUAL = VehicleStatus(True, 'POSCTL', 'active', False)
+OFFBOARD = VehicleStatus(True, 'OFFBOARD', True)
+MANUAL = VehicleStatus(True, 'POSCTL', False)
 
 
 def judge(limits=LIMITS, **changes):

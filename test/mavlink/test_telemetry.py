@@ -137,12 +137,12 @@ def test_heights_are_known_above_the_sea_and_the_local_origin():
 def test_current_mode_tells_the_mode_and_leaves_the_rest_to_heartbeat():
     assert received(mode_message('OFFBOARD')).status is None
     telemetry = received(heartbeat('OFFBOARD'), mode_message('POSCTL'))
-    assert telemetry.status == (True, 'POSCTL', 'active', False)
+    assert telemetry.status == (True, 'POSCTL', False)
     assert telemetry.shown_time(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1.0
     assert telemetry.shown_time(mavlink.MAV_CMD_DO_SET_MODE) == 2.0
     assert telemetry.silence(6.0) == 4.0  # it does not keep the link alive
     telemetry.update(heartbeat('OFFBOARD', base_mode=0), 4.0)
-    assert telemetry.status == (False, 'OFFBOARD', 'active', True) and telemetry.mode_time == 4.0
+    assert telemetry.status == (False, 'OFFBOARD', True) and telemetry.mode_time == 4.0
 
 
 # Position and attitude become one estimate, valid at one time.
