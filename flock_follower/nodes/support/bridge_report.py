@@ -38,6 +38,7 @@ from std_msgs.msg import String
 from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
@@ -55,6 +56,9 @@ STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has 
 PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
+FEW = 0.5  # share of the requested rate of the estimate below which the rate is reported
+PAUSE = 0.3  # s without any message that are reported: the largest age of a velocity for braking
+HEIGHTS_DIFFER = 1.0  # m between barometer and estimate that are reported
 #: Limits that planner and bridge are to have alike.
 LIMITS = ('a_max', 'v_max')
 
@@ -75,7 +79,9 @@ class BridgeReport:
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
         self._last_estimate = -math.inf
-        self._lines: tuple[str, ...] | None = None
+        self._lines: set[str] = set()  # that were logged
+        self._alive_since = self._start
+        self._estimate_rate: float = node.get_parameter('telemetry_rate').value
         self._bytes = (self._start, 0, 0)
         self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
@@ -90,12 +96,11 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, bridge.housekeeping.unreceived),
-                (ERROR, self._ended),
-                (ERROR, self._forwarding_fault),
-                (WARN, self._estimate_fault), (WARN, bridge.gate.misaligned),
-                (WARN, bridge.gate.thrust_error),
-                (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
+                (ERROR, self._link_fault), (ERROR, self._ended), (ERROR, self._forwarding_fault),
+                (WARN, self._estimate_fault), (WARN, self._too_slow),
+                (WARN, bridge.gate.misaligned), (WARN, bridge.gate.thrust_error),
+                (WARN, self._planner_differs), (WARN, self._heights_differ),
+                (WARN, self._battery_unknown)))]
 
     # From any thread.
 
@@ -207,12 +212,15 @@ class BridgeReport:
         while self._events:
             self._events.popleft()()
         result = self._bridge.housekeeping.parameters.result()
-        if result is not None and result.lines != self._lines:
-            self._lines = result.lines
-            for line in result.lines:
-                self._warn(f'parameter {line}')
-            if not result.lines:
-                self._info(f'{result.answered} parameters of the autopilot are as recommended')
+        # While some are unanswered, more lines may follow.
+        good = result is not None and not (result.differing or result.unanswered)
+        lines = () if result is None else (
+            (f'{result.answered} parameters of the autopilot are as recommended',) if good else
+            tuple(f'parameter {line}' for line in result.lines))
+        for line in lines:
+            if line not in self._lines:
+                (self._info if good else self._warn)(line)
+        self._lines |= {*lines}
         return None
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
@@ -275,7 +283,7 @@ class BridgeReport:
 
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
-            return ''
+            return self._bridge.housekeeping.unreceived(now)
         transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
@@ -297,14 +305,39 @@ class BridgeReport:
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
+    def _too_slow(self, now: float) -> str:
+        """Return that the estimate comes too seldom, or that the link stalls."""
+        arrivals = self._bridge.telemetry.arrivals
+        if not self._bridge.alive(now):
+            self._alive_since = now
+        if now - self._alive_since < 2.0 * estimator_health.RECENT:
+            return ''  # the messages requested cannot all have come yet
+        found = [f'{name} comes at {hertz:.0f} Hz of {self._estimate_rate:g} requested'
+                 for name, hertz in self._bridge.housekeeping.rates(now).items()
+                 if 0.0 < hertz < FEW * self._estimate_rate]  # none is another fault
+        if (pause := arrivals.longest_pause(now)) > PAUSE:
+            found.append(f'nothing came from the autopilot for {pause:.2f} s in the last '
+                         f'{estimator_health.RECENT:g} s')
+        return '; '.join(found)
+
     def _ended(self, now: float) -> str:
-        """Return the requests by which the bridge itself ends a flight, and their results."""
-        return '; '.join(
+        """Return the requests by which the bridge itself ends this flight, and their results."""
+        status = self._bridge.status(now)
+        return '' if status is not None and not status.armed else '; '.join(
             f'the bridge requests {request.goal.name}: {why}'
             + (f' ({request.outcome.message})' if request.outcome else '')
             for request, why in ((self._bridge.blind_landing, 'no valid velocity'),
                                  (self._bridge.handover, self._bridge.end.why))
             if request is not None and why)
+
+    def _heights_differ(self, now: float) -> str:
+        status, height = self._bridge.status(now), self._bridge.gate.heights.height(now)
+        estimate = self._bridge.telemetry.height_above_home(now)
+        if not (status and status.armed) or height is None or estimate is None or (
+                abs(height - estimate) <= HEIGHTS_DIFFER):
+            return ''
+        return (f'the autopilot estimates its height above home as {estimate:.1f} m, the '
+                f'barometer says {height:.1f} m')
 
     def _battery_unknown(self, now: float) -> str:
         status = self._bridge.status(now)
@@ -333,7 +366,7 @@ class BridgeReport:
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard
+        unserved = status is not None and status.offboard and not self._takes_off(now)
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
@@ -347,6 +380,19 @@ class BridgeReport:
         if setpoint.kind == LEVEL:
             return ERROR, f'only level setpoints: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
+
+    def _takes_off(self, now: float) -> bool:
+        """
+        Return whether a take-off explains an offboard mode that misses no setpoint.
+
+        ArduPilot takes off in GUIDED, and stays in GUIDED after the climb.
+        """
+        telemetry, newest = self._bridge.telemetry, self._bridge.requests.newest
+        if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:
+            return False
+        requested = newest is not None and newest.goal.command == TAKEOFF and (
+            newest.outcome is None or newest.outcome.success)
+        return requested or telemetry.flying(now) is False
 
     def _publisher_problem(self, now: float) -> Problem | None:
         reason = self._bridge.gate.permission.reason
