@@ -126,6 +126,7 @@ class OwnOdometry:
                  depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
         self._node, self._use, self._clock, self._placed = node, use, clock, ''
+        self._found = ''  # the frame of the velocity that was logged
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
         configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
@@ -149,6 +150,9 @@ class OwnOdometry:
         state = self.source.take(message, arrival - shift, shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
+        if self.source.twist.found != self._found:
+            self._found = self.source.twist.found
+            self._node.get_logger().info(f'velocity of odom: {self.source.twist.describe}')
         if state is not None:
             self._use(state, arrival - shift)
 
