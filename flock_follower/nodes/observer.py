@@ -188,14 +188,12 @@ class Observer(Node):
         seen.nodes = self._nodes()
         for topic, _ in self.get_topic_names_and_types():
             known = seen.topics.setdefault(topic, TopicSeen())
-            known.publishers = self._ends(self.get_publishers_info_by_topic(topic))
+            known.publishers = [
+                TopicEnd(f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
+                for info in self.get_publishers_info_by_topic(topic)
+                if info.node_name != self.get_name()]
             if not known.publishers:
                 del seen.topics[topic]
-
-    def _ends(self, infos: list[Any]) -> list[TopicEnd]:
-        return [TopicEnd(
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
-            for info in infos if info.node_name != self.get_name()]
 
 
 def processes() -> Iterator[tuple[str, dict[str, str]]]:

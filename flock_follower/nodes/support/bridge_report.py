@@ -120,7 +120,7 @@ class BridgeReport:
         if cycle.sent:
             self._events.append(lambda: shown.rate('stream').tick(now))
         if first is not None:
-            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+            self._events.append(lambda: shown.latency('latency').append(now - first.source_time))
         due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
         self._last = cycle
