@@ -79,6 +79,12 @@ class Reports:
                 if node not in self.nodes or self.nodes[node][0] <= since]
 
     @property
+    def vehicle_known(self) -> bool:
+        """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
+        return not self.bridge.startswith('NO_AUTOPILOT') and all(
+            self.value('mavlink_bridge', key) for key in ('armed', 'flying'))
+
+    @property
     def streams(self) -> bool:
         """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
         return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
@@ -142,7 +148,7 @@ class Flight:
                 self.lines.append(f'missing: {", ".join(missing)}: '
                                   'ros2 launch flock_follower follower.launch.py starts it')
                 self.code = 1
-        elif due != self._question and not reports.bridge.startswith('NO_AUTOPILOT'):
+        elif due != self._question and reports.vehicle_known:
             self._question = due
             if due in self._requested and not self._confirm:
                 self.lines.append(f'{due} is due again, but --yes requests each step only once')

@@ -170,7 +170,9 @@ def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None
 
 def test_a_missing_node_ends_it_and_without_the_autopilot_nothing_is_due() -> None:
     desk = Desk()
-    assert desk.report({'armed': '', 'flying': ''}, 'NO_AUTOPILOT: lost, ACTIVE before') == ''
+    assert desk.report(AIR, 'NO_AUTOPILOT: lost, ACTIVE before') == ''
+    for vehicle in ({'armed': '', 'flying': ''}, {**ARMED, 'flying': ''}):
+        assert desk.report(vehicle, HOVER) == ''  # the state is known before
     assert desk.press('a') == []
     flight = Flight(100.0)
     del desk.reports.nodes['planner']
