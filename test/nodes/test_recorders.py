@@ -145,6 +145,14 @@ def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
         return [n for path in (tmp_path / 'box').iterdir() for n in numbers(path)]
     wait_until(recorded, 10.0, 'a recording')
     assert box.problems() == ''
+    box.node._notes['parameters.yaml'] = 'v_max: 0.5'
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', full)
+        box.node._write()
+    assert box.problems() == told
+    box.node._retry = 0.0
+    box.node._write()
+    assert next((tmp_path / 'box').glob('*/parameters.yaml')).read_text() == 'v_max: 0.5'
     box.node._recording.close()
 
 
