@@ -57,6 +57,7 @@ from flock_follower.nodes.support.middleware import (
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import (
     FlockNode,
+    LONGEST_WAIT,
     never_block_output,
     run,
     spin,
@@ -107,6 +108,7 @@ class BlackBox(FlockNode):
         self._recording: FlightRecording | None = None
         # One thread takes, one writes, and the executor's notes: none needs a lock.
         self._notes: dict[str, str] = {}
+        self._last: dict[RecordedTopic, int] = {}
         self._taken: deque[TakenMessage] = deque()
         self._bytes_taken = self._bytes_written = 0
         self._fault, self._retry = '', 0.0
@@ -169,16 +171,17 @@ class BlackBox(FlockNode):
     def _note(self, _: dict[str, Any]) -> None:
         """Note the parameters flown as a file for ``evaluate``, and the neighbours beside them."""
         flown = {}
-        for name, node in self._nodes.items():
+        for name, node in zip(OURS, self._nodes.values()):
             if node.values is None:
                 continue
             own = {key: value for key, value in node.values.items() if value is not None}
-            if own.get('neighbors_file') or name.endswith('/relative_pose'):
-                path = Path(own.get('neighbors_file') or resource('config/neighbors.yaml'))
-                with suppress(OSError, UnicodeDecodeError):  # its node reports that, if it must
-                    self._notes['neighbors.yaml'] = path.read_text(encoding='utf-8')
-                    own['neighbors_file'] = 'neighbors.yaml'
-            flown[name.rsplit('/', 1)[-1]] = {'ros__parameters': own}
+            if own.get('neighbors_file') or name == 'relative_pose':
+                file = f'neighbors_of_{name}.yaml'
+                with suppress(OSError, ValueError):  # its node reports that, if it must
+                    path = Path(own.get('neighbors_file') or resource('config/neighbors.yaml'))
+                    self._notes[file] = path.read_text(encoding='utf-8')
+                    own['neighbors_file'] = file
+            flown[name] = {'ros__parameters': own}
         text = yaml.safe_dump(flown, default_flow_style=False, allow_unicode=True)
         self._notes[FLOWN] = f'# The parameters flown, as the nodes had them last.\n{text}'
 
@@ -214,7 +217,11 @@ class BlackBox(FlockNode):
                     self.diagnostics.reject('disk too slow')
                     continue
                 self._bytes_taken += len(data)
-                self._taken.append(TakenMessage(topic, self.arrival(info), data))
+                stamp, last = self.arrival(info), self._last.get(topic, 0)
+                if stamp < last < stamp + LONGEST_WAIT:  # else the clock was set
+                    stamp = last  # simulated time comes in steps
+                self._last[topic] = stamp
+                self._taken.append(TakenMessage(topic, stamp, data))
 
     def _write_on(self) -> None:
         """Write until the end, and finish the recording."""
@@ -240,7 +247,12 @@ class BlackBox(FlockNode):
             if self._recording is None:
                 self._recording = FlightRecording(self._folder, self._limits)
             while self._notes:
-                self._recording.note(*self._notes.popitem())
+                name, text = self._notes.popitem()
+                try:
+                    self._recording.note(name, text)
+                except OSError:
+                    self._notes.setdefault(name, text)  # unless there is a newer one
+                    raise
             self._recording.write(taken, now)
             self._fault = ''
             self.diagnostics.rate('written').tick(now)

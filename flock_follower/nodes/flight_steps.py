@@ -32,8 +32,8 @@ from typing import Final
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.
 DISCOVERY: Final[float] = 8.0
-#: Only reports received so long after an answer show for certain what it has changed, s.
-SETTLING: Final[float] = 1.5
+#: Only reports received so long after an answer show what it has changed, s.
+SETTLING: Final[float] = 0.2
 #: The state of a node whose last report is older, s, is shown as old.
 OLD: Final[float] = 1.5
 #: An older distance is not shown, s.
@@ -72,6 +72,17 @@ class Reports:
     def value(self, node: str, key: str) -> str:
         """Return a value of a node's diagnostics, or ''."""
         return self.nodes[node][1].get(key, '') if node in self.nodes else ''
+
+    def missing(self, since: float) -> list[str]:
+        """Return the nodes that have not reported after a time, s."""
+        return [node for node in NODES
+                if node not in self.nodes or self.nodes[node][0] <= since]
+
+    @property
+    def vehicle_known(self) -> bool:
+        """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
+        return not self.bridge.startswith('NO_AUTOPILOT') and all(
+            self.value('mavlink_bridge', key) for key in ('armed', 'flying'))
 
     @property
     def streams(self) -> bool:
@@ -115,7 +126,7 @@ class Flight:
         """The exit code, once the flight has ended."""
         self.lines: list[str] = []
         """Lines to print; the caller empties the list."""
-        self._start = self._answered = now  # s
+        self._answered = now  # of the last answer, s
         self._landing = False
         self._ending: int | None = None
         self._question: str | None = None
@@ -124,20 +135,20 @@ class Flight:
 
     def step(self, reports: Reports, now: float) -> list[str]:
         """Ask for the key of the step that is due, or request it; end after a landing."""
-        missing = [node for node in NODES if node not in reports.nodes]
-        if missing and now - self._start > DISCOVERY:
-            self.lines.append(f'missing: {", ".join(missing)}: '
-                              'ros2 launch flock_follower follower.launch.py starts it')
-            self.code = 1
-        if missing or self._pending or self._ending is not None or (
-                now - self._answered < SETTLING):
+        if self._pending or self._ending is not None:
             return []
-        due = reports.due()
+        due, missing = reports.due(), reports.missing(self._answered + SETTLING)
         if self._landing:
-            if reports.value('mavlink_bridge', 'armed') == 'False':
+            if 'mavlink_bridge' not in missing and (
+                    reports.value('mavlink_bridge', 'armed') == 'False'):
                 self.lines.append('landed and disarmed')
                 self.code = 0
-        elif due != self._question and not reports.bridge.startswith('NO_AUTOPILOT'):
+        elif missing:
+            if now - self._answered > DISCOVERY and not self._requested:
+                self.lines.append(f'missing: {", ".join(missing)}: '
+                                  'ros2 launch flock_follower follower.launch.py starts it')
+                self.code = 1
+        elif due != self._question and reports.vehicle_known:
             self._question = due
             if due in self._requested and not self._confirm:
                 self.lines.append(f'{due} is due again, but --yes requests each step only once')

@@ -96,6 +96,7 @@ UNNUMBERED = ('this middleware numbers no messages: that a second node commands 
               '/diagnostics, but does not brake')
 TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
+ENDED = Outcome(False, 'refused: the setpoint thread has ended or takes no more')
 
 
 class _Call:
@@ -114,9 +115,9 @@ class _Call:
             self.outcome = Outcome(False, internal_error(error))
             raise
 
-    def refuse(self) -> None:
-        """End the call, because the setpoint thread ends before its turn."""
-        self.outcome = STOPPING
+    def refuse(self, outcome: Outcome = STOPPING) -> None:
+        """End the call, because the setpoint thread ends before its turn, or takes no more."""
+        self.outcome = outcome
 
     def result(self) -> Outcome | None:
         """Return the outcome, None before."""
@@ -265,7 +266,7 @@ class MavlinkBridge(FlockNode):
         call = _Call()
         self._calls.append(call)
         if not self._stream.submit(lambda: call.begin(ask[name]), call.refuse):
-            call.refuse()
+            call.refuse(ENDED)
         self._answer_calls()
         response.success, response.message = await call.answer
         self.get_logger().info(f'{name}: {response.message}')

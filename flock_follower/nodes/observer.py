@@ -92,6 +92,7 @@ class Observer(Node):
         self._collector = Collector(self.seen, seconds)
         self._static = StaticChild(self)
         self._simulated: float | None = None
+        self._begin = time.monotonic() + DISCOVERY  # before, /clock may not be found
         self._subscribed: set[str] = set()
         self._remote: dict[str, RemoteParameters] = {}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
@@ -105,8 +106,7 @@ class Observer(Node):
         """
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        before, began = PROCESSORS.read_text(), time.monotonic()
-        end = began + DISCOVERY + self._seconds
+        before, end = PROCESSORS.read_text(), self._begin + self._seconds
         try:
             while rclpy.ok() and (now := time.monotonic()) < end:
                 executor.spin_once(timeout_sec=end - now)
@@ -114,7 +114,7 @@ class Observer(Node):
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():
             raise ExternalShutdownException
-        self.seen.duration = time.monotonic() - began
+        self.seen.duration = time.monotonic() - self._begin
         self.seen.machine = _machine(idle_share(before, PROCESSORS.read_text()))
         self._look_at_graph()
         self.seen.static_child = self._static.transform(self.seen.child_frame)
@@ -174,6 +174,8 @@ class Observer(Node):
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
 
     def _take(self, name: str, topic: str, message: Any, info: Any) -> None:
+        if time.monotonic() < self._begin:
+            return
         # The time of reception, not that of the callback: decoding an image takes a while.
         arrival = (self._simulated if self._simulated is not None
                    else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
@@ -188,14 +190,12 @@ class Observer(Node):
         seen.nodes = self._nodes()
         for topic, _ in self.get_topic_names_and_types():
             known = seen.topics.setdefault(topic, TopicSeen())
-            known.publishers = self._ends(self.get_publishers_info_by_topic(topic))
+            known.publishers = [
+                TopicEnd(f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
+                for info in self.get_publishers_info_by_topic(topic)
+                if info.node_name != self.get_name()]
             if not known.publishers:
                 del seen.topics[topic]
-
-    def _ends(self, infos: list[Any]) -> list[TopicEnd]:
-        return [TopicEnd(
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
-            for info in infos if info.node_name != self.get_name()]
 
 
 def processes() -> Iterator[tuple[str, dict[str, str]]]:

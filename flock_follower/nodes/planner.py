@@ -89,7 +89,7 @@ class Planner(FlockNode):
         configured = cameras(values)
         self._rpy = {camera.name: camera.rpy for camera in configured}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
-        self._decision = Decision(State.IDLE)
+        self._decision = Decision(State.IDLE, reason='not engaged')
         self._reported: tuple[State, bool] | None = None
         self._ticked = time.monotonic()
         self._even_clock = EvenClock(self)
@@ -98,7 +98,8 @@ class Planner(FlockNode):
         # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
         # accelerations before the states that they belong to.
         self._polls = [
-            self._poll_states(Odometry, MOTION_TOPIC, from_odometry, self._take_motion, 200),
+            self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
+                      required=False),
             self._own.poll,
             self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
                               from_acceleration, self._loop.take_acceleration, 100),
@@ -156,8 +157,11 @@ class Planner(FlockNode):
             state = state._replace(stamp=min(state.stamp, arrival))
         self._loop.take_odometry(state, arrival)
 
-    def _take_motion(self, state: OdometryState) -> None:
-        self._loop.take_odometry(state, self._even_clock.now())
+    def _take_motion(self, message: Odometry, arrival: int) -> None:
+        shift = self._even_clock.shift
+        if self._even_clock.fresh(MOTION_TOPIC, stamp_to_nanoseconds(message.header.stamp)):
+            state = from_odometry(message)
+            self._take_odom(state._replace(stamp=state.stamp - shift), arrival - shift)
 
     def _take_bridge(self, message: String) -> None:
         reported = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -275,7 +279,7 @@ class Planner(FlockNode):
 
     def _state_problem(self, now: float) -> Problem | None:
         decision = self._decision
-        if decision.reason in ('', 'not engaged') and not decision.warnings:
+        if decision.reason == 'not engaged':
             return None
         if decision.state is not State.TRACK:
             return WARN, f'{decision.state.value}: {decision.reason}'

@@ -217,8 +217,8 @@ class RelativePose(FlockNode):
         for name in sighting.estimates:
             self.diagnostics.rate(name).tick(now)
             if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
-                self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
-        self.diagnostics.latency('processing').add(seen.decoding + seen.perception)
+                self.diagnostics.latency('stamp_to_estimate').append(age / NANOSECONDS)
+        self.diagnostics.latency('processing').append(seen.decoding + seen.perception)
         if seen.usable:
             self._processed, camera.dropping_since = now, None
             self.diagnostics.rate('processed').tick(now)

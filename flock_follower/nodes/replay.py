@@ -42,6 +42,7 @@ from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
 from flock_follower.bags.live_line import bar, LiveLine
 from flock_follower.bags.schedule import NANOSECONDS, section, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
+from flock_follower.nodes.support.diagnostics import percentiles
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
@@ -129,7 +130,7 @@ class Replay(FlockNode):
             self._line.say(
                 f'replayed {self._sent.total()} messages of {len(self._outputs)} topics '
                 f'in {time.monotonic() - began:.1f} s, p99 '
-                f'{self._lateness.values("late")["late_p99_ms"]} ms late')
+                f'{percentiles("late", self._lateness)["late_p99_ms"]} ms late')
             return 0
         except BagError as error:
             self._line.end()
@@ -211,7 +212,7 @@ class Replay(FlockNode):
             self._publish_clock(self._timeline.position(now))
             tick = max(CLOCK_PERIOD / self._timeline.rate, SHORTEST_CLOCK_PERIOD)
             time.sleep(max(0.0, min(due, self._next_service, now + tick) - time.monotonic()))
-        self._lateness.add(now - due)
+        self._lateness.append(now - due)
         self._timeline.limit_lateness(stamp_ns, now, MAX_LATENESS)
 
     def _publish_clock(self, stamp_ns: int) -> None:

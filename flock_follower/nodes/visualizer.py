@@ -96,7 +96,8 @@ class Visualizer(FlockNode):
         self._report: dict[str, str] = {}
         """The planner's newest values on /diagnostics."""
         self._polls = [
-            self.poll(Odometry, 'odom', self._take_odom, best_effort()),
+            # Without a viewer nothing is taken, which is no silence.
+            self.poll(Odometry, 'odom', self._take_odom, best_effort(), sporadic=True),
             self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False),
             self.poll(Odometry, 'neighbors/heard', self._take_neighbor, best_effort(10),
                       required=False),

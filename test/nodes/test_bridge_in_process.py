@@ -34,6 +34,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
+from flock_follower.mavlink.commands import Outcome
+from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
@@ -269,7 +271,8 @@ def test_a_request_that_fails_inside_is_answered_and_the_stream_goes_on(make_ben
     assert bench.counters['internal error in the stream'] == 1
     assert 'no HEARTBEAT' in bench.ask('offboard').message  # the thread goes on
     bench.node._stream.stop()
-    assert not bench.ask('land').success
+    assert bench.ask('land').message == (
+        'refused: the setpoint thread has ended or takes no more')
 
 
 def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
@@ -320,18 +323,59 @@ def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
     assert 'autopilot lost on' in bench.problems(ahead=60.0)
 
 
+def test_a_slow_link_heights_that_differ_and_a_landing_by_the_bridge_are_reported(make_bench):
+    bench = make_bench()
+    bench.receive()
+    bench.wait(lambda: bench.bridge.telemetry.attitude and bench.problems())
+    assert 'comes at' not in bench.problems()
+    bench.bridge.housekeeping._alive_since = 0.0
+    bench.bridge.telemetry.height_above_home = lambda now: 5.0
+    bench.bridge.gate.heights.height = lambda now: 2.0
+    bench.bridge.blind_landing = SimpleNamespace(goal=SimpleNamespace(name='land'), outcome=None)
+    found = bench.problems(ahead=0.6)
+    for part in ('LOCAL_POSITION_NED comes at 0 Hz of 50 asked for',
+                 'nothing came from the autopilot for 0.',
+                 'height above home as 5.0 m, the barometer says 2.0 m',
+                 'the bridge requests land: no valid velocity'):
+        assert part in found
+    bench.beat(armed=False)
+    bench.wait(lambda: not bench.bridge.telemetry.status.armed)
+    assert 'the bridge requests' not in bench.problems()  # a second flight may begin
+
+
+def test_a_take_off_of_ardupilot_misses_no_setpoint(make_bench):
+    bench, warning = make_bench(), 'mavlink_bridge/offboard to request offboard'
+
+    def reported(landed: int) -> bool:
+        bench.send(mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 129, 4,
+            mavlink.MAV_STATE_ACTIVE, 3), mavlink.MAVLink_extended_sys_state_message(0, landed))
+        bench.wait(lambda: bench.bridge.telemetry.landed == landed)
+        return warning in bench.problems()
+    assert not reported(mavlink.MAV_LANDED_STATE_ON_GROUND)
+    assert reported(mavlink.MAV_LANDED_STATE_IN_AIR)
+    bench.bridge.requests.newest = SimpleNamespace(
+        goal=SimpleNamespace(command=mavlink.MAV_CMD_NAV_TAKEOFF, ends_flight=False),
+        outcome=Outcome(True, 'takeoff'))
+    assert not reported(mavlink.MAV_LANDED_STATE_IN_AIR)
+
+
 def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_reported(
         make_bench):
     bench = make_bench()
     line = 'COM_OF_LOSS_T = 1, recommended 0.5: why'
-    bench.bridge.housekeeping.parameters = SimpleNamespace(
-        result=lambda: SimpleNamespace(differing=1, answered=3, unanswered=0, lines=(line,)))
+    results = [CheckResult(0, 0, 3, ()), CheckResult(1, 1, 2, (line,)),
+               CheckResult(3, 2, 0, (line, 'COM_ARM = 0, recommended 1: why'))]
+    for result in results:  # one by one, over a slow line
+        bench.bridge.housekeeping.parameters = SimpleNamespace(result=lambda result=result: result)
+        bench.problems()
+    assert [text for text in bench.log if 'parameter' in text] == [
+        f'parameter {each}' for each in results[-1].lines]
     for values, said in (
             ({'v_max': 0.5, 'a_max': 2.5}, ''), ({'v_max': None}, ''),
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge')):
         bench.node._report.planner.values = values
         found = bench.problems()
         assert said in found and bool(said) == ('of the planner' in found)
-    assert bench.log.count(f'parameter {line}') == 1
-    assert bench.values['parameters'] == '1 of 3 differ, 0 unanswered'
+    assert bench.values['parameters'] == '2 of 3 differ, 0 unanswered'
     assert bench.values['parameter COM_OF_LOSS_T'] == '= 1, recommended 0.5: why'

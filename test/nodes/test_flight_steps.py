@@ -77,7 +77,7 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
         assert desk.press(others) == [] and desk.press(step[0]) == [step]
         assert desk.press(step[0]) == [] and desk.report(*before) == ''  # until it is answered
         desk.answer(step, False)
-        desk.flight.step(desk.reports, desk.now + 1.0)  # an old report does not ask again
+        desk.flight.step(desk.reports, desk.now + 9.0)  # an old report does not ask again
         assert desk.flight.lines == ['done'] and desk.press(step[0]) == []
         assert desk.report(*before) == f'{before[1]}: press {step[0]} for {step}'
         assert desk.press(step[0]) == [step]
@@ -107,6 +107,7 @@ def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight(
 @pytest.mark.parametrize(('connection', 'own'), [
     ('udpin:127.0.0.1:14540', True), ('udpout:localhost:14540', True), ('tcp:127.0.0.2:1', True),
     ('udpin:0.0.0.0:14540', False), ('/dev/ttyACM0:57600', False), ('udpin:drone:14540', False),
+    ('tcp:localhost.example.com:5760', False), ('udpin:127.0.0.1', False), ('', False),
     ('udpin:192.168.1.2:14540', False)])
 def test_only_an_address_of_this_machine_is_loopback(connection: str, own: bool) -> None:
     assert loopback(connection) is own
@@ -169,7 +170,9 @@ def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None
 
 def test_a_missing_node_ends_it_and_without_the_autopilot_nothing_is_due() -> None:
     desk = Desk()
-    assert desk.report({'armed': '', 'flying': ''}, 'NO_AUTOPILOT: lost, ACTIVE before') == ''
+    assert desk.report(AIR, 'NO_AUTOPILOT: lost, ACTIVE before') == ''
+    for vehicle in ({'armed': '', 'flying': ''}, {**ARMED, 'flying': ''}):
+        assert desk.report(vehicle, HOVER) == ''  # the state is known before
     assert desk.press('a') == []
     flight = Flight(100.0)
     del desk.reports.nodes['planner']

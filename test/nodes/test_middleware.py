@@ -112,14 +112,14 @@ def test_the_bridge_and_the_planner_run_without(module, monkeypatch):
 
 @pytest.mark.parametrize(('given', 'found'), [
     ({}, True), ({RANGE: 'SUBNET'}, True), ({RANGE: 'SYSTEM_DEFAULT'}, True),
-    ({'ROS_STATIC_False': '10.0.0.2'}, True),
+    ({'ROS_STATIC_PEERS': '10.0.0.2'}, True),
     ({RANGE: 'SUBNET', PROFILE: '/of/the/user.xml'}, True),
     ({PROFILE: OWN, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}, True),
     ({'ROS_LOCALHOST_ONLY': '0'}, True),
     ({RANGE: 'LOCALHOST'}, False), ({RANGE: 'localhost'}, False), ({RANGE: 'OFF'}, False),
     ({'ROS_LOCALHOST_ONLY': '1'}, False), ({PROFILE: OWN}, False),
-    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_False': '10.0.0.2'}, False),
-    ({RANGE: 'LOCALHOST', 'ROS_STATIC_False': '10.0.0.2'}, False)])
+    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, False),
+    ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, False)])
 def test_how_far_ros_reaches(given, found):
     assert open_to_network(given) == found
 

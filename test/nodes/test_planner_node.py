@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -209,6 +210,26 @@ def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig
     rig.word = 'READY'
     rig.run(0.1)
     assert rig.set(v_max=0.5, a_max=2.5, guard=False) == ''
+
+
+def test_the_frame_of_the_velocity_is_logged_when_it_is_found(rig: Rig) -> None:
+    lines: list[str] = []
+    rig.node.get_logger = lambda: SimpleNamespace(info=lines.append, warning=lines.append)
+    rig.node._own.source.twist.found = 'odom'
+    rig.run(0.2)
+    text = 'velocity of odom: child: odom by the positions'
+    assert lines == [text] and text in rig.problems()
+
+
+def test_the_motion_without_odometry_is_as_old_as_it_was_on_arrival(ros: None) -> None:
+    rig = Driven(Planner(parameter_overrides=overrides(require_bridge=False)))
+    for late in (60, 40):  # ms; both wait for the tick
+        now = rig.node.get_clock().now().nanoseconds
+        rig.give(MOTION_TOPIC, to_odometry(
+            nanoseconds_to_stamp(now - late * 10**6), RELATIVE, 'base_link', (0.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)), received=time.time_ns() - late * 10**6)
+    assert [*rig.node._loop._ages] == [pytest.approx(0.02, abs=0.01)]
+    rig.close()
 
 
 @pytest.mark.parametrize('step', [-5.0, 5.0])

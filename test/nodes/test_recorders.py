@@ -26,8 +26,9 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
-from driven import Driven, overrides
+from driven import Driven, overrides, START
 from full_disk import disk_of
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -144,6 +145,14 @@ def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(
         return [n for path in (tmp_path / 'box').iterdir() for n in numbers(path)]
     wait_until(recorded, 10.0, 'a recording')
     assert box.problems() == ''
+    box.node._notes['parameters.yaml'] = 'v_max: 0.5'
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', full)
+        box.node._write()
+    assert box.problems() == told
+    box.node._retry = 0.0
+    box.node._write()
+    assert next((tmp_path / 'box').glob('*/parameters.yaml')).read_text() == 'v_max: 0.5'
     box.node._recording.close()
 
 
@@ -187,6 +196,21 @@ def test_a_recording_holds_images_latched_states_and_the_parameters_flown(
     assert np.all(np.diff(stamps) >= 0)
     values = parameters_flown(path, TABLE)
     assert values is not None and values['planner']['v_max'] == 0.5
+
+
+def test_in_simulated_time_the_messages_of_a_topic_keep_their_order(
+        box: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
+    topic, _, kind, _ = box.node._inputs[0]
+    for clock, waited in ((START, 0), (START + 33_000_000, 40_000_000)):  # the clock has steps
+        monkeypatch.setattr(box.node, 'get_clock', lambda clock=clock: SimpleNamespace(
+            now=lambda: SimpleNamespace(nanoseconds=clock)))
+        waiting = [(b'', {'received_timestamp': time.time_ns() - waited})]
+        box.node._inputs = [(topic, SimpleNamespace(
+            take_message=lambda *_, waiting=waiting: waiting.pop() if waiting else None),
+            kind, bytes)]
+        box.node._take()
+    stamps = [message.stamp_ns for message in box.node._taken]
+    assert len(stamps) == 2 and stamps == sorted(stamps)
 
 
 def test_no_deadline_ends_a_process_that_finishes_its_files(

@@ -41,7 +41,7 @@ from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.support import runtime
-from flock_follower.nodes.support.diagnostics import ERROR, Latency, Rate, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, percentiles, Rate, WARN
 from flock_follower.nodes.support.inputs import best_effort
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.visualizer import Visualizer
@@ -66,24 +66,6 @@ def tested(ros: None) -> Iterator[Tested]:
     made = Tested()
     yield made
     made.close()
-
-
-@pytest.fixture
-def other(ros: None, tested: Tested) -> Iterator[Node]:
-    """Give another node, and have an executor for the tested one."""
-    node = Node('other')
-    tested.executor = SingleThreadedExecutor()
-    tested.executor.add_node(tested.node)
-
-    def until(condition: Callable[[], object], what: str) -> None:
-        def look() -> bool:
-            tested.executor.spin_once(timeout_sec=0.01)
-            return bool(condition())
-        wait_until(look, 20.0, what)
-    tested.until = until
-    yield node
-    tested.executor.shutdown()
-    node.destroy_node()
 
 
 def oops(*_: Any) -> None:
@@ -187,13 +169,13 @@ def test_the_silence_of_a_required_input_is_explained(
 
 
 def test_rates_are_means_over_the_window_and_latencies_percentiles_in_milliseconds() -> None:
-    rate, latency = Rate(window=5.0), Latency()
-    assert latency.values('x') == {}
+    rate = Rate()
     for i in range(101):
         rate.tick(i * 0.1)
-        latency.add(i * 1e-3)
     assert (rate.count, rate.hertz(10.0), rate.hertz(20.0)) == (101, pytest.approx(10.0), 0.0)
-    assert latency.values('x') == {'x_p50_ms': '50.0', 'x_p95_ms': '95.0', 'x_p99_ms': '99.0'}
+    assert percentiles('x', []) == {}
+    assert percentiles('x', [i * 1e-3 for i in range(101)]) == {
+        'x_p50_ms': '50.0', 'x_p95_ms': '95.0', 'x_p99_ms': '99.0'}
 
 
 @pytest.mark.parametrize('kind', [Planner, MavlinkBridge, RelativePose, SharingNode, Visualizer])
@@ -208,24 +190,31 @@ def test_no_timer_stops_if_the_system_clock_is_set_and_small_messages_have_a_siz
     node.destroy_node()
 
 
-def test_what_is_polled_comes_by_itself_while_it_is_awaited(tested: Tested, other: Node) -> None:
+def test_what_is_polled_comes_by_itself_while_it_is_awaited(tested: Tested) -> None:
+    other, executor = Node('other'), SingleThreadedExecutor()
+    executor.add_node(tested.node)
+
+    def until(condition: Callable[[], object], what: str) -> None:
+        wait_until(lambda: executor.spin_once(timeout_sec=0.01) or condition(), 20.0, what)
     taken, awaited = [], []
     publisher = other.create_publisher(Odometry, 'odom', 10)
     poll = tested.node.poll(Odometry, 'odom', lambda message, at: taken.append(
         (message.child_frame_id, tested.node.get_clock().now().nanoseconds - at)), TEN,
         awaited=lambda: bool(awaited))
-    tested.until(publisher.get_subscription_count, 'the subscription')
+    until(publisher.get_subscription_count, 'the subscription')
     publisher.publish(Odometry(child_frame_id='first'))
     begin = time.monotonic()
-    tested.until(lambda: time.monotonic() - begin > 0.3, 'time')
+    until(lambda: time.monotonic() - begin > 0.3, 'time')
     assert taken == []
     awaited.append('from now on')
-    tested.until(lambda: taken, 'the first')
+    until(lambda: taken, 'the first')
     assert taken[0][1] > 0.3e9  # since it arrived, though it came by a callback
     awaited.clear()
     publisher.publish(Odometry(child_frame_id='second'))
-    tested.until(lambda: poll() or len(taken) == 2, 'the second')
+    until(lambda: poll() or len(taken) == 2, 'the second')
     assert [child for child, _ in taken] == ['first', 'second']
+    executor.shutdown()
+    other.destroy_node()
 
 
 def test_a_parameter_callback_that_raises_refuses_the_change(tested: Tested) -> None:

@@ -22,8 +22,10 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from driven import Driven, overrides, START
 from hypothesis import given, strategies
+from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+from rclpy.node import Node
 from visualization_msgs.msg import Marker
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_to_matrix
@@ -129,6 +131,15 @@ def test_old_states_are_marked_and_forgotten_and_nothing_is_drawn_without_a_view
     rig.sent.clear()
     rig.node._tick()
     assert not rig.sent['visualizer/markers']
+
+
+def test_without_a_viewer_odometry_that_waits_is_no_silence(ros: None) -> None:
+    unseen, other = Driven(Visualizer()), Node('vio')
+    assert 'no /odom for 9 s: no publisher' in unseen.problems(ahead=9.0)
+    other.create_publisher(Odometry, 'odom', 1)
+    unseen.wait(lambda: unseen.problems(ahead=9.0) == '')
+    unseen.close()
+    other.destroy_node()
 
 
 @given(strategies.lists(strategies.floats(-1.0, 1.0), min_size=9, max_size=9))

@@ -38,6 +38,7 @@ from std_msgs.msg import String
 from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
@@ -55,6 +56,7 @@ STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has 
 PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
+HEIGHTS_DIFFER = 1.0  # m between barometer and estimate that are reported
 #: Limits that planner and bridge are to have alike.
 LIMITS = ('a_max', 'v_max')
 
@@ -75,7 +77,7 @@ class BridgeReport:
         self._announced = ('', -math.inf)
         self._armed: bool | None = None
         self._last_estimate = -math.inf
-        self._lines: tuple[str, ...] | None = None
+        self._lines: set[str] = set()  # that were logged
         self._bytes = (self._start, 0, 0)
         self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
@@ -90,13 +92,11 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, bridge.housekeeping.unreceived),
-                (ERROR, self._ended),
-                (ERROR, self._forwarding_fault),
+                (ERROR, self._link_fault), (ERROR, self._ended), (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
-                (WARN, bridge.gate.contradiction),
-                (WARN, bridge.gate.thrust_error),
-                (WARN, self._planner_differs), (WARN, self._battery_unknown)))]
+                (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
+                (WARN, self._planner_differs), (WARN, self._heights_differ),
+                (WARN, self._battery_unknown)))]
 
     # From any thread.
 
@@ -116,7 +116,7 @@ class BridgeReport:
         if cycle.sent:
             self._events.append(lambda: shown.rate('stream').tick(now))
         if first is not None:
-            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+            self._events.append(lambda: shown.latency('latency').append(now - first.source_time))
         due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
         self._last = cycle
@@ -208,12 +208,15 @@ class BridgeReport:
         while self._events:
             self._events.popleft()()
         result = self._bridge.housekeeping.parameters.result()
-        if result is not None and result.lines != self._lines:
-            self._lines = result.lines
-            for line in result.lines:
-                self._warn(f'parameter {line}')
-            if not result.lines:
-                self._info(f'{result.answered} parameters of the autopilot are as recommended')
+        # While some are unanswered, more lines may follow.
+        good = result is not None and not (result.differing or result.unanswered)
+        lines = () if result is None else (
+            (f'{result.answered} parameters of the autopilot are as recommended',) if good else
+            tuple(f'parameter {line}' for line in result.lines))
+        for line in lines:
+            if line not in self._lines:
+                (self._info if good else self._warn)(line)
+        self._lines |= {*lines}
         return None
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
@@ -276,7 +279,7 @@ class BridgeReport:
 
     def _link_fault(self, now: float) -> str:
         if self._bridge.alive(now):
-            return ''
+            return self._bridge.housekeeping.unreceived(now)
         transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
@@ -299,13 +302,23 @@ class BridgeReport:
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
     def _ended(self, now: float) -> str:
-        """Return the requests by which the bridge itself ends a flight, and their results."""
-        return '; '.join(
+        """Return the requests by which the bridge itself ends this flight, and their results."""
+        status = self._bridge.status(now)
+        return '' if status is not None and not status.armed else '; '.join(
             f'the bridge requests {request.goal.name}: {why}'
             + (f' ({request.outcome.message})' if request.outcome else '')
             for request, why in ((self._bridge.blind_landing, 'no valid velocity'),
                                  (self._bridge.handover, self._bridge.end.why))
             if request is not None and why)
+
+    def _heights_differ(self, now: float) -> str:
+        status, height = self._bridge.status(now), self._bridge.gate.heights.height(now)
+        estimate = self._bridge.telemetry.height_above_home(now)
+        if not (status and status.armed) or height is None or estimate is None or (
+                abs(height - estimate) <= HEIGHTS_DIFFER):
+            return ''
+        return (f'the autopilot estimates its height above home as {estimate:.1f} m, the '
+                f'barometer says {height:.1f} m')
 
     def _battery_unknown(self, now: float) -> str:
         status = self._bridge.status(now)
@@ -334,8 +347,7 @@ class BridgeReport:
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} is blocked')
         permission, status = bridge.gate.permission, bridge.status(now)
-        # ArduPilot takes off in its offboard mode.
-        unserved = status is not None and status.offboard and bridge.requests.pending is None
+        unserved = status is not None and status.offboard and not self._takes_off(now)
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
@@ -349,6 +361,19 @@ class BridgeReport:
         if setpoint.kind == LEVEL:
             return ERROR, f'only level setpoints: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
+
+    def _takes_off(self, now: float) -> bool:
+        """
+        Return whether a take-off explains an offboard mode that misses no setpoint.
+
+        ArduPilot takes off in GUIDED, and stays in GUIDED after the climb.
+        """
+        telemetry, newest = self._bridge.telemetry, self._bridge.requests.newest
+        if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:
+            return False
+        requested = newest is not None and newest.goal.command == TAKEOFF and (
+            newest.outcome is None or newest.outcome.success)
+        return requested or telemetry.flying(now) is False
 
     def _publisher_problem(self, now: float) -> Problem | None:
         reason = self._bridge.gate.permission.reason

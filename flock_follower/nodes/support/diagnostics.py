@@ -22,7 +22,7 @@ its clock or its inputs have stopped.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 import time
 import traceback
 from typing import Any, Final
@@ -38,6 +38,8 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
+WINDOW = 5.0  # s over which rates are means
+LATENCIES = 1000  # durations of which percentiles are shown
 SILENCE = 2.0  # s without a message of a required topic that is reported
 #: The clock of timers that setting the system clock must not stop.
 STEADY: Final = Clock(clock_type=ClockType.STEADY_TIME)
@@ -71,10 +73,9 @@ def listed(names: list[str]) -> str:
 
 
 class Rate:
-    """The rate of events over the last few seconds, and their number."""
+    """The rate of events within the last WINDOW, and their number."""
 
-    def __init__(self, window: float = 5.0) -> None:
-        self._window = window
+    def __init__(self) -> None:
         self._times: deque[float] = deque()
         self.count = 0
 
@@ -82,33 +83,21 @@ class Rate:
         """Record an event at ``now``, s on a monotonic clock."""
         self.count += 1
         self._times.append(now)
-        while now - self._times[0] > self._window:
+        while now - self._times[0] > WINDOW:
             self._times.popleft()
 
     def hertz(self, now: float) -> float:
         """Return the mean rate, Hz, over the window before ``now``."""
-        recent = [t for t in self._times if now - t <= self._window]
-        if len(recent) < 2 or now - recent[-1] > self._window / 2:
+        recent = [t for t in self._times if now - t <= WINDOW]
+        if len(recent) < 2 or now - recent[-1] > WINDOW / 2:
             return 0.0
         return (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)
 
 
-class Latency:
-    """Percentiles of the last 1,000 durations."""
-
-    def __init__(self) -> None:
-        self._samples: deque[float] = deque(maxlen=1000)
-
-    def add(self, seconds: float) -> None:
-        """Record a duration, s."""
-        self._samples.append(seconds)
-
-    def values(self, name: str) -> dict[str, str]:
-        """Return ``{name_p50_ms: ..., name_p95_ms: ..., name_p99_ms: ...}``, or nothing yet."""
-        if not self._samples:
-            return {}
-        points = np.percentile(np.asarray(self._samples) * 1e3, [50, 95, 99])
-        return {f'{name}_p{p}_ms': f'{v:.1f}' for p, v in zip((50, 95, 99), points)}
+def percentiles(name: str, durations: Collection[float]) -> dict[str, str]:
+    """Return ``{NAME_p50_ms: ..., NAME_p95_ms: ..., NAME_p99_ms: ...}`` of durations, s."""
+    points = np.percentile([*durations], [50, 95, 99]) if durations else ()
+    return {f'{name}_p{p}_ms': f'{1e3 * v:.1f}' for p, v in zip((50, 95, 99), points)}
 
 
 class Input:
@@ -170,7 +159,7 @@ class Diagnostics:
         self.sources: list[Callable[[float], Mapping[str, Any]]] = []
         self.counters: Counter[str] = Counter()
         self.rates: dict[str, Rate] = {}
-        self.latencies: dict[str, Latency] = {}
+        self.latencies: dict[str, deque[float]] = {}
         self.checks: list[Callable[[float], Problem | None]] = []
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
@@ -190,9 +179,9 @@ class Diagnostics:
         """Return the rate shown as ``NAME_hz``."""
         return self.rates.setdefault(f'{name}_hz', Rate())
 
-    def latency(self, name: str) -> Latency:
-        """Return the latency shown as ``NAME_p50_ms`` and so on."""
-        return self.latencies.setdefault(name, Latency())
+    def latency(self, name: str) -> deque[float]:
+        """Return the newest durations, s, that are shown as ``NAME_p50_ms`` and so on."""
+        return self.latencies.setdefault(name, deque(maxlen=LATENCIES))
 
     def reject(self, reason: str, detail: str = '') -> None:
         """Count something dropped under a short reason; log it at most once per 5 s."""
@@ -242,8 +231,8 @@ class Diagnostics:
         values = dict(self.values)
         for source in self.sources:
             values |= self._asked(source, now) or {}
-        for name, latency in self.latencies.items():
-            values |= latency.values(name)
+        for name, durations in self.latencies.items():
+            values |= percentiles(name, durations)
         values |= {name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()}
         return values | {f'rejected: {reason}': n for reason, n in self.counters.items()}
 

@@ -46,7 +46,7 @@ def best_effort(depth: int = 1) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class EvenClock:
+class EvenClock(ClockWatch):
     """
     The time of a node, which goes on evenly if the system clock is set.
 
@@ -55,22 +55,18 @@ class EvenClock:
     """
 
     def __init__(self, node: FlockNode) -> None:
-        self._node, self._watch = node, ClockWatch()
+        super().__init__()
+        self._node = node
         self.simulated = bool(node.get_parameter('use_sim_time').value)
-
-    @property
-    def shift(self) -> int:
-        """Return the time by which the system clock was set, ns."""
-        return self._watch.shift
 
     def now(self) -> int:
         """Return the time, ns; find a step of the system clock, and count it."""
         if self.simulated:
             return int(self._node.get_clock().now().nanoseconds)
         system, monotonic = self._node.read_clocks()
-        if step := self._watch.take(system, monotonic):
+        if step := self.take(system, monotonic):
             self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
-        return system - self._watch.shift
+        return system - self.shift
 
     def dated(self, stamp: int, arrival: int) -> int:
         """Return a stamp of a message, ns, on this clock, and no later than its arrival."""
@@ -78,7 +74,7 @@ class EvenClock:
 
     def fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
-        fresh = self.simulated or not self._watch.before_step(stamp)
+        fresh = self.simulated or not self.before_step(stamp)
         if not fresh:
             self._node.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
         return fresh
@@ -126,6 +122,7 @@ class OwnOdometry:
                  depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
         self._node, self._use, self._clock, self._placed = node, use, clock, ''
+        self._found = ''  # the frame of the velocity that was logged
         node.diagnostics.checks.append(self._problem)
         node.diagnostics.sources.append(self._values)
         configured = any(values['odom_child_position']) or any(values['odom_child_rpy'])
@@ -149,6 +146,9 @@ class OwnOdometry:
         state = self.source.take(message, arrival - shift, shift)
         for event in self.source.new_events():
             self._node.diagnostics.reject(*event)
+        if self.source.twist.found != self._found:
+            self._found = self.source.twist.found
+            self._node.get_logger().info(f'velocity of odom: {self.source.twist.describe}')
         if state is not None:
             self._use(state, arrival - shift)
 
