@@ -338,14 +338,14 @@ def _check_keys(where: str, entry: Any, keys: set[str],
                 optional: Collection[str] = frozenset()) -> None:
     if not isinstance(entry, Mapping):
         raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
-    for key in sorted(keys - set(entry)):
-        raise ValueError(f'{where} lacks {key}')
     unknown = sorted(map(str, set(entry) - keys - {*optional}))
     if unknown:
         known = sorted({*keys, *optional})
         near = difflib.get_close_matches(unknown[0], known, n=1)
         raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + (
             f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
+    for key in sorted(keys - set(entry)):
+        raise ValueError(f'{where} lacks {key}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:

@@ -90,6 +90,16 @@ def test_distance_has_no_bias(camera: CameraModel, conditions: dict[str, float])
     assert np.std(ratios) < 0.006
 
 
+def test_edges_in_a_shadow_count() -> None:
+    # Without them the attitude would rest on the lit half alone.
+    pose = facing((0.0, 0.0, 1.2), (0.02, 0.03, 0.0))
+    image = render(CAMERA, {3: pose}, black=10.0)
+    image[:, :round(CAMERA.project(pose.translation)[0, 0])] //= 5
+    found = fitted(image, pose)
+    assert found.inliers > 0.85
+    assert np.linalg.norm(error(found, pose)[3:]) < 0.05
+
+
 @pytest.mark.parametrize('axis', [0, 1])
 def test_white_that_swells_in_one_direction_does_not_move_the_pose(axis: int) -> None:
     # White that reaches 1 px further left and right, or up and down, and nowhere else.

@@ -30,6 +30,7 @@ from flock_follower.perception.overlay import (
     Color,
     ColorImage,
     STAGE_COLORS,
+    WHITE,
 )
 from flock_follower.perception.tracker import Sighting
 
@@ -46,7 +47,7 @@ def drawn(T_camera_marker: Transform, stage: str, model: str,
     image = np.zeros(shape, dtype=np.uint8)
     image.flags.writeable = False  # as images of messages are
     measurement = Measurement('leader', T_camera_marker @ TAIL.inverse(), TAIL.translation,
-                              np.eye(6), 0.1, None, stage)
+                              1e-4 * np.eye(6), 0.1, None, stage)
     canvas = annotate(image, make_camera(model), Sighting(
         measurements={'leader': measurement}, rejections=[('late', '')], other_ids=[7]), CONFIG)
     assert canvas.shape == (*shape, 3) and canvas.dtype == np.uint8 and not image.any()
@@ -70,6 +71,8 @@ def test_outline_and_axes_are_where_the_lens_puts_them(model: str, stage: str) -
     for axis, color in zip(np.eye(3), AXIS_COLORS):
         (pixel,) = camera.project((pose @ TAIL.inverse()).apply(0.45 * SIDE * axis))
         assert near(canvas, pixel, color)
+    for deviations in (0.02, 0.0, 0.0), (0.0, -0.02, 0.0):
+        assert near(canvas, camera.project(pose.translation + deviations)[0], WHITE)
 
 
 @pytest.mark.parametrize('position', [
