@@ -198,6 +198,8 @@ class Tracker:
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
+        look.camera.vain.update((name, stamp + look.camera.time_offset.applied)
+                                for name in look.near if name not in look.measured)
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))
         for measurement in (*look.measured.values(), *look.others):
             placed = self._placed(look, measurement)

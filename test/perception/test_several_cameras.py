@@ -144,6 +144,15 @@ def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
     assert (len(tracked), len(whole)) == (18, 0)  # in the images of the front camera
 
 
+def test_a_neighbour_covered_in_one_image_is_looked_for_there_now_and_then(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    drone, tracked = Drone(front=FRONT, left=LEFT), watched(monkeypatch, tracker_module, 'track')
+    for k in range(50):
+        drone.see('front', 0.02 * k, ahead(2.0, 0.75, 0.02 * k))
+        drone.see('left', 0.02 * k + 0.01)
+    assert len(tracked) - 50 == pytest.approx(1.0 / SEARCH_PERIOD, abs=2)
+
+
 def test_an_image_older_than_that_of_another_camera_is_not_used() -> None:
     drone = Drone(front=FRONT, left=LEFT)
     for k in range(5):
