@@ -240,13 +240,6 @@ class MarkedNeighbor:
     """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 
 
-class MarkerOf(NamedTuple):
-    """A marker and the neighbour that carries it."""
-
-    neighbor: MarkedNeighbor
-    marker: Marker
-
-
 @dataclass(frozen=True, eq=False)
 class NeighborConfig:
     """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
@@ -254,9 +247,9 @@ class NeighborConfig:
     dictionary: str
     neighbors: tuple[MarkedNeighbor, ...]
 
-    def by_marker(self) -> dict[int, MarkerOf]:
-        """Return the markers with their neighbours, by marker id."""
-        return {marker.marker_id: MarkerOf(neighbor, marker)
+    def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
+        """Return the neighbours with their markers, by marker id."""
+        return {marker.marker_id: (neighbor, marker)
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
 

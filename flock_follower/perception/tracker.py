@@ -42,6 +42,7 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
     Transform,
 )
+from flock_follower.messages import duplicate_name
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
@@ -362,7 +363,7 @@ class Tracker:
             sighting.rejections.append((outcome.value, name))
         if refused:
             if candidate is not None and candidate.confirmed:
-                sighting.duplicates[candidate.name(name)] = self._estimate(
+                sighting.duplicates[duplicate_name(name, candidate.number)] = self._estimate(
                     candidate.track, look, placed)
             return
         self._schedule.saw(name, camera, placed.time)

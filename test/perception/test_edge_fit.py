@@ -20,7 +20,16 @@ import math
 from typing import Any
 import warnings
 
-from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
+from marker_images import (
+    Cover,
+    DICTIONARY,
+    facing,
+    known,
+    make_camera,
+    marker_code,
+    render,
+    SIDE,
+)
 import numpy as np
 import pytest
 
@@ -66,9 +75,7 @@ def off(pose: Transform, seed: int) -> Transform:
 
 def fitted(image: GrayImage, start: Transform, camera: CameraModel = CAMERA,
            spacing: tuple[float, float] | None = None) -> EdgeFit:
-    found = fit(image, camera, MODEL, start, spacing)
-    assert found is not None
-    return found
+    return known(fit(image, camera, MODEL, start, spacing))
 
 
 @pytest.mark.parametrize(('camera', 'conditions'), [
