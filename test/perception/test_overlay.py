@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from marker_images import facing, make_camera, SIDE
+from marker_images import CONFIG, DICTIONARY, facing, make_camera, SIDE, TAIL
 import numpy as np
 import pytest
 
@@ -34,11 +34,8 @@ from flock_follower.perception.overlay import (
 )
 from flock_follower.perception.tracker import Sighting
 
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig('DICT_4X4_50', (
-    MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
-    MarkedNeighbor('other', (Marker(1, 0.1, TAIL),))))
+BOTH = NeighborConfig(DICTIONARY, (
+    *CONFIG.neighbors, MarkedNeighbor('other', (Marker(1, 0.1, TAIL),))))
 
 
 def drawn(T_camera_marker: Transform, stage: str, model: str,
@@ -49,7 +46,7 @@ def drawn(T_camera_marker: Transform, stage: str, model: str,
     measurement = Measurement('leader', T_camera_marker @ TAIL.inverse(), TAIL.translation,
                               1e-4 * np.eye(6), 0.1, None, stage)
     canvas = annotate(image, make_camera(model), Sighting(
-        measurements={'leader': measurement}, rejections=[('late', '')], other_ids=[7]), CONFIG)
+        measurements={'leader': measurement}, rejections=[('late', '')], other_ids=[7]), BOTH)
     assert canvas.shape == (*shape, 3) and canvas.dtype == np.uint8 and not image.any()
     return canvas
 
