@@ -75,8 +75,7 @@ def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
     ``position`` (3,), m, FLU; ``rpy`` roll, pitch, yaw, rad, of the camera *link*, whose x axis
     is the line of sight: zeros look straight ahead.
     """
-    roll, pitch, yaw = np.asarray(rpy, dtype=float)
-    link = quaternion_to_matrix(quaternion_from_rpy(roll, pitch, yaw))
+    link = quaternion_to_matrix(quaternion_from_rpy(*np.asarray(rpy, dtype=float)))
     return Transform(link @ R_FLU_OPTICAL, np.asarray(position, dtype=float))
 
 
@@ -100,8 +99,7 @@ class Tracker:
     The neighbours of one drone, seen by one camera or several.
 
     The tracker needs every odometry message, and each image once :meth:`missing` returns None for
-    its stamp. Cameras have names; a single camera has the name ''. All times of filters are by the
-    odometry's clock.
+    its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
 
     :param cameras: by name; of a single one its place on the body (optical) is enough.
     """
