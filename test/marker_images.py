@@ -17,34 +17,43 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception import markers
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
-    draw_marker,
     MarkedNeighbor,
     Marker,
-    marker_cells,
     NeighborConfig,
 )
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.tracker import Sighting, Tracker
 
+T = TypeVar('T')
 DICTIONARY = 'DICT_4X4_50'
 SIDE = 0.16  # m
+#: A marker's cells (n, n) by its id, border included, True where white.
+marker_code = partial(markers.marker_code, DICTIONARY)
 #: T_body_marker of a marker on the tail that faces backwards; x of the body is ahead.
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
 CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
+
+
+def known(value: T | None) -> T:
+    """Return a value that must not be None."""
+    assert value is not None
+    return value
 
 
 class Hovering:
@@ -96,7 +105,7 @@ def facing(position: tuple[float, float, float], turn: tuple[float, float, float
                      np.array(position))
 
 
-def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 0.6,
+def render(camera: CameraModel, shown: dict[int, Transform], *, blur: float = 0.6,
            noise: float = 2.0, motion: tuple[float, float] = (0.0, 0.0), black: float = 30.0,
            white: float = 200.0, rays: int = 5, gamma: float = 1.0, cover: Cover | None = None,
            codes: Mapping[int, Any] | None = None, seed: int = 0) -> GrayImage:
@@ -111,7 +120,7 @@ def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 
     rng = np.random.default_rng(seed)
     coarse = rng.normal(0.0, 25.0, (camera.height // 8 + 2, camera.width // 8 + 2))
     image = 0.5 * (black + white) + np.kron(coarse, np.ones((8, 8)))[:camera.height, :camera.width]
-    for marker_id, pose in markers.items():
+    for marker_id, pose in shown.items():
         code = (codes or {}).get(marker_id, marker_code(marker_id))
         _paint(image, camera, pose, code, cover, motion, black, white, rays)
     if blur:
@@ -122,18 +131,12 @@ def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def marker_code(marker_id: int) -> Any:
-    """Return a marker's cells (n, n), border included, True where white."""
-    return draw_marker(DICTIONARY, marker_id, marker_cells(DICTIONARY)) > 127
-
-
 def _paint(image: Array, camera: CameraModel, pose: Transform, code: Any, cover: Cover | None,
            motion: tuple[float, float], black: float, white: float, rays: int) -> None:
     code = np.pad(code, 1, constant_values=True)
     cells = len(code)
     half = 0.5 * SIDE * cells / (cells - 2)
-    outline = camera.project(pose.apply(
-        [[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]]))
+    outline = camera.project(pose.apply(marker_corners(2.0 * half)))
     x0, y0 = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 6, 0)
     x1, y1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 7,
                         (camera.width, camera.height))
@@ -170,6 +173,5 @@ def seen_corners(image: GrayImage, camera: CameraModel, side: float) -> Array:
     sought = target(MarkedNeighbor('leader', (marker,)), DICTIONARY)
     found = detect(image, DICTIONARY)
     assert list(found.ids) == [0]
-    measured = locate(image, camera, sought, 0, found.corners[0], PosePrior())
-    assert measured is not None
+    measured = known(locate(image, camera, sought, 0, found.corners[0], PosePrior()))
     return camera.project(measured.T_camera_body.apply(marker_corners(side)))

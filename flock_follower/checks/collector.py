@@ -142,7 +142,7 @@ class Collector:
         if seen.own is None:
             seen.own = read_own_motion(seen, self._odometry)
         seen.dictionary = config.dictionary
-        seen.marker_sides = {number: of.marker.side_length for number, of in markers.items()}
+        seen.marker_sides = {number: marker.side_length for number, (_, marker) in markers.items()}
         try:
             camera = camera_model(seen)
         except ValueError:
@@ -151,7 +151,7 @@ class Collector:
             found = everywhere(pixels, config.dictionary)
             if not markers.keys() & set(found.ids.tolist()):  # thoroughly, which takes longer
                 found = everywhere(pixels, config.dictionary,
-                                   [of.marker for of in markers.values()])
+                                   [marker for _, marker in markers.values()])
             picture.markers = _sides(found)
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):

@@ -16,7 +16,8 @@
 Decides which neighbours to look for in which camera's image, and how often to search whole images.
 
 With one camera, every neighbour is looked for in every image. With several, a neighbour that
-another camera has just seen is looked for only where it is expected inside, and without a search.
+another camera has just seen is looked for only where it is expected inside, and without a search;
+less often if it was not found there.
 Each of n cameras searches whole images n times less often, so that more cameras cost no more.
 """
 
@@ -36,7 +37,8 @@ from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.time_offset import MountedCamera
 
-#: Shortest time between two searches of whole images for a missing neighbour, s.
+#: Shortest time between two searches of whole images for a missing neighbour, s, and between two
+#: attempts to find a neighbour that another camera sees.
 SEARCH_PERIOD = 0.1
 #: Period of searches although no neighbour is missing, s: for further markers with a known id.
 SWEEP_PERIOD = 1.0
@@ -96,10 +98,12 @@ class CameraSchedule:
             age = time - seen if last is not camera else math.inf
             if -LATE < age < 0.0:
                 continue
-            expected = track.place(time)
-            if expected is not None and self.in_view(name, model, T_camera_odom @ expected):
+            expected, tracked = track.place(time), 0.0 <= age <= FRESH
+            covered = tracked and abs(time - camera.vain.get(name, -math.inf)) < SEARCH_PERIOD
+            if not covered and expected is not None and self.in_view(
+                    name, model, T_camera_odom @ expected):
                 sought.near.append(name)
-            if not 0.0 <= age <= FRESH:
+            if not tracked:
                 sought.anywhere.append(name)
         return sought
 

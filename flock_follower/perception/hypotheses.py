@@ -40,7 +40,7 @@ import math
 from typing import NamedTuple
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.messages import duplicate_name, MAX_JUMP
+from flock_follower.messages import MAX_JUMP
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import FilterParams
 
@@ -106,10 +106,6 @@ class Candidate:
     def seen(self) -> float:
         """Return when it was measured last, s."""
         return -math.inf if self.track.newest is None else self.track.newest.stamp
-
-    def name(self, neighbor: str) -> str:
-        """Return under which name it is known, given the neighbour's."""
-        return duplicate_name(neighbor, self.number)
 
     def distance(self, time: float, place: Array) -> float:
         """Return how far a place (3,), m, is from where it is expected, m."""

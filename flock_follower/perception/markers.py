@@ -240,13 +240,6 @@ class MarkedNeighbor:
     """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 
 
-class MarkerOf(NamedTuple):
-    """A marker and the neighbour that carries it."""
-
-    neighbor: MarkedNeighbor
-    marker: Marker
-
-
 @dataclass(frozen=True, eq=False)
 class NeighborConfig:
     """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
@@ -254,9 +247,9 @@ class NeighborConfig:
     dictionary: str
     neighbors: tuple[MarkedNeighbor, ...]
 
-    def by_marker(self) -> dict[int, MarkerOf]:
-        """Return the markers with their neighbours, by marker id."""
-        return {marker.marker_id: MarkerOf(neighbor, marker)
+    def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
+        """Return the neighbours with their markers, by marker id."""
+        return {marker.marker_id: (neighbor, marker)
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
 
@@ -338,14 +331,14 @@ def _check_keys(where: str, entry: Any, keys: set[str],
                 optional: Collection[str] = frozenset()) -> None:
     if not isinstance(entry, Mapping):
         raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
-    for key in sorted(keys - set(entry)):
-        raise ValueError(f'{where} lacks {key}')
     unknown = sorted(map(str, set(entry) - keys - {*optional}))
     if unknown:
         known = sorted({*keys, *optional})
         near = difflib.get_close_matches(unknown[0], known, n=1)
         raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + (
             f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
+    for key in sorted(keys - set(entry)):
+        raise ValueError(f'{where} lacks {key}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:

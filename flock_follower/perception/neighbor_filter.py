@@ -314,13 +314,13 @@ class NeighborFilter:
         noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
                                float(lever.dot(lever)))
         spread = float(along.dot(prior[POSITION, POSITION]).dot(along)) + noise
-        verdict = self._range_gate.judge(innovation, spread)
-        if not verdict.used:
+        factors = self._range_gate.judge(innovation, spread)
+        if factors is None:
             return UpdateOutcome.OUTLIER
-        prior = _widened(prior, _MOVING, verdict.prior)
+        prior = _widened(prior, _MOVING, factors[0])
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
-        whole = verdict.spread * (expected_spread + noise)
+        whole = factors[1] * (expected_spread + noise)
         gain = np.zeros(SIZE)
         for part in (POSITION, VELOCITY, ACCELERATION):
             gain[part] = float(along.dot(across[part])) / whole * along
@@ -331,8 +331,7 @@ class NeighborFilter:
         self.change, self._predicted, self._line = None, None, along
         self.newest = expected.corrected(innovation * gain, bounded_across(
             covariance, along, length, self.params.initial_speed))
-        return (UpdateOutcome.USED if verdict.prior == verdict.spread == 1.0
-                else UpdateOutcome.SURPRISING)
+        return UpdateOutcome.USED if factors == (1.0, 1.0) else UpdateOutcome.SURPRISING
 
     def _again(self, what: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""

@@ -25,6 +25,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import NeighborConfig
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import Sighting
 
 ColorImage = NDArray[np.uint8]
@@ -46,7 +47,8 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
     Return a copy of an image (H, W) uint8 as BGR (H, W, 3), with its sighting drawn over it.
 
     Of each measured neighbour: the outlines of its markers that face the camera, in the colour of
-    the stage of detection, and the axes of its body, x red, y green, z blue. The text on top lists
+    the stage of detection, the axes of its body, x red, y green, z blue, and the ellipse of two
+    standard deviations of the place that was measured, in white. The text on top lists
     distances, neighbours that are not seen, and rejections.
     """
     canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
@@ -65,6 +67,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
         for axis, color in zip(np.eye(3), AXIS_COLORS):
             tip = 0.5 * neighbor.markers[0].side_length * axis
             _line(canvas, camera.project(body.apply(np.array([np.zeros(3), tip]))), color)
+        _line(canvas, ellipse(camera, measurement), WHITE)
         lines.append(f'{neighbor.name}: {stage}, {np.linalg.norm(body.translation):.2f} m')
     lines += [f'{name}: the same marker again' for name in sighting.duplicates]
     lines += [f'other marker: {marker_id}' for marker_id in sighting.other_ids]
@@ -74,6 +77,17 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
             cv2.putText(canvas, text, (4, LINE * n), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color,
                         thickness, cv2.LINE_AA)
     return canvas
+
+
+def ellipse(camera: CameraModel, measurement: Measurement) -> Array:
+    """Return the pixels (25, 2) of two standard deviations of a place; NaN if out of view."""
+    pixels, by_point = camera.linearize(measurement.T_camera_body.apply(measurement.reference))
+    spread = by_point[0] @ measurement.covariance[:3, :3] @ by_point[0].T
+    values, axes = np.linalg.eigh(np.nan_to_num(spread))
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)[:, None]
+    circle = np.hstack([np.cos(angle), np.sin(angle)])
+    rim: Array = pixels + 2.0 * circle * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+    return rim
 
 
 def _line(canvas: ColorImage, pixels: Array, color: Color) -> None:

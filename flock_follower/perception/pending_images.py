@@ -15,12 +15,14 @@
 """
 Perception from messages to messages: calibrations, odometry, and the queue of images.
 
-An image is processed as soon as odometry has reached its stamp, or after ``max_wait``.
+An image is processed as soon as odometry has reached its stamp. It waits a little longer than
+recent images had to, and never longer than ``max_wait``.
 """
 
 from __future__ import annotations
 
 from bisect import insort
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -40,6 +42,9 @@ from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
+WAITS = 50  # images over which the wait for odometry is observed
+LONGER = 1.5  # times the longest of these waits, and
+MARGIN = 0.03  # s more: odometry is late by now
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -98,7 +103,7 @@ class Perceiver:
     ``now`` is seconds on any clock that runs evenly, the same for all calls. Cameras are called
     by their names, as in the tracker; the only one by ''.
 
-    :param max_wait: how long an image waits for odometry of its stamp, s.
+    :param max_wait: the longest time for which an image waits for odometry of its stamp, s.
     """
 
     def __init__(self, tracker: Tracker, *, max_wait: float) -> None:
@@ -106,6 +111,7 @@ class Perceiver:
         self.frame = ''
         self._choice = OdometryChoice()
         self._max_wait = max_wait
+        self._waits: deque[float] = deque(maxlen=WAITS)  # of images that odometry reached, s
         self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self._epoch: int | None = None
         self._pending: list[PendingImage] = []  # by stamp: one from the future blocks no other
@@ -113,7 +119,14 @@ class Perceiver:
     @property
     def overdue(self) -> float | None:
         """Return when a waiting image will not wait any longer, s, or None."""
-        return min((image.received + self._max_wait for image in self._pending), default=None)
+        return min((image.received + self._wait for image in self._pending), default=None)
+
+    @property
+    def _wait(self) -> float:
+        """Return how long an image waits for odometry now, s."""
+        if len(self._waits) < WAITS:
+            return self._max_wait
+        return min(LONGER * max(self._waits) + MARGIN, self._max_wait)
 
     def model(self, camera: str = '') -> CameraModel | None:
         """Return the calibration of a camera, where a usable one came."""
@@ -205,10 +218,16 @@ class Perceiver:
 
     def _ready(self, image: PendingImage, now: float) -> bool:
         """Return whether to process an image now: it waits for calibration and odometry."""
-        if now - image.received >= self._max_wait:
-            return True
-        return self._cameras[image.camera].model is not None and self.tracker.missing(
+        waited = now - image.received
+        reached = self._cameras[image.camera].model is not None and self.tracker.missing(
             image.stamp, camera=image.camera) not in (Missing.TOO_NEW, Missing.EMPTY)
+        if reached:
+            self._waits.append(waited)
+        elif waited < self._wait:
+            return False
+        else:
+            self._waits.clear()  # odometry may be later from now on: wait longer
+        return True
 
     def take_range(self, measured: RangeState) -> Rejection | None:
         """Take a range, or return why not; it is used by ``tracker.ranged``."""

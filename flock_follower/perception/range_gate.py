@@ -27,7 +27,6 @@ marker gives the true distance.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 #: chi^2 with 1 degree of freedom at a probability of 0.99: detours are frequent, ranges too.
 RANGE_GATE = 6.63
@@ -39,16 +38,6 @@ COUNTED = 200
 UNKNOWN_BIAS = 0.5
 #: Random walk of the bias, m/sqrt(s).
 WALK = 0.01
-
-
-class Verdict(NamedTuple):
-    """The treatment of a measured distance."""
-
-    used: bool
-    prior: float = 1.0
-    """Factor on the predicted variance."""
-    spread: float = 1.0
-    """Factor on the variance of the innovation after that: the noise is larger."""
 
 
 class RangeGate:
@@ -65,8 +54,13 @@ class RangeGate:
         self.outliers = 0.0
         """Share of recent distances that was refused."""
 
-    def judge(self, innovation: float, spread: float) -> Verdict:
-        """Judge a distance by its innovation, m, of variance ``spread``, m^2."""
+    def judge(self, innovation: float, spread: float) -> tuple[float, float] | None:
+        """
+        Judge a distance by its innovation, m, of variance ``spread``, m^2; None if it is refused.
+
+        Return the factor on the predicted variance, and the one on the variance of the innovation
+        after that: the noise is larger.
+        """
         doubt = innovation * innovation / (spread * RANGE_GATE)
         inside = doubt <= 1.0  # NaN is not
         enough = self._refused >= self._most - 1
@@ -75,13 +69,13 @@ class RangeGate:
         self.outliers += (refused - self.outliers) / self._judged
         if refused or not math.isfinite(doubt):
             self._refused += refused
-            return Verdict(False)
+            return None
         side = 0.0 if inside else math.copysign(1.0, innovation)
         again, self._before = side == self._before, side
         if inside:
             self._refused = 0
-            return Verdict(True)
-        return Verdict(True, prior=doubt) if again or enough else Verdict(True, spread=doubt)
+            return 1.0, 1.0
+        return (doubt, 1.0) if again or enough else (1.0, doubt)
 
 
 class RangeBias:
@@ -105,11 +99,11 @@ class RangeBias:
         :param noise: variance of their difference but for the bias, m^2.
         """
         prior, innovation = self.variance(stamp), excess - self.value
-        verdict = self.gate.judge(innovation, prior + noise)
-        if not verdict.used:
+        factors = self.gate.judge(innovation, prior + noise)
+        if factors is None:
             return
-        prior *= verdict.prior
-        gain = prior / (verdict.spread * (prior + noise))
+        prior *= factors[0]
+        gain = prior / (factors[1] * (prior + noise))
         # A larger assumed noise means a smaller gain: the bias is learnt more slowly.
         self.value += gain * innovation
         self._variance, self._stamp = (1.0 - gain) * prior, stamp

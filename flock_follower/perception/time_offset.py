@@ -197,6 +197,8 @@ class MountedCamera:
         self.time_offset.restart()
         self.searched = self.swept = -math.inf
         """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
+        self.vain: dict[str, float] = {}
+        """When a neighbour was last looked for without success, by the odometry's clock, s."""
         self.thorough = False
         """Whether the next search of a whole image is thorough."""
         self.unchecked = dict.fromkeys(names, 0)

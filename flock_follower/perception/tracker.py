@@ -42,6 +42,7 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
     Transform,
 )
+from flock_follower.messages import duplicate_name
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
@@ -74,8 +75,7 @@ def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
     ``position`` (3,), m, FLU; ``rpy`` roll, pitch, yaw, rad, of the camera *link*, whose x axis
     is the line of sight: zeros look straight ahead.
     """
-    roll, pitch, yaw = np.asarray(rpy, dtype=float)
-    link = quaternion_to_matrix(quaternion_from_rpy(roll, pitch, yaw))
+    link = quaternion_to_matrix(quaternion_from_rpy(*np.asarray(rpy, dtype=float)))
     return Transform(link @ R_FLU_OPTICAL, np.asarray(position, dtype=float))
 
 
@@ -99,8 +99,7 @@ class Tracker:
     The neighbours of one drone, seen by one camera or several.
 
     The tracker needs every odometry message, and each image once :meth:`missing` returns None for
-    its stamp. Cameras have names; a single camera has the name ''. All times of filters are by the
-    odometry's clock.
+    its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
 
     :param cameras: by name; of a single one its place on the body (optical) is enough.
     """
@@ -198,6 +197,8 @@ class Tracker:
         if self._schedule.sweep_due(look.camera, stamp):
             self._locate(search.everywhere(image, self.config.dictionary), 'full', image, look)
             look.camera.swept = stamp
+        look.camera.vain.update((name, stamp + look.camera.time_offset.applied)
+                                for name in look.near if name not in look.measured)
         look.sighting.other_ids = sorted(set(look.sighting.other_ids))
         for measurement in (*look.measured.values(), *look.others):
             placed = self._placed(look, measurement)
@@ -360,7 +361,7 @@ class Tracker:
             sighting.rejections.append((outcome.value, name))
         if refused:
             if candidate is not None and candidate.confirmed:
-                sighting.duplicates[candidate.name(name)] = self._estimate(
+                sighting.duplicates[duplicate_name(name, candidate.number)] = self._estimate(
                     candidate.track, look, placed)
             return
         self._schedule.saw(name, camera, placed.time)

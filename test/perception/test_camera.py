@@ -53,6 +53,14 @@ def test_undistortion_inverts_projection(model: str) -> None:
                                points[:, :2] / points[:, 2:], atol=1e-10)
 
 
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_jacobian_agrees_with_differences(model: str) -> None:
+    camera, points = make_camera(model), np.vstack([points_ahead(50), [[0.0, 0.0, 1.0]]])
+    numeric = np.stack([(camera.project(points + step) - camera.project(points - step)) / 2e-6
+                        for step in 1e-6 * np.eye(3)], axis=2)
+    np.testing.assert_allclose(camera.linearize(points)[1], numeric, atol=1e-4)
+
+
 def test_points_behind_the_camera_have_no_pixel() -> None:
     pixels = make_camera().project([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [0.1, 0.1, 1.0]])
     assert np.isnan(pixels[:2]).all()

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from marker_images import DICTIONARY
 import numpy as np
 import pytest
 
@@ -27,7 +28,6 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker
 from flock_follower.perception.print_model import cell_code, CellCode, shows_code
 
-DICTIONARY = 'DICT_4X4_50'
 DICTIONARIES = ('DICT_4X4_50', 'DICT_5X5_100', 'DICT_6X6_250', 'DICT_7X7_50',
                 'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_36h11')
 PX = 10  # per cell

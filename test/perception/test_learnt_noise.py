@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from marker_images import known
 import numpy as np
 import pytest
 
@@ -146,10 +147,8 @@ def test_a_track_that_begins_anew_does_not_keep_the_motion_that_was_learnt() -> 
         tracker.update(k / 30.0, Transform(translation=rng.normal(0.0, 0.001, 3)), np.zeros(3),
                        noise)
     tracker.update(20.0, Transform(), np.zeros(3), noise)
-    assert tracker.newest is not None and tracker.newest.velocity.tolist() == [0.0] * 3
-    first = tracker.predict(20.1)
+    assert known(tracker.newest).velocity.tolist() == [0.0] * 3
     fresh = NeighborFilter()
     fresh.update(20.0, Transform(), np.zeros(3), noise)
-    other = fresh.predict(20.1)
-    assert first is not None and other is not None
-    assert np.allclose(first.covariance[:9, :9], other.covariance[:9, :9])
+    first, other = (known(each.predict(20.1)).covariance[:9, :9] for each in (tracker, fresh))
+    assert np.allclose(first, other)

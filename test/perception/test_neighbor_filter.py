@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from marker_images import known
 import numpy as np
 import pytest
 
@@ -83,9 +84,7 @@ def tracked(seconds: float, noisy: bool = True,
 
 
 def now(tracker: NeighborFilter, t: float) -> Estimate:
-    estimate = tracker.predict(t)
-    assert estimate is not None
-    return estimate
+    return known(tracker.predict(t))
 
 
 def test_steady_flight_without_noise_is_found_exactly() -> None:

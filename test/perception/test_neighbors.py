@@ -113,7 +113,8 @@ def two(**changes: Any) -> dict[str, Any]:
     (document(position=[0.0, 0.0, 200.0]), r'in \[-5, 5\] m'),
     (document(rpy=[90.0, 0.0, -90.0]), r'rpy = .*in \[-6\.28319, 6\.28319\] rad'),
     (document(tag_position=[0.0, 0.0, 9.0]), 'tag_position = .*: must be three values'),
-    (document(sidelength=0.16), 'unknown key sidelength: did you mean side_length?'),
+    ({**document(), 'neighbors': [{'name': 'leader', 'marker': 0}]},
+     r'neighbors\[0\] has an unknown key marker: did you mean marker_id\?'),
     (document(role=['avoid']), r'role = \[.avoid.\]: must be one of'),
     (document(radius=-0.1), r'neighbors\[0\]\.radius = -0\.1: must be a number in \[0, 5\] m'),
 ])

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from marker_images import DICTIONARY, Hovering, SIDE, TAIL
+from marker_images import Hovering, TAIL
 import numpy as np
 import pytest
-from warped_marker import Shade, WarpedMarker
+from warped_marker import WarpedMarker
 
 from flock_follower.geometry import (
     Array,
@@ -51,7 +51,7 @@ class Flight:
     """What a hovering follower sees of the leader, image by image, after a few clear ones."""
 
     def __init__(self, show: Show, seed: int) -> None:
-        world = WarpedMarker(DICTIONARY, 0, SIDE, seed=seed)
+        world = WarpedMarker(seed)
         drone = Hovering(world.camera, camera_mounting([0.1, 0.0, 0.0], [0.0] * 3))
         self.sightings: list[Sighting] = []
         self.measured: list[tuple[Measurement, Transform]] = []
@@ -89,7 +89,7 @@ class Flight:
 def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
                                                                    gamma: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
-        shade = Shade(0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light)
+        shade = 0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light
         return world.image([pose], k, shade=shade, gamma=gamma)
 
     flight = Flight(show, seed=0)

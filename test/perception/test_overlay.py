@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from marker_images import facing, make_camera, SIDE
+from marker_images import CONFIG, DICTIONARY, facing, make_camera, SIDE, TAIL
 import numpy as np
 import pytest
 
@@ -30,14 +30,12 @@ from flock_follower.perception.overlay import (
     Color,
     ColorImage,
     STAGE_COLORS,
+    WHITE,
 )
 from flock_follower.perception.tracker import Sighting
 
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig('DICT_4X4_50', (
-    MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
-    MarkedNeighbor('other', (Marker(1, 0.1, TAIL),))))
+BOTH = NeighborConfig(DICTIONARY, (
+    *CONFIG.neighbors, MarkedNeighbor('other', (Marker(1, 0.1, TAIL),))))
 
 
 def drawn(T_camera_marker: Transform, stage: str, model: str,
@@ -46,9 +44,9 @@ def drawn(T_camera_marker: Transform, stage: str, model: str,
     image = np.zeros(shape, dtype=np.uint8)
     image.flags.writeable = False  # as images of messages are
     measurement = Measurement('leader', T_camera_marker @ TAIL.inverse(), TAIL.translation,
-                              np.eye(6), 0.1, None, stage)
+                              1e-4 * np.eye(6), 0.1, None, stage)
     canvas = annotate(image, make_camera(model), Sighting(
-        measurements={'leader': measurement}, rejections=[('late', '')], other_ids=[7]), CONFIG)
+        measurements={'leader': measurement}, rejections=[('late', '')], other_ids=[7]), BOTH)
     assert canvas.shape == (*shape, 3) and canvas.dtype == np.uint8 and not image.any()
     return canvas
 
@@ -70,6 +68,8 @@ def test_outline_and_axes_are_where_the_lens_puts_them(model: str, stage: str) -
     for axis, color in zip(np.eye(3), AXIS_COLORS):
         (pixel,) = camera.project((pose @ TAIL.inverse()).apply(0.45 * SIDE * axis))
         assert near(canvas, pixel, color)
+    for deviations in (0.02, 0.0, 0.0), (0.0, -0.02, 0.0):
+        assert near(canvas, camera.project(pose.translation + deviations)[0], WHITE)
 
 
 @pytest.mark.parametrize('position', [

@@ -32,6 +32,7 @@ from flock_follower.perception.pending_images import (
     NO_CAMERA,
     Perceiver,
     Processed,
+    WAITS,
 )
 from flock_follower.perception.tracker import camera_mounting, Tracker
 
@@ -96,6 +97,21 @@ def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time()
     assert 'leader' in near.sighting.estimates  # 25 ms are extrapolated
     assert [reason for reason, _ in far.sighting.rejections] == [Missing.TOO_NEW.value]
     assert not far.usable
+
+
+def test_images_wait_little_longer_than_odometry_was_late_of_late() -> None:
+    queue = Queue()
+    for k in range(WAITS):
+        stamp = 0.01 * k
+        queue.image(stamp, now=stamp)
+        queue.odometry(stamp)
+        assert len(queue.processed(stamp + 0.04)) == 1
+    for now, wait in (1.0, 0.09), (2.0, 0.3):  # odometry ends: it may come later from now on
+        queue.image(1.0, now)
+        assert queue.perceiver.overdue == pytest.approx(now + wait)
+        assert queue.processed(now + wait - 0.01) == []
+        (one,) = queue.processed(now + wait + 0.01)
+        assert not one.usable
 
 
 def test_an_image_from_the_future_holds_nobody_up_and_the_oldest_is_dropped_first() -> None:

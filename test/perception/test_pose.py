@@ -21,7 +21,16 @@ import warnings
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from marker_images import DICTIONARY, facing, make_camera, marker_code, render, SIDE, TAIL
+from marker_images import (
+    DICTIONARY,
+    facing,
+    known,
+    make_camera,
+    marker_code,
+    render,
+    SIDE,
+    TAIL,
+)
 import numpy as np
 import pytest
 
@@ -86,9 +95,7 @@ def mirrored(pose: Transform) -> Transform:
 
 def tracked(image: GrayImage, camera: CameraModel, sought: Target, expected: Transform,
             check: bool = False) -> Measurement:
-    found = track(image, camera, sought, PosePrior(expected), None, check)
-    assert found is not None
-    return found
+    return known(track(image, camera, sought, PosePrior(expected), None, check))
 
 
 # Tracking one marker
@@ -175,12 +182,10 @@ def test_the_wrong_branch_is_left_where_the_image_is_clear(
     assert np.linalg.norm(error(stuck, truth)[3:]) > 0.2  # a minimum of its own
     found = tracked(image, SMALL, LEADER, wrong, check=True)
     assert np.linalg.norm(error(found, truth)[3:]) < 0.03
-    assert found.margin is not None
     assert chi2(found, truth) < 22.5
     # The right one stays, by as much and more.
     again = tracked(image, SMALL, LEADER, found.T_camera_body, check=True)
-    assert again.margin is not None
-    assert again.margin > found.margin > 0.0
+    assert known(again.margin) > known(found.margin) > 0.0
     np.testing.assert_allclose(again.T_camera_body.rotation, found.T_camera_body.rotation,
                                atol=0.03)
 
@@ -193,8 +198,7 @@ def test_where_both_attitudes_are_probable_the_covariance_covers_both() -> None:
         plain = tracked(image, SMALL, LEADER, body(marker))
         found = tracked(image, SMALL, LEADER, body(marker), check=True)
         assert plain.margin is None
-        assert found.margin is not None
-        assert found.margin < 8.0
+        assert known(found.margin) < 8.0
         wider.append(np.sqrt(found.covariance[4, 4] / plain.covariance[4, 4]))
         values.append(chi2(found, body(marker)))
     assert np.median(wider) > 1.1  # about y, where the two are 0.2 rad apart
@@ -220,9 +224,8 @@ def test_from_coarse_corners_the_edges_are_found(model: str) -> None:
     for k, distance in enumerate(camera.matrix[0, 0] / 610.0 * np.array([1.0, 1.8, 2.6])):
         marker = facing((0.02, -0.03, distance), (0.2, -0.5, 0.4))
         corners = corners_of(camera, marker) + rng.uniform(-1.0, 1.0, (4, 2))
-        found = locate(render(camera, {0: marker}, seed=k), camera, LEADER, 0, corners,
-                       PosePrior())
-        assert found is not None
+        found = known(locate(render(camera, {0: marker}, seed=k), camera, LEADER, 0, corners,
+                             PosePrior()))
         assert np.linalg.norm(error(found, body(marker))[:3]) < 0.006 * distance
         assert np.linalg.norm(error(found, body(marker))[3:]) < 0.08
         assert found.spacing is not None
@@ -233,8 +236,9 @@ def test_from_coarse_corners_the_edges_are_found(model: str) -> None:
 def test_a_detected_marker_must_show_the_code_by_its_edges_or_smeared(blur: float) -> None:
     marker = facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1))
     corners = corners_of(SMALL, marker)
-    found = locate(render(SMALL, {0: marker}, blur=blur), SMALL, LEADER, 0, corners, PosePrior())
-    assert found is not None and (found.spacing is None) == (blur > 1.0)
+    found = known(locate(render(SMALL, {0: marker}, blur=blur), SMALL, LEADER, 0, corners,
+                         PosePrior()))
+    assert (found.spacing is None) == (blur > 1.0)
     assert np.linalg.norm(error(found, body(marker))[:3]) < 0.05
     for shown in ({'codes': {0: np.rot90(marker_code(0))}}, {'codes': {0: marker_code(4)}},
                   {'black': 200.0, 'white': 30.0}):
@@ -303,13 +307,11 @@ def test_one_detected_marker_brings_in_the_others(index: int) -> None:
     marker = WINGED.neighbor.markers[index]
     corners = corners_of(CAMERA, AHEAD @ marker.T_body_marker) + 0.4
     upright = PosePrior(None, AHEAD.rotation[:, 2])
-    found = locate(scene(0, 1), CAMERA, WINGED, index, corners, upright)
-    assert found is not None
+    found = known(locate(scene(0, 1), CAMERA, WINGED, index, corners, upright))
     assert found.margin == math.inf
     np.testing.assert_allclose(found.reference, [-0.175, 0.0, 0.03], atol=0.02)
     assert np.linalg.norm(error(found, AHEAD)[3:]) < 0.02
     # Where it is the only one in sight, it alone counts.
-    found = locate(scene(index), CAMERA, WINGED, index, corners, upright)
-    assert found is not None
+    found = known(locate(scene(index), CAMERA, WINGED, index, corners, upright))
     np.testing.assert_allclose(found.reference, marker.T_body_marker.translation, atol=0.02)
     assert np.linalg.norm(error(found, AHEAD)[:3]) < 0.015

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
+from marker_images import known
 import numpy as np
 import pytest
 
@@ -156,8 +157,7 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(measured: RangeState, st
 def test_a_range_before_odometry_is_dropped() -> None:
     ranges = Ranging(
         [MarkedNeighbor('leader', ())], {'leader': NeighborFilter()}, OdometryBuffer())
-    rejection = ranges.take(state(0.0), 0.0)
-    assert rejection is not None and rejection[0] == range_tracking.UNPLACED
+    assert known(ranges.take(state(0.0), 0.0))[0] == range_tracking.UNPLACED
 
 
 def test_a_range_waits_for_its_odometry() -> None:
@@ -178,8 +178,7 @@ def test_a_distance_corrects_what_is_along_the_line_only() -> None:
     tracker.update(0.0, Transform(np.eye(3), np.array([2.0, 0.0, 0.0])), np.zeros(3), NOISE)
     plain = tracker.continued(2.0)
     assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.USED
-    before, after = plain.predict(0.5), tracker.newest
-    assert before is not None and after is not None
+    before, after = known(plain.predict(0.5)), known(tracker.newest)
     assert after.position[0] > 2.2
     np.testing.assert_array_equal(after.position[1:], before.position[1:])
     np.testing.assert_array_equal(after.velocity[1:], before.velocity[1:])
@@ -197,5 +196,4 @@ def test_an_antenna_beside_the_body_counts_where_the_attitude_is_known() -> None
         tracker.update(k / 30, Transform(np.eye(3), np.array([2.0, 0.0, 0.0])), np.zeros(3), NOISE)
     apart = tracker.continued(2.0)
     assert apart.update_range(2.1, 1.5, np.zeros(3), 0.01, tag) is UpdateOutcome.USED
-    assert apart.newest is not None
-    assert apart.newest.position[0] == pytest.approx(2.0, abs=0.01)
+    assert known(apart.newest).position[0] == pytest.approx(2.0, abs=0.01)

@@ -20,7 +20,6 @@ Ids and corners are as their publishers' own tests have them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -130,14 +129,6 @@ ELSEWHERE = [
 @pytest.mark.parametrize('name', [*PHOTOGRAPHS, pytest.param(GRID, marks=pytest.mark.sweep)])
 def test_a_marker_expected_elsewhere_is_found_at_its_pose(
         name: str, across: list[float], along: float, turn: list[float], tracked: bool) -> None:
-    for key, sighting, before in perturbed(name, across, along, turn):
-        assert not tracked or sighting.stages.get(key) == 'track', f'{key}: {sighting.rejections}'
-        assert_same(name, places(sighting)[key], before)
-
-
-def perturbed(name: str, across: list[float], along: float,
-              turn: list[float]) -> Iterator[tuple[str, Sighting, Transform]]:
-    """Yield for each marker its name, what is seen when it is expected elsewhere, and its pose."""
     scene = Scene(name)
     scene.look()
     before = places(scene.look())
@@ -150,7 +141,9 @@ def perturbed(name: str, across: list[float], along: float,
                              pose.translation + shift)
         scene = Scene(name)
         scene.look()  # one sighting: the filter does not know the marker's speed, nor rejects one
-        yield key, scene.look(T_BODY_CAMERA @ pose @ expected.inverse()), pose
+        sighting = scene.look(T_BODY_CAMERA @ pose @ expected.inverse())
+        assert not tracked or sighting.stages.get(key) == 'track', f'{key}: {sighting.rejections}'
+        assert_same(name, places(sighting)[key], pose)
 
 
 def assert_same(name: str, pose: Transform, other: Transform) -> None:

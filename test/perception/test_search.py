@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import cv2
 from marker_images import DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
 import pytest
@@ -52,6 +53,17 @@ def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) 
     errors = found.corners[0] - corners_of(camera, pose)
     assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.5)
     assert np.abs(errors.mean(axis=0)).max() < (0.35 if width < search.LARGE else 0.7)
+
+
+@pytest.mark.parametrize('hidden', [(20, 20, 18), (110, 110, 20), (65, 20, 15)])
+def test_an_outline_is_whole_although_a_reflex_hides_a_corner_or_part_of_a_side(
+        hidden: tuple[int, int, int]) -> None:
+    image = np.full((140, 150), 190, dtype=np.uint8)
+    image[20:111, 20:111] = 30
+    cv2.circle(image, hidden[:2], hidden[2], 255, -1)
+    corners = np.array([[20.0, 20.0], [110.0, 20.0], [110.0, 110.0], [20.0, 110.0]])
+    assert min(np.abs(np.roll(outline, k, axis=0) - corners).max()
+               for outline in search.quadrilaterals(image) for k in range(4)) < 2.0
 
 
 @pytest.mark.parametrize('place', [

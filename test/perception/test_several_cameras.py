@@ -144,6 +144,15 @@ def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
     assert (len(tracked), len(whole)) == (18, 0)  # in the images of the front camera
 
 
+def test_a_neighbour_covered_in_one_image_is_looked_for_there_now_and_then(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    drone, tracked = Drone(front=FRONT, left=LEFT), watched(monkeypatch, tracker_module, 'track')
+    for k in range(50):
+        drone.see('front', 0.02 * k, ahead(2.0, 0.75, 0.02 * k))
+        drone.see('left', 0.02 * k + 0.01)
+    assert len(tracked) - 50 == pytest.approx(1.0 / SEARCH_PERIOD, abs=2)
+
+
 def test_an_image_older_than_that_of_another_camera_is_not_used() -> None:
     drone = Drone(front=FRONT, left=LEFT)
     for k in range(5):
@@ -173,32 +182,39 @@ def test_a_neighbour_that_leaves_all_images_is_searched_for_in_all_and_found() -
     assert found and found[0] <= 3.0 + 4 * SEARCH_PERIOD + 0.05
 
 
-def test_each_camera_finds_its_own_offset_of_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
-    offsets, rng, leader = {'front': 0.0, 'left': 0.02}, np.random.default_rng(3), ahead(2.0, 0.75)
+def test_each_camera_finds_its_own_offset_of_stamps_and_the_track_goes_with_it(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    offsets, rng = {'front': 0.0, 'left': 0.02}, np.random.default_rng(3)
     drone, exposed = Drone(front=FRONT, left=LEFT), ['', 0.0]
+    off: list[Array] = []  # errors of place at an image's stamp, m, once an offset is applied
 
     def attitude(now: float) -> Array:
         return quaternion_from_yaw(0.15 * np.sin(1.7 * now) + 0.05 * np.sin(11.0 * now))
 
     def measured(*_: Any) -> Measurement:
         name, now = exposed
-        own = Transform(quaternion_to_matrix(attitude(now)), PLACE)
-        pose = (own @ drone.mountings[name]).inverse() @ leader
+        own = Transform(quaternion_to_matrix(attitude(now)), body(now).translation)
+        pose = (own @ drone.mountings[name]).inverse() @ ahead(2.0, 0.75, now)
         noisy = Transform(pose.rotation, pose.translation + rng.normal(0.0, 0.001, 3))
         return Measurement('leader', noisy, TAIL.translation, np.diag([1e-6] * 3 + [1e-4] * 3),
                            0.1, None)
 
     monkeypatch.setattr(tracker_module, 'track', measured)
     monkeypatch.setattr(tracker_module, 'locate', measured)
-    first = drone.image('front', 0.0, leader)
+    first, cameras = drone.image('front', 0.0, ahead(2.0, 0.75)), drone.tracker.cameras
     for k in range(2000):
-        stamp = k / 200.0
+        now = k / 200.0
         drone.tracker.feed_odometry(OdometrySample(
-            stamp, PLACE, attitude(stamp), np.zeros(3),
-            np.array([0.0, 0.0, 0.255 * np.cos(1.7 * stamp) + 0.55 * np.cos(11.0 * stamp)])))
+            now, body(now).translation, attitude(now), FLYING,
+            np.array([0.0, 0.0, 0.255 * np.cos(1.7 * now) + 0.55 * np.cos(11.0 * now)])))
         name = 'front' if k % 8 == 0 else 'left' if k % 8 == 4 else ''
-        if name and stamp > 0.1:
-            exposed[:] = name, stamp - 0.05
-            drone.tracker.process_image(stamp - 0.05 - offsets[name], first, MODEL, name)
-    applied = [drone.tracker.cameras[name].time_offset.applied for name in offsets]
+        if name and now > 0.1:
+            exposed[:] = name, now - 0.05
+            stamp = now - 0.05 - offsets[name]
+            sighting = drone.tracker.process_image(stamp, first, MODEL, name)
+            if cameras['left'].time_offset.applied:
+                off += [estimate.position - ahead(2.0, 0.75, stamp).translation
+                        for estimate in sighting.estimates.values()]
+    applied = [cameras[name].time_offset.applied for name in offsets]
     assert applied == pytest.approx([0.0, 0.02], abs=0.003)
+    assert np.sqrt(np.mean(np.square(off[3:]), axis=0)).max() < 0.0025

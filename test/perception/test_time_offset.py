@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from marker_images import known
 import numpy as np
 import pytest
 
@@ -134,11 +135,10 @@ def test_a_state_is_moved_as_the_offset_moves_it() -> None:
     for k in range(30):
         track.update(k * DT, Transform(translation=np.array([2.0, 0.0, 0.0])), np.zeros(3),
                      1e-6 * np.eye(6))
-    before = track.newest
-    track.shift(0.02 * moving)
-    after = track.newest
-    assert before is not None
-    assert after is not None
+    before = known(track.newest)
+    track.shift(0.02 * moving, 0.02)
+    after = known(track.newest)
+    assert after.stamp == pytest.approx(before.stamp + 0.02)
     np.testing.assert_allclose(after.position - before.position, 0.02 * moving[POSITION])
     added = np.linalg.eigvalsh(after.covariance - before.covariance)
     assert added.min() > -1e-12

@@ -32,8 +32,9 @@ from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.look import reported
 from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
-from flock_follower.perception.neighbor_filter import FilterParams
+from flock_follower.perception.neighbor_filter import Estimate, FilterParams
 from flock_follower.perception.tracker import camera_mounting, MARGIN, MIRRORED_EVERY, Tracker
 
 CAMERA = make_camera()
@@ -86,6 +87,13 @@ def test_the_leader_is_where_it_is_in_odom(image: GrayImage) -> None:
     np.testing.assert_allclose(leader.rotation, LEADER.rotation, atol=0.05)
     # Its distance is less certain than its direction, as seen along the line of sight (north).
     assert leader.covariance[1, 1] > leader.covariance[0, 0]
+
+
+def test_the_noise_of_the_own_state_widens_a_reported_state() -> None:
+    state = Estimate(0.0, np.array([2.0, 0.0, 0.0]), np.zeros(3), np.eye(3), np.zeros(3),
+                     np.zeros(3), np.eye(15))
+    noisy = reported(state, 0.0, own(0.0), 0.01, 0.3).covariance
+    np.testing.assert_allclose(np.diag(noisy)[:6], [1.0, 1.04, 1.04, 1.3, 1.3, 1.3])
 
 
 def test_a_leader_in_formation_has_the_own_velocity_through_jumps_of_odometry_and_time(

@@ -33,6 +33,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting, Sighting
 
@@ -110,8 +111,7 @@ def test_in_bad_light_and_out_of_focus_no_fewer_markers_are_found_than_by_defaul
 
 def homography(margin: float = 0.0) -> Array:
     """Return what takes the unit square to where the marker is expected, grown by a margin."""
-    h = (0.5 + margin) * SIDE
-    corners = CAMERA.project(HERE.apply([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]]))
+    corners = CAMERA.project(HERE.apply(marker_corners((1.0 + 2.0 * margin) * SIDE)))
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
     return np.asarray(cv2.getPerspectiveTransform(square, corners.astype(np.float32)))
 
