@@ -185,7 +185,7 @@ def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(max_wait=0.0)
     r.image(0.0, image)  # without odometry nothing is looked for
-    assert 'no image processed for 4 s: no odometry yet' in r.problems(ahead=4.0)
+    assert re.search(r'no image processed for \d s: no odometry yet', r.problems(ahead=4.0))
     r.odom(0.0, frame='vio_odom')
     r.image(0.0, image)
     r.image(0.01, EMPTY)
@@ -342,9 +342,10 @@ def test_a_camera_that_stops_or_is_not_calibrated_is_named_while_the_other_goes_
     assert len(r.found) == 3
     assert r.counters == {'no usable camera_info of camera left': 1}
     reported = r.problems(ahead=4.0)
-    assert 'no /left/camera_info for 4 s' in reported
-    assert 'no /left/image_raw for 4 s' in reported
-    assert 'no image of camera left processed for 4 s: no usable camera_info' in reported
+    for silent in ('/left/camera_info for', '/left/image_raw for',
+                   'image of camera left processed for'):
+        assert re.search(rf'no {silent} \d s', reported)
+    assert 's: no usable camera_info' in reported
     assert 'no image of camera front processed' not in reported
     assert r.values['camera front'] == '640x480 plumb_bob' and 'camera left' not in r.values
     assert {'time_offset front', 'time_offset left'} <= r.values.keys()
