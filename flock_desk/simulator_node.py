@@ -340,8 +340,9 @@ class Simulator(FlockNode):
         if self._line.due(now):
             when = ('waiting' if flight.began_ns is None
                     else f'{flight.time:5.1f} of {self._duration:g} s')
-            self._line.show(f'{when}  distance {flight.distance:.2f} m  '
-                            f'{self._state or "no planner":<6}')
+            where = ('no leader' if math.isnan(flight.distance)
+                     else f'distance {flight.distance:.2f} m')
+            self._line.show(f'{when}  {where}  {self._state or "no planner":<6}')
 
 
 def _logged(state: Odometry) -> tuple[Array, Array, Array]:

@@ -214,8 +214,11 @@ def velocities_after(positions: Array, velocities: Array, mean_velocity: bool = 
         mean: Array = seen @ velocities / seen.sum(axis=1, keepdims=True)
         return mean
     speed = np.linalg.norm(velocities, axis=1, keepdims=True)
-    total = seen @ (velocities / np.maximum(speed, 1e-12))
-    return speed * total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    heading = velocities / np.maximum(speed, 1e-12)
+    total = seen @ heading
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    # Headings that cancel have no mean: an agent then keeps its own.
+    return speed * np.where(length > 1e-12, total / np.maximum(length, 1e-12), heading)
 
 
 def adaptive(acceleration: Acceleration, start: State, times: Array,

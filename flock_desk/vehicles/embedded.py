@@ -198,9 +198,11 @@ class EmbeddedAutopilot:
 
     def _due_messages(self, now: float) -> list[Any]:
         messages = self._status_texts()
-        if self.controller.mode != self._shown_mode:  # each change is shown at once
-            self._shown_mode = self.controller.mode
-            self._due[self._profile.mode_message] = now
+        if self.controller.mode != self._shown_mode:
+            self._shown_mode, shown_by = self.controller.mode, self._profile.mode_message
+            # PX4 shows a change in its stream; ArduCopter sends another HEARTBEAT at once.
+            delay = self._intervals[shown_by] if self._profile.px4 else 0.0
+            self._due[shown_by] = min(self._due[shown_by], now + delay)
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
                 name = _NAMES[message_id]
@@ -208,6 +210,8 @@ class EmbeddedAutopilot:
                     messages.append(mavlink.mavlink_map[message_id](*fields))
                 # From the time it was due: the mean rate is exact.
                 interval = self._intervals[message_id]
+                if name == 'CURRENT_MODE':
+                    interval = max(interval, CURRENT_MODE_PERIOD)
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
         return messages
 
@@ -228,6 +232,8 @@ class EmbeddedAutopilot:
                 results = [controller.take_off(message.param7, now)]
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 results = [self._set_interval(message.param1, message.param2, now)]
+            case mavlink.MAV_CMD_RUN_PREARM_CHECKS if controller.armed and not self._profile.px4:
+                results = [int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)]
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
                 controller.check_arming(now)
                 results = [ACCEPTED]
@@ -242,9 +248,7 @@ class EmbeddedAutopilot:
         fixed = self._profile.px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         if message_id not in self._intervals or not microseconds > 0.0 or fixed:
             return self._profile.unknown_message
-        slowest = (CURRENT_MODE_PERIOD if message_id == mavlink.MAVLINK_MSG_ID_CURRENT_MODE
-                   else STEP)
-        self._intervals[int(message_id)] = max(microseconds * 1e-6, slowest)
+        self._intervals[int(message_id)] = max(microseconds * 1e-6, STEP)
         self._due[int(message_id)] = now
         return ACCEPTED
 
@@ -294,7 +298,7 @@ class EmbeddedAutopilot:
             case 'EKF_STATUS_REPORT':
                 return self.estimator_flags(now), 0.0, 0.0, 0.0, 0.0, 0.0
             case 'ESTIMATOR_STATUS':
-                # Without aiding nothing is compared any more, and the accuracy grows.
+                # Without aiding nothing is compared any more.
                 ratio, accuracy = ((0.02, 0.03) if controller.conditions(now)['aided']
                                    else (math.nan, 100.0))
                 return (self._boot_ms(now) * 1000, self.estimator_flags(now), ratio, ratio,

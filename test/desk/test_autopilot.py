@@ -30,6 +30,7 @@ import pytest
 
 from flock_desk import autopilot
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
+from flock_desk.vehicles.profiles import PX4
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import GRAVITY
 
@@ -162,6 +163,19 @@ def test_px4_without_a_position_falls_back_until_something_can_be_flown():
     assert state(flight) == ('OFFBOARD', False)
 
 
+@pytest.mark.parametrize(('rate', 'least', 'most'), [(50.0, 0.01, 0.03), (5.0, 0.1, 0.25)])
+def test_px4_shows_a_change_of_the_mode_in_its_stream(rate, least, most):
+    flight = Flight()
+    flight.ask('CURRENT_MODE', rate)
+    flight.fly(3.03)
+    assert len(flight.all('CURRENT_MODE')) == 7  # twice a second while the mode stays
+    flight.mode('AUTO.LAND')
+    changed = flight.now
+    while flight.last('CURRENT_MODE').custom_mode != PX4.modes['AUTO.LAND'].number:
+        flight.fly(0.01)
+    assert least <= round(flight.now - changed, 3) <= most
+
+
 @pytest.mark.parametrize(('above_home', 'reached'), [(4.0, 4.0), (-400.0, 2.5)])
 def test_px4_takes_the_altitude_as_above_sea_level_and_raises_one_that_is_too_low(
         above_home, reached):
@@ -182,6 +196,7 @@ def test_arducopter_says_why_it_does_not_arm_and_stays_in_land():
     assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [0]
     assert flight.texts() == ['PreArm: Compass not calibrated']
     flight = Flight('arducopter')
+    assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [1] and flight.texts() == []
     flight.mode('LAND')
     flight.fly(8.0)
     assert (flight.controller.mode, flight.controller.armed) == ('LAND', False)

@@ -87,6 +87,11 @@ def test_vicsek_turns_to_the_mean_of_those_in_sight(mean_velocity: bool,
     assert velocities_after(x, v, mean_velocity) == pytest.approx(np.array(expected))
 
 
+def test_vicsek_keeps_headings_that_cancel() -> None:
+    x, v = np.array([[0.0, 0.0], [0.5, 0.0]]), np.array([[1.0, 0.0], [-2.0, 0.0]])
+    assert velocities_after(x, v) == pytest.approx(v)
+
+
 def test_metrics_of_a_known_flock() -> None:
     x = np.array([[[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]] * 2)
     v = np.array([[[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[2.0, 0.0]] * 3])
