@@ -54,8 +54,8 @@ COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
 Row = tuple[str, ...]
-DURATION = 20.0  # s, of the larger flock
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
+DURATION, FLOCK_PERIOD = 20.0, 0.05  # s, of the larger flock
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -141,12 +141,10 @@ def redraw_controllers(out: Path, path: Path) -> list[str]:
 def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of its files."""
     start = random_start(agents, dim, paper.FLIGHT_PARAMS, seed)
-    with progress(1000) as bar:
+    with progress(round(DURATION / FLOCK_PERIOD) + 1) as bar:
         bar.set_description_str(f'{agents} agents, {dim}-D')
-
-        def show(share: float) -> None:
-            bar.update(round(1000 * share) - bar.n)
-        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION, progress=show)
+        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION,
+                             sample_period=FLOCK_PERIOD, progress=bar.update)
     m, name = run.metrics, f'flock_{agents}_{dim}d_seed{seed}'
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')

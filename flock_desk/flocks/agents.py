@@ -90,14 +90,12 @@ class Simulation:
 
 def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
              duration: float = 20.0, model: Model = 'flocking', leader: Leader | None = None,
-             sample_period: float = 0.02,
-             progress: Callable[[float], None] | None = None) -> Simulation:
+             sample_period: float = 0.02) -> Simulation:
     """
     Return how a flock moves from its positions and velocities, both (k, n) with n = 2 or 3.
 
     :param duration: s to simulate; :param sample_period: s between the times returned, at least
         0.1 s for Vicsek's rule.
-    :param progress: called with the share done, 0 to 1.
     :raises ValueError: for an unknown model, bad shapes or values, or a start outside the band.
     :raises RuntimeError: if no finite solution goes on.
     """
@@ -112,34 +110,29 @@ def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
         _check_band(x, params, model)
         states = adaptive(partial(_acceleration, params, cast(flocking.Model, model), leader),
                           (x, v), time, leader.breaks if leader else ())
-    return Simulation(time, *_collected(states, len(time), progress), params)
+    x, v = map(np.array, zip(*states))
+    return Simulation(time, x, v, params)
 
 
 def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
                    duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
-                   progress: Callable[[float], None] | None = None) -> Simulation:
+                   progress: Callable[[], object] = lambda: None) -> Simulation:
     """
     Return how a flock moves on its neighbour graph; see ``simulate``.
 
     :param dt: s, the longest step.
+    :param progress: called at each of the times returned.
     :raises RuntimeError: if the flock ends at a singularity of the law.
     """
     x, v = flocking.checked(positions, velocities)
     time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
     growing = _GrowingGraph(x, params)
-    x, v = _collected(growing.states((x, v), time, dt), len(time), progress)
+    states = []
+    for state in growing.states((x, v), time, dt):
+        states.append(state)
+        progress()
+    x, v = map(np.array, zip(*states))
     return Simulation(time, x, v, params, Graph(growing.edges, np.array(growing.joined)))
-
-
-def _collected(states: Iterator[State], count: int,
-               progress: Callable[[float], None] | None) -> State:
-    run: list[State] = []
-    for state in states:
-        run.append(state)
-        if progress is not None:
-            progress((len(run) - 1) / (count - 1))
-    x, v = map(np.array, zip(*run))
-    return x, v
 
 
 class _GrowingGraph:

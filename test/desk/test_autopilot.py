@@ -59,6 +59,14 @@ def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
     assert vehicle.rotation[2, 1] > 0.05 and abs(vehicle.rotation[2, 0]) < 1e-9
 
 
+def test_wind_pushes_the_vehicle_and_the_hover_thrust_errs():
+    vehicle = Quadrotor((0, 0, 50))
+    for _ in range(100):
+        vehicle.step([0.0, 0.0, 0.0], 0.0, STEP, wind=[5.0, 0.0, 0.0])
+    gained = 1.0 - math.exp(-0.1)  # drag of 0.1 1/s, for 1 s
+    assert vehicle.velocity == pytest.approx([5.0 * gained, 0.0, 0.08 * gained], rel=0.01)
+
+
 # PX4.
 
 
@@ -204,6 +212,13 @@ def test_arducopter_says_why_it_does_not_arm_and_stays_in_land():
     assert flight.mode('GUIDED') == [0] and flight.arm() == [0]
 
 
+def test_arducopter_obeys_nan_and_falls():
+    flight = Flight('arducopter', altitude=20.0)
+    flight.mode('GUIDED')
+    flight.fly(1.0, setpoint(math.nan))
+    assert flight.vehicle.velocity[2] < -5.0
+
+
 def test_brake_holds_the_position_and_is_refused_without_one():
     flight = Flight('arducopter')
     flight.mode('GUIDED')
@@ -268,6 +283,12 @@ def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality):
     assert not flight.controller.armed
     assert flight.last('ATTITUDE_QUATERNION').time_boot_ms < 1200
     assert len(flight.all('LOCAL_POSITION_NED')) > 50
+
+
+def test_a_reboot_in_the_air_brings_it_down():
+    flight = Flight(altitude=30.0, faults=[Fault('reboot', 0.5, duration=3.0)])
+    flight.fly(2.5)
+    assert flight.vehicle.velocity[2] < -8.0
 
 
 @pytest.mark.parametrize(('options', 'message'), [

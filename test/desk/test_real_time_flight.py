@@ -124,7 +124,7 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
 
 
 def test_the_image_shows_the_marker_where_truth_camera_and_mounting_put_it(camera):
-    motion = LeaderMotion(motion='circle', wait=0.0, speed=0.5, size=1.0)
+    motion = LeaderMotion(motion='circle', wait=0.0, speed=(0.5, 0.5), size=1.0)
     flown = Commanded(camera, (0.2, -0.1, 0.05), yaw=-0.1, leader=motion).fly(2.0)
     k = calibration(camera.camera)
     model = CameraModel(np.reshape(k['k'], (3, 3)), k['d'], k['distortion_model'], k['width'],
@@ -166,7 +166,7 @@ def test_light_changes_hide_the_marker_for_as_long_as_the_scenario_says():
 
 
 def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pose():
-    motion = LeaderMotion(motion='circle', wait=0.0, speed=1.0, size=1.5, heading='course')
+    motion = LeaderMotion(motion='circle', wait=0.0, speed=(1.0, 1.0), size=1.5, heading='course')
     live, time, h = ScenarioRun(scenario(leader=motion), 1), 9.0, 0.01
     before, state, after, opposite = (live.motion(0, t) for t in (
         time - h, time, time + h, time + math.pi * 1.5 / 1.0))
