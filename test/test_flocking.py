@@ -127,8 +127,8 @@ def assert_close(actual: Array, expected: Array, rounding: float = 0.0) -> None:
     assert actual == pytest.approx(expected, rel=1e-8, abs=limit)
 
 
-@given(flocks(), st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale']), st.tuples(*[st.floats(-3.0, 3.0)] * 3),
-       st.randoms(use_true_random=False))
+@given(flocks(), st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale']),
+       st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.randoms(use_true_random=False))
 def test_law_moves_turns_and_permutes_with_the_flock_and_sums_to_zero(
         flock: tuple[Array, Array], model: Any, vector: tuple[float, float, float],
         random: Any) -> None:

@@ -64,8 +64,9 @@ class EmbeddedAutopilot:
     """
     An autopilot with the personality of PX4 or ArduCopter.
 
+    :param personality: a key of ``PROFILES``.
     :param now: monotonic time, s, of the start; messages carry times since then.
-    :param start: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
+    :param start: one of ``STARTS``: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
     :param altitude: m, of an airborne start.
     :param yaw: rad, ENU, at the start.
     :param parameters: values that differ from the autopilot's defaults.
@@ -73,17 +74,13 @@ class EmbeddedAutopilot:
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, if the link is signed.
-    :raises ValueError: for an unknown personality, start or parameter.
+    :raises ValueError: for an unknown parameter, or a value that it cannot have.
     """
 
     def __init__(self, personality: str = 'px4', *, now: float, start: str = 'airborne',
                  altitude: float = 2.0, yaw: float = 0.0, system_id: int = 1,
                  parameters: Mapping[str, float] = _NO_PARAMETERS, arming_denial: str = '',
                  ready_after: float = 0.0, seed: int = 0, signing: Any = None) -> None:
-        for name, value, valid in (('personality', personality, tuple(PROFILES)),
-                                   ('start', start, STARTS)):
-            if value not in valid:
-                raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
         self._profile = PROFILES[personality]
         self._parameters = Parameters(self._profile)
         for name, number in parameters.items():

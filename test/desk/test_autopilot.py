@@ -150,6 +150,7 @@ def test_px4_without_an_origin_stays_in_its_take_off_until_it_gets_one():
     assert flight.controller.mode == 'AUTO.TAKEOFF'
     assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
     assert flight.mode('AUTO.LOITER') == [0, 1] and flight.mode('POSCTL') == [0, 1]
+    assert not flight.all('HOME_POSITION')
     answers = flight.send(ORIGIN)
     assert [m.get_type() for m in answers] == ['GPS_GLOBAL_ORIGIN']
     flight.fly(0.1, seen(flight))
@@ -291,16 +292,13 @@ def test_a_reboot_in_the_air_brings_it_down():
     assert flight.vehicle.velocity[2] < -8.0
 
 
-@pytest.mark.parametrize(('options', 'message'), [
-    ({'personality': 'betaflight'}, "personality = 'betaflight': must be one of px4, arducopter"),
-    ({'start': 'diving'}, "start = 'diving': must be one of airborne, armed, landed"),
-    ({'parameters': {'GUID_TIMEOUT': 1.0}}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
-    ({'parameters': {'COM_OBL_RC_ACT': 1.5}}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
-    ({'parameters': {'COM_OF_LOSS_T': math.inf}}, 'COM_OF_LOSS_T = inf: must be a finite number')])
-def test_bad_options_are_named(options, message):
-    with pytest.raises(ValueError) as error:
-        EmbeddedAutopilot(now=0.0, **options)
-    assert str(error.value).startswith(message)
+@pytest.mark.parametrize(('parameters', 'message'), [
+    ({'GUID_TIMEOUT': 1.0}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
+    ({'COM_OBL_RC_ACT': 1.5}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
+    ({'COM_OF_LOSS_T': math.inf}, 'COM_OF_LOSS_T = inf: must be a finite number')])
+def test_bad_parameters_are_named(parameters, message):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        EmbeddedAutopilot(now=0.0, parameters=parameters)
 
 
 # The command.

@@ -15,6 +15,7 @@
 """A flight in real time without clock, socket or ROS: its sensors show the truth."""
 
 import math
+from types import SimpleNamespace
 
 from marker_images import seen_corners
 import numpy as np
@@ -203,7 +204,8 @@ class Elsewhere:
         self.motion, self.ahead = ExternalMotion(), ExternalMotion()
         self.sent_ns, self.led_ns = START - PERIOD, START - PERIOD
         self.report(START)
-        self.vehicle = ExternalVehicle(self.motion, START, height=0.0)
+        autopilot = SimpleNamespace(motion=self.motion, armed=True, mode='')
+        self.vehicle = ExternalVehicle(autopilot, START, height=0.0)
         self.flight = RealTimeFlight(
             scenario(sensing=STILL, odometry=EXACT), 0, self.vehicle, camera,
             LATEST_NS + 40_000_000 * led,
