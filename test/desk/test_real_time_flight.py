@@ -42,6 +42,7 @@ from flock_desk.scenarios.scenario import (
     Sensing,
     VioErrors,
 )
+from flock_desk.sensors.vio import Odometry
 from flock_follower.geometry import (
     enu_to_ned,
     matrix_to_rotation_vector,
@@ -182,6 +183,16 @@ def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pos
         math.atan2(*(rotation @ state.linear)[1::-1]), abs=0.05)
 
 
+def test_a_leader_that_faces_away_turns_its_tail_to_the_follower():
+    live = ScenarioRun(scenario(leader=LeaderMotion(heading='away')), 0)
+    follower = Odometry(0.0, np.array([1.5, -1.5, 1.5]), quaternion_from_yaw(0.0), np.zeros(3),
+                        np.zeros(3))
+    for k in range(1500):
+        live.step(follower, 0.01 * k, offboard=True)
+    assert yaw_from_quaternion(live.motion(0, 15.0).quaternion) == pytest.approx(
+        math.pi / 2, abs=0.01)
+
+
 # Vehicles flown elsewhere.
 
 START = 5_000_000_000  # ns, of the flight
@@ -289,3 +300,7 @@ def test_a_leader_elsewhere_is_where_it_reports_and_the_scenarios_does_not_fly(c
         # Every pose that the image shows had been reported.
         assert START + frame.stamp_ns + round(0.5e9 * SENSOR.exposure) <= flown.ahead.newest
     assert len(flown.frames) >= 73 and flown.flight.skipped_images == 0
+    leader = ExternalLeader(flown.ahead, START, np.zeros(3))
+    for stalled, there in ((0.1, True), (0.2, False)):
+        at = flown.ahead.newest - START + round(stalled * 1e9)
+        assert (leader.motion(at, 0.0) is not None) == there
