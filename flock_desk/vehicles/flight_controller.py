@@ -124,7 +124,11 @@ class FlightController(ABC):
         """Return the MAV_STATE of HEARTBEAT."""
         if self.in_failsafe:
             return int(mavlink.MAV_STATE_CRITICAL)
-        return int(mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY)
+        px4 = self.PROFILE.px4
+        if self.armed if px4 else self._flown:  # ArduCopter is active in the air only
+            return int(mavlink.MAV_STATE_ACTIVE)
+        unfit = px4 and self.missing(self.mode, self._time, self.PROFILE.arming)
+        return int(mavlink.MAV_STATE_UNINIT if unfit else mavlink.MAV_STATE_STANDBY)
 
     @property
     def landed_state(self) -> int:

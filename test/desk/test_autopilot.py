@@ -91,7 +91,9 @@ def test_setpoints_px4_would_drop_do_not_count_as_a_stream(dropped):
 def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
     flight = Flight(start='landed')
     assert flight.mode('OFFBOARD') == [0, 0] and flight.arm() == [1]
+    assert flight.controller.system_status == mavlink.MAV_STATE_UNINIT
     flight.send(setpoint())
+    assert flight.controller.system_status == mavlink.MAV_STATE_STANDBY
     assert flight.arm() == [0] and flight.controller.mode == 'OFFBOARD'
     assert flight.arm(False) == [0] and flight.mode('AUTO.LAND') == [0, 0]
     assert flight.arm() == [1] and flight.controller.mode == 'AUTO.LAND'
