@@ -25,15 +25,9 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_desk.flocks.agents import Leader, simulate, Simulation
+from flock_desk.flocks.agents import simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
-from flock_desk.flocks.paper import (
-    LEADER_FOLLOWER,
-    leader_input,
-    LEADER_SWITCH,
-    LEADERLESS,
-    PARAMS,
-)
+from flock_desk.flocks.paper import LEADER_FOLLOWER, LEADERLESS, PARAMS
 from flock_follower.flocking import (
     acceleration,
     accelerations,
@@ -94,8 +88,7 @@ def test_predecessors_leave_the_band_as_in_the_reference(
 
 
 def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
-    run = simulate(*LEADER_FOLLOWER, PARAMS, duration=10.0,
-                   leader=Leader(leader_input, (LEADER_SWITCH,)), sample_period=0.01)
+    run = simulate(*LEADER_FOLLOWER, PARAMS, duration=10.0, led=True, sample_period=0.01)
     assert run.metrics.min_r2.min() == pytest.approx(1.3976, abs=1e-4)
     assert run.metrics.max_r2.max() == pytest.approx(2.0049, abs=1e-4)
 
