@@ -9,7 +9,7 @@
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
 #   make site      build the pages of docs/ as a site, with every link checked (build/site)
-#   make bless     make the present result of the sample bag the golden one (test/golden)
+#   make bless     make the present result of the sample bag the golden one (test/frozen)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
 #   make frozen    compare with them, bit for bit (minutes; RUNS=4: the first 4 runs of each scenario)
 #   make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
@@ -117,7 +117,7 @@ lint: setup
 	@$(VENV)/bin/mypy
 
 bless: setup
-	@$(RUN) test/golden_result.py
+	@$(RUN) test/frozen.py --write sample
 
 frozen: setup
 	@$(RUN) test/frozen.py --runs $(RUNS)

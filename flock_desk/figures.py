@@ -37,7 +37,7 @@ import numpy as np
 
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.flocks import paper
-from flock_desk.flocks.agents import Leader, Model, simulate, simulate_graph, Simulation
+from flock_desk.flocks.agents import Model, simulate, simulate_graph, Simulation
 from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
@@ -54,8 +54,8 @@ COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
 Row = tuple[str, ...]
-DURATION = 20.0  # s, of the larger flock
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
+DURATION, FLOCK_PERIOD = 20.0, 0.05  # s, of the larger flock
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -85,19 +85,18 @@ def _draw(options: argparse.Namespace) -> int:
 
 def redraw(out: Path) -> list[str]:
     """Write the paper's simulations and ``results.csv``, print the table, return the names."""
-    leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
     runs: dict[str, dict[str, Simulation]] = {'leaderless': {}, 'leader-follower': {}}
     with progress(2 * len(MODELS)) as bar:
-        for scenario, start, lead, duration in (
-                ('leaderless', paper.LEADERLESS, None, 20.0),
-                ('leader-follower', paper.LEADER_FOLLOWER, leader, 10.0)):
+        for scenario, start, led, duration in (
+                ('leaderless', paper.LEADERLESS, False, 20.0),
+                ('leader-follower', paper.LEADER_FOLLOWER, True, 10.0)):
             for model, name in MODELS.items():
                 bar.set_description_str(f'{scenario}: {name}')
                 runs[scenario][name] = simulate(
-                    *start, paper.PARAMS, duration=duration, model=model, leader=lead,
+                    *start, paper.PARAMS, duration=duration, model=model, led=led,
                     sample_period=SAMPLE_PERIOD)
                 bar.update()
-    alone, led = runs.values()
+    alone, followed = runs.values()
     continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
     three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
     unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
@@ -106,9 +105,9 @@ def redraw(out: Path) -> list[str]:
         'leaderless_speeds': plots.speeds(alone, three, 10.0),
         'leaderless_distances': plots.distances(alone, 10.0),
         'leaderless_lyapunov': plots.agreement(continuous, 10.0),
-        'leader_trajectories': plots.trajectories(led, two, 10.0, unseen),
-        'leader_speeds': plots.speeds(led, two, 10.0, unseen),
-        'leader_distances': plots.distances(led, 10.0, unseen)}
+        'leader_trajectories': plots.trajectories(followed, two, 10.0, unseen),
+        'leader_speeds': plots.speeds(followed, two, 10.0, unseen),
+        'leader_distances': plots.distances(followed, 10.0, unseen)}
     rows = [row(scenario, name, run)
             for scenario, by_name in runs.items() for name, run in by_name.items()]
     write_csv(out / 'results.csv', COLUMNS, rows)
@@ -141,12 +140,10 @@ def redraw_controllers(out: Path, path: Path) -> list[str]:
 def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of its files."""
     start = random_start(agents, dim, paper.FLIGHT_PARAMS, seed)
-    with progress(1000) as bar:
+    with progress(round(DURATION / FLOCK_PERIOD) + 1) as bar:
         bar.set_description_str(f'{agents} agents, {dim}-D')
-
-        def show(share: float) -> None:
-            bar.update(round(1000 * share) - bar.n)
-        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION, progress=show)
+        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION,
+                             sample_period=FLOCK_PERIOD, progress=bar.update)
     m, name = run.metrics, f'flock_{agents}_{dim}d_seed{seed}'
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor, T_BODY_OPTICAL
+from flock_desk.closed_loop.real_time_flight import calibration
 from flock_desk.runs.console import guarded, progress, within
 from flock_desk.runs.processes import computed
 from flock_desk.scenarios.scenario import VioErrors
@@ -161,14 +162,11 @@ class Recording:
 
     def camera_info(self, k: int) -> BagMessage:
         """Return the calibration recorded just before image k."""
-        camera, types = self.variant.camera, typestore().types
-        matrix = np.array([[camera.focal_x, 0.0, camera.centre_x],
-                           [0.0, camera.focal_y, camera.centre_y], [0.0, 0.0, 1.0]])
+        info, types = calibration(self.variant.camera), typestore().types
         message = types[_INFO](
-            _header(self.image_stamps_ns[k], 'camera_optical_frame'), camera.height, camera.width,
-            camera.model, np.array(camera.distortion), matrix.ravel(), np.eye(3).ravel(),
-            np.hstack([matrix, np.zeros((3, 1))]).ravel(), 0, 0,
-            types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False))
+            _header(self.image_stamps_ns[k], 'camera_optical_frame'), info['height'],
+            info['width'], info['distortion_model'], *(np.array(info[name]) for name in 'dkrp'),
+            0, 0, types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False))
         return BagMessage('/camera_info', _INFO, self.image_arrivals_ns[k] - 20_000,
                           serialize(message, _INFO))
 

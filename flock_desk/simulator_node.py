@@ -192,7 +192,7 @@ class Simulator(FlockNode):
             self.get_logger().warning(
                 "no ground truth comes: images and odometry follow the autopilot's own estimate; "
                 'never forward that odometry to it')
-        vehicle = ExternalVehicle(external.follower.motion, external.start_ns,
+        vehicle = ExternalVehicle(external.follower, external.start_ns,
                                   altitude if external.follower.flying else 0.0)
         return vehicle, (None if external.leader is None else ExternalLeader(
             external.leader.motion, external.start_ns, vehicle.origin))
@@ -277,9 +277,6 @@ class Simulator(FlockNode):
         if isinstance(self._vehicle, EmbeddedVehicle):  # an external simulator has its own wind
             self._vehicle.autopilot.controller.wind = self._flight.scenario.wind(self._flight.time)
         self._end.step(due)
-        if isinstance(self._vehicle, ExternalVehicle) and self._external is not None:
-            autopilot = self._external.follower
-            self._vehicle.armed, self._vehicle.mode = autopilot.armed, autopilot.mode
         arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
         now_ns = self._epoch_ns + self._flight.time_ns
         self._log.add('distance', due, self._flight.distance)
@@ -340,8 +337,9 @@ class Simulator(FlockNode):
         if self._line.due(now):
             when = ('waiting' if flight.began_ns is None
                     else f'{flight.time:5.1f} of {self._duration:g} s')
-            self._line.show(f'{when}  distance {flight.distance:.2f} m  '
-                            f'{self._state or "no planner":<6}')
+            where = ('no leader' if math.isnan(flight.distance)
+                     else f'distance {flight.distance:.2f} m')
+            self._line.show(f'{when}  {where}  {self._state or "no planner":<6}')
 
 
 def _logged(state: Odometry) -> tuple[Array, Array, Array]:

@@ -15,12 +15,13 @@
 """
 The result of the sample bag as numbers to compare: what a change of the code must not move.
 
-``make bless``, or ``python test/golden_result.py``, writes them to test/golden/sample.csv: after
-a change that is meant to move them, look at the difference and commit it with the change.
+``make bless`` freezes them, see frozen.py: after a change that is meant to move them, look at the
+difference and commit it with the change.
 """
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 import tempfile
 
@@ -32,8 +33,7 @@ from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.pending_images import Perceiver
 
-GOLDEN = Path(__file__).resolve().parent / 'golden' / 'sample.csv'
-COLUMNS = 'topic,time,x,y,z,vx_or_yaw,vy,vz'
+GOLDEN = Path(__file__).resolve().parent / 'frozen' / 'sample.csv'
 BAG = resource('bags/sample')
 
 Row = tuple[str, int, list[float]]
@@ -94,18 +94,7 @@ def neighbors() -> list[Row]:
 
 def read() -> list[Row]:
     """Return the golden rows."""
-    fields = [line.split(',') for line in GOLDEN.read_text(encoding='utf-8').splitlines()[1:]]
-    return [(topic, int(time), [float(n) for n in numbers]) for topic, time, *numbers in fields]
-
-
-def write() -> None:
-    """Make the present result the golden one."""
-    lines = [','.join([topic, str(time), *(f'{number:.6f}' for number in numbers)])
-             for topic, time, numbers in result()]
-    GOLDEN.parent.mkdir(exist_ok=True)
-    GOLDEN.write_text('\n'.join([COLUMNS, *lines]) + '\n', encoding='utf-8')
-    print(f'{len(lines)} rows written to {GOLDEN}')
-
-
-if __name__ == '__main__':
-    write()
+    with GOLDEN.open(encoding='utf-8', newline='') as file:
+        _, *rows = csv.reader(file)
+    named = [(name.removesuffix(' ns').split(' at '), numbers) for name, *numbers in rows]
+    return [(topic, int(time), [float(n) for n in numbers]) for (topic, time), numbers in named]

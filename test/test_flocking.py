@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -25,6 +25,9 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
+from flock_desk.flocks.agents import simulate, Simulation
+from flock_desk.flocks.flock_metrics import extremum
+from flock_desk.flocks.paper import LEADER_FOLLOWER, LEADERLESS, PARAMS
 from flock_follower.flocking import (
     acceleration,
     accelerations,
@@ -36,122 +39,58 @@ from flock_follower.flocking import (
 )
 from flock_follower.geometry import Array, rotation_vector_to_matrix
 
-PAPER = FlockingParams()
 FLIGHT = FlockingParams(beta=0.25, d1=8.0)
 
 
-def polar(heading: float, speed: float) -> list[float]:
-    angle = np.radians(heading)
-    return [speed * np.cos(angle), speed * np.sin(angle)]
-
-
-LEADERLESS = (np.array([[0.0, 0.0], [1.25, 0.0], [0.63, 1.08]]),
-              np.array([polar(45, 0.54), polar(135, 0.42), polar(270, 0.99)]))
-LEADER_FOLLOWER = (np.array([[0.0, 1.32], [0.0, 0.0]]),
-                   np.array([polar(118, 0.88), polar(92, 0.50)]))
-
-
-class Run(NamedTuple):
-    """A solution at every step: t (m,), x and v (m, k, n), squared distances (m, pairs)."""
-
-    t: Array
-    x: Array
-    v: Array
-    r2: Array
-
-
-def runge_kutta(law: Callable[[float, Array, Array], Array], start: tuple[Array, Array],
-                duration: float, dt: float) -> Run:
-    def rate(t: float, state: Array) -> Array:
-        return np.stack([state[1], law(t, state[0], state[1])])
-
-    states = [np.stack(start)]
-    for n in range(round(duration / dt)):
-        t, s = n * dt, states[-1]
-        k1 = rate(t, s)
-        k2 = rate(t + dt / 2, s + dt / 2 * k1)
-        k3 = rate(t + dt / 2, s + dt / 2 * k2)
-        k4 = rate(t + dt, s + dt * k3)
-        states.append(s + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
-    x, v = np.array(states).swapaxes(0, 1)
-    i, j = np.triu_indices(x.shape[1], k=1)
-    return Run(np.linspace(0.0, duration, len(x)), x, v, np.sum((x[:, i] - x[:, j]) ** 2, axis=-1))
-
-
-def turning_point(t: Array, y: Array, index: int) -> tuple[float, float]:
-    """Return time and value of the extremum next to a sample, by the parabola through three."""
-    around = slice(index - 1, index + 2)
-    a, b, c = np.polyfit(t[around] - t[index], y[around], 2)
-    return float(t[index] - b / (2 * a)), float(c - b * b / (4 * a))
-
-
-def leader_input(t: float, reversed_: bool) -> Array:
-    """Return the leader's acceleration; the paper's t is an index of steps of 0.01 s."""
-    angle = np.pi * (t / 0.01) / 180
-    return np.array([np.sin(angle), np.cos(angle)]) * (-1.0 if reversed_ else 1.0)
-
-
 @pytest.fixture(scope='module')
-def leaderless() -> Run:
-    return runge_kutta(lambda t, x, v: accelerations(x, v, PAPER), LEADERLESS, 20.0, 0.004)
+def leaderless() -> Simulation:
+    return simulate(*LEADERLESS, PARAMS, sample_period=0.005)
 
 
-def test_leaderless_distances_reproduce_the_reference(leaderless: Run) -> None:
-    sample, pair = np.unravel_index(np.argmin(leaderless.r2), leaderless.r2.shape)
-    t, smallest = turning_point(leaderless.t, leaderless.r2[:, pair], int(sample))
-    assert pair == 1  # agents 1 and 3
+def test_leaderless_distances_reproduce_the_reference(leaderless: Simulation) -> None:
+    m = leaderless.metrics
+    t, smallest = extremum(m.time, m.min_r2, least=True)
     assert t == pytest.approx(0.173, abs=5e-4)
     assert smallest == pytest.approx(1.326202, abs=1e-6)
-    sample, pair = np.unravel_index(np.argmax(leaderless.r2), leaderless.r2.shape)
-    _, largest = turning_point(leaderless.t, leaderless.r2[:, pair], int(sample))
-    assert largest == pytest.approx(1.832563, abs=1e-6)
+    first, _, third = leaderless.positions[int(np.argmin(m.min_r2))]
+    assert np.sum((first - third) ** 2) == pytest.approx(smallest, abs=1e-4)
+    assert extremum(m.time, m.max_r2, least=False)[1] == pytest.approx(1.832563, abs=1e-6)
 
 
-def test_leaderless_velocities_reproduce_the_reference(leaderless: Run) -> None:
-    final = leaderless.v[-1]
+def test_leaderless_velocities_reproduce_the_reference(leaderless: Simulation) -> None:
+    final = leaderless.velocities[-1]
     assert np.linalg.norm(final, axis=1) == pytest.approx([0.10751301] * 3, abs=1e-8)
     headings = np.degrees(np.arctan2(final[:, 1], final[:, 0]))
     assert headings == pytest.approx([-74.7472] * 3, abs=5e-5)
-    deviation = leaderless.v - leaderless.v.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(deviation, axis=(1, 2))
+    length = leaderless.metrics.disagreement
     assert length[0] == pytest.approx(1.18887462, abs=5e-9)
     share = length / length[0]
     below = int(np.argmax(share < 0.01))
-    crossing = np.interp(0.01, share[[below, below - 1]], leaderless.t[[below, below - 1]])
+    crossing = np.interp(0.01, share[[below, below - 1]], leaderless.time[[below, below - 1]])
     assert crossing == pytest.approx(2.5355, abs=5e-4)
 
 
-def test_lyapunov_function_falls_strictly_to_the_reference(leaderless: Run) -> None:
-    w = np.array([lyapunov(x, v, PAPER) for x, v in zip(leaderless.x, leaderless.v)])
+def test_lyapunov_function_falls_strictly_to_the_reference(leaderless: Simulation) -> None:
+    w = leaderless.metrics.lyapunov
     assert w[0] == pytest.approx(6.0436562, abs=5e-8)
     assert w[-1] == pytest.approx(4.8031331, abs=1e-7)
     assert np.all(np.diff(w) < 0.0)
 
 
-@pytest.mark.parametrize(('model', 'extremum', 'reference', 'digits'), [
-    ('cucker_smale', np.min, 0.404997, 5e-7),
-    ('cucker_dong', np.max, 21.984, 5e-4),
-])
+@pytest.mark.parametrize(('model', 'figure', 'extreme', 'reference', 'digits'), [
+    ('cucker_smale', 'min_r2', np.min, 0.404997, 5e-7),
+    ('cucker_dong', 'max_r2', np.max, 21.984, 5e-4)])
 def test_predecessors_leave_the_band_as_in_the_reference(
-        model: Any, extremum: Callable[[Array], float], reference: float,
+        model: Any, figure: str, extreme: Callable[[Array], float], reference: float,
         digits: float) -> None:
-    run = runge_kutta(lambda t, x, v: accelerations(x, v, PAPER, model), LEADERLESS, 20.0, 0.01)
-    assert extremum(run.r2) == pytest.approx(reference, abs=digits)
+    run = simulate(*LEADERLESS, PARAMS, model=model, sample_period=0.01)
+    assert extreme(getattr(run.metrics, figure)) == pytest.approx(reference, abs=digits)
 
 
 def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
-    def law(reversed_: bool) -> Callable[[float, Array, Array], Array]:
-        def u(t: float, x: Array, v: Array) -> Array:
-            leader = leader_input(t + (1.25 if reversed_ else 0.0), reversed_)
-            return np.stack([leader, accelerations(x, v, PAPER)[1]])
-        return u
-
-    # Two runs, because no step may straddle the jump of the input.
-    first = runge_kutta(law(False), LEADER_FOLLOWER, 1.25, 0.01)
-    second = runge_kutta(law(True), (first.x[-1], first.v[-1]), 8.75, 0.01)
-    r2 = np.concatenate([first.r2, second.r2])
-    assert r2.min() == pytest.approx(1.3976, abs=1e-4)
-    assert r2.max() == pytest.approx(2.0049, abs=1e-4)
+    run = simulate(*LEADER_FOLLOWER, PARAMS, duration=10.0, led=True, sample_period=0.01)
+    assert run.metrics.min_r2.min() == pytest.approx(1.3976, abs=1e-4)
+    assert run.metrics.max_r2.max() == pytest.approx(2.0049, abs=1e-4)
 
 
 @st.composite
@@ -176,16 +115,13 @@ def rounding(flock: tuple[Array, Array]) -> float:
     return float(1e-14 * stiffness * (1.0 + disagreement(v)))
 
 
-MODELS = st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale'])
-
-
 def assert_close(actual: Array, expected: Array, rounding: float = 0.0) -> None:
     limit = 1e-8 * (1 + np.max(np.abs(expected))) + rounding
     assert actual == pytest.approx(expected, rel=1e-8, abs=limit)
 
 
-@given(flocks(), MODELS, st.tuples(*[st.floats(-3.0, 3.0)] * 3),
-       st.randoms(use_true_random=False))
+@given(flocks(), st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale']),
+       st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.randoms(use_true_random=False))
 def test_law_moves_turns_and_permutes_with_the_flock_and_sums_to_zero(
         flock: tuple[Array, Array], model: Any, vector: tuple[float, float, float],
         random: Any) -> None:
@@ -216,10 +152,10 @@ def test_law_equals_its_formula_written_out() -> None:
             if i == j:
                 continue
             r2 = np.sum((x[i] - x[j]) ** 2)
-            u[i] += PAPER.K / (PAPER.sigma ** 2 + r2) ** PAPER.beta * (v[j] - v[i])
-            u[i] += scale / (r2 - PAPER.d0) ** PAPER.theta * (x[i] - x[j])
-            u[i] += scale / (PAPER.d1 - r2) ** PAPER.theta * (x[j] - x[i])
-    assert accelerations(x, v, PAPER) == pytest.approx(u, rel=1e-12)
+            u[i] += PARAMS.K / (PARAMS.sigma ** 2 + r2) ** PARAMS.beta * (v[j] - v[i])
+            u[i] += scale / (r2 - PARAMS.d0) ** PARAMS.theta * (x[i] - x[j])
+            u[i] += scale / (PARAMS.d1 - r2) ** PARAMS.theta * (x[j] - x[i])
+    assert accelerations(x, v, PARAMS) == pytest.approx(u, rel=1e-12)
 
 
 @pytest.mark.parametrize(('r2', 'pull'), [(1.0 + 1e-5, -1e10), (8.0 - 1e-5, 1e10)])
@@ -263,8 +199,7 @@ def test_equal_velocities_and_an_agent_alone_give_no_acceleration() -> None:
 @pytest.mark.parametrize('theta', [1.0, 1.5, 2.0, 3.0])
 def test_lyapunov_function_is_positive_falls_and_is_infinite_outside(theta: float) -> None:
     params = FlockingParams(theta=theta)
-    run = runge_kutta(lambda t, x, v: accelerations(x, v, params), LEADERLESS, 2.0, 0.01)
-    w = np.array([lyapunov(x, v, params) for x, v in zip(run.x, run.v)])
+    w = simulate(*LEADERLESS, params, duration=2.0, sample_period=0.01).metrics.lyapunov
     assert np.all(w > 0.0)
     assert np.all(np.diff(w) < 0.0)
     for distance in (0.9, 1.0, 1.5, 1.6):
@@ -303,6 +238,6 @@ def test_bad_states_are_refused_with_what_to_change(positions: Any, velocities: 
                                                     message: str) -> None:
     for function in (accelerations, lyapunov):
         with pytest.raises(ValueError, match=message):
-            function(positions, velocities, PAPER)
+            function(positions, velocities, PARAMS)
     with pytest.raises(ValueError, match=f'relative_{message}'.replace(' velocities ', ' .*')):
-        acceleration(positions, velocities, PAPER)
+        acceleration(positions, velocities, PARAMS)

@@ -36,8 +36,9 @@ def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
 def test_a_part_is_not_left_by_a_full_disk_or_an_interrupt(
         tmp_path: Path, size: int, error: type[BaseException]) -> None:
     path = tmp_path / 'x'
+    path.write_bytes(b'old')
     with disk_of(1000), pytest.raises(error) as caught, whole_file(path) as file:
         file.write(bytes(size))
         raise KeyboardInterrupt
     assert getattr(caught.value, 'filename', str(path)) == str(path)
-    assert not list(tmp_path.iterdir())
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == [b'old']

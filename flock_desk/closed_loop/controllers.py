@@ -26,7 +26,7 @@ Each flies the same planner, limits, altitude and yaw. Without the guard they ha
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -50,15 +50,18 @@ class PdServo(FlockingParams):
 class CuckerSmale(FlockingParams):
     """Alignment alone."""
 
+    MODEL: ClassVar[Model] = 'cucker_smale'
+
     def command(self, offsets: Array, differences: Array) -> Array:
-        return _of_model('cucker_smale', offsets, differences, self)
+        own = np.zeros((1, offsets.shape[1]))
+        return accelerations(np.vstack([own, offsets]), np.vstack([own, differences]), self,
+                             self.MODEL)[0]
 
 
-class CuckerDong(FlockingParams):
+class CuckerDong(CuckerSmale):
     """The law without cohesion."""
 
-    def command(self, offsets: Array, differences: Array) -> Array:
-        return _of_model('cucker_dong', offsets, differences, self)
+    MODEL = 'cucker_dong'
 
 
 class Controller(NamedTuple):
@@ -77,9 +80,3 @@ CONTROLLERS = {'law': Controller('law', FlockingParams),
                'pd': Controller('PD servo', PdServo),
                'cucker_smale': Controller('Cucker-Smale', CuckerSmale),
                'cucker_dong': Controller('Cucker-Dong', CuckerDong)}
-
-
-def _of_model(model: Model, offsets: Array, differences: Array, params: FlockingParams) -> Array:
-    positions, velocities = (np.vstack([np.zeros((1, each.shape[1])), each])
-                             for each in (offsets, differences))
-    return accelerations(positions, velocities, params, model)[0]

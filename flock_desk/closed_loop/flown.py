@@ -25,6 +25,7 @@ from typing import Final
 import numpy as np
 
 from flock_desk.closed_loop.scenario_run import ScenarioRun
+from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP, Motion
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
@@ -104,14 +105,13 @@ class ExternalVehicle(_Reported):
     :param height: m above the ground, of its first reported place.
     """
 
-    def __init__(self, motion: ExternalMotion, start_ns: int, height: float) -> None:
-        super().__init__(motion, start_ns, np.array([0.0, 0.0, height]))
+    def __init__(self, autopilot: ExternalAutopilot, start_ns: int, height: float) -> None:
+        super().__init__(autopilot.motion, start_ns, np.array([0.0, 0.0, height]))
+        self._autopilot = autopilot
         self.offboard = False
         """Whether it obeys the bridge's setpoints, by the bridge's state; set by the owner."""
-        self.armed, self.mode = False, ''
-        """Armed and mode by the HEARTBEAT, for the log; set by the owner."""
         self.log = FlightLog()
-        self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
+        self._rotation = quaternion_to_matrix(self.at(0).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
         """Return the reported motion, interpolated."""
@@ -119,7 +119,8 @@ class ExternalVehicle(_Reported):
         before, self._rotation = self._rotation, quaternion_to_matrix(state.quaternion)
         self.log.moved((self._start_ns + time_ns) * 1e-9, state.position,
                        self._rotation @ state.linear, np.full(3, np.nan),
-                       yaw_from_quaternion(state.quaternion), self.armed, self.mode)
+                       yaw_from_quaternion(state.quaternion), self._autopilot.armed,
+                       self._autopilot.mode)
         # Not the reported rates: poses arrive unevenly, and the camera sees that.
         return state._replace(
             angular=matrix_to_rotation_vector(before.T @ self._rotation) / STEP)

@@ -216,7 +216,7 @@ FIGURES = {
     'unasked_setpoints': Figure('unasked_setpoints', np.sum, np.sum),  # without an offboard call
     # Followers that do not follow at the end, or that no chain of near ones links to the leader.
     'lost_for_good': Figure('lost', np.sum),
-    'rms_acceleration_m_s2': Figure('rms_acceleration', _rms),
+    'rms_acceleration_m_s2': Figure('rms_acceleration', _rms, _rms),
     'time_tracking': Figure('tracking', np.mean),  # share in TRACK
     'edges': Figure('edges', np.mean),  # how many each follows
     'neighbors_in_sight': Figure('shown', np.mean),  # of all others, each
@@ -262,17 +262,16 @@ def of_runs(rows: Measures, flights: Flights) -> Measures:
     kept = _kept(flights)
     by_run = len(flights.positions), -1
     tracking = flights.state == STATES.index(State.TRACK)
-    squares = np.nanmean(np.sum(flights.command ** 2, axis=2), axis=1)
     rows = {**rows, 'tracking': tracking.mean(axis=1), 'edges': flights.edges.mean(axis=1),
-            'shown': flights.shown.mean(axis=1), 'squares': squares}
+            'shown': flights.shown.mean(axis=1),
+            'rms_acceleration': np.sqrt(np.nanmean(np.sum(flights.command ** 2, axis=2), axis=1))}
     reductions = {figure.measure: figure.over_followers for figure in FIGURES.values()}
-    runs = {name: reductions.get(name, np.mean)(values.reshape(by_run)[:, kept], axis=1)
+    runs = {name: reductions[name](values.reshape(by_run)[:, kept], axis=1)
             for name, values in rows.items()}
     late = flights.times > flights.times[-1] - LOST_AFTER
     strayed = np.stack([_strayed(positions[-1], flights) for positions in flights.positions])
     lost = ~tracking[:, late].any(axis=1).reshape(by_run) | strayed
     runs['lost'] = lost[:, kept].sum(axis=1).astype(float)
-    runs['rms_acceleration'] = np.sqrt(runs.pop('squares'))
     return runs
 
 

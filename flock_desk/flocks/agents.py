@@ -46,6 +46,7 @@ from flock_desk.flocks.laws import (
     pairs_within,
     step_is_small,
 )
+from flock_desk.flocks.paper import leader_input, LEADER_SWITCH
 from flock_follower import flocking
 from flock_follower.flocking import accelerations, FlockingParams
 from flock_follower.geometry import Array
@@ -57,18 +58,6 @@ State = tuple[Array, Array]
 VICSEK_STEP, VICSEK_RADIUS = 0.1, 1.0  # s, and m: how far an agent sees
 _LOOK_PERIOD = 0.05  # s between searches for new edges
 _SKIN = 0.05  # m that agents may move before near pairs are searched again
-
-
-@dataclass(frozen=True)
-class Leader:
-    """
-    A prescribed acceleration of agent 0, which then reacts to no other.
-
-    ``acceleration`` gives (n,), m/s^2, at a time in s; ``breaks`` are the times of its jumps.
-    """
-
-    acceleration: Callable[[float], ArrayLike]
-    breaks: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -89,15 +78,14 @@ class Simulation:
 
 
 def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
-             duration: float = 20.0, model: Model = 'flocking', leader: Leader | None = None,
-             sample_period: float = 0.02,
-             progress: Callable[[float], None] | None = None) -> Simulation:
+             duration: float = 20.0, model: Model = 'flocking', led: bool = False,
+             sample_period: float = 0.02) -> Simulation:
     """
     Return how a flock moves from its positions and velocities, both (k, n) with n = 2 or 3.
 
+    :param led: whether agent 0 is the paper's leader, which obeys ``leader_input`` alone.
     :param duration: s to simulate; :param sample_period: s between the times returned, at least
         0.1 s for Vicsek's rule.
-    :param progress: called with the share done, 0 to 1.
     :raises ValueError: for an unknown model, bad shapes or values, or a start outside the band.
     :raises RuntimeError: if no finite solution goes on.
     """
@@ -106,40 +94,35 @@ def simulate(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
     x, v = flocking.checked(positions, velocities)
     if model.startswith('vicsek'):
         time = VICSEK_STEP * np.arange(round(duration / VICSEK_STEP) + 1)
-        states = _vicsek(x, v, len(time) - 1, model, leader)
+        states = _vicsek(x, v, len(time) - 1, model, led)
     else:
         time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
         _check_band(x, params, model)
-        states = adaptive(partial(_acceleration, params, cast(flocking.Model, model), leader),
-                          (x, v), time, leader.breaks if leader else ())
-    return Simulation(time, *_collected(states, len(time), progress), params)
+        states = adaptive(partial(_acceleration, params, cast(flocking.Model, model), led),
+                          (x, v), time, (LEADER_SWITCH,) if led else ())
+    x, v = map(np.array, zip(*states))
+    return Simulation(time, x, v, params)
 
 
 def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams, *,
                    duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
-                   progress: Callable[[float], None] | None = None) -> Simulation:
+                   progress: Callable[[], object] = lambda: None) -> Simulation:
     """
     Return how a flock moves on its neighbour graph; see ``simulate``.
 
     :param dt: s, the longest step.
+    :param progress: called at each of the times returned.
     :raises RuntimeError: if the flock ends at a singularity of the law.
     """
     x, v = flocking.checked(positions, velocities)
     time = np.linspace(0.0, duration, max(1, round(duration / sample_period)) + 1)
     growing = _GrowingGraph(x, params)
-    x, v = _collected(growing.states((x, v), time, dt), len(time), progress)
+    states = []
+    for state in growing.states((x, v), time, dt):
+        states.append(state)
+        progress()
+    x, v = map(np.array, zip(*states))
     return Simulation(time, x, v, params, Graph(growing.edges, np.array(growing.joined)))
-
-
-def _collected(states: Iterator[State], count: int,
-               progress: Callable[[float], None] | None) -> State:
-    run: list[State] = []
-    for state in states:
-        run.append(state)
-        if progress is not None:
-            progress((len(run) - 1) / (count - 1))
-    x, v = map(np.array, zip(*run))
-    return x, v
 
 
 class _GrowingGraph:
@@ -180,22 +163,22 @@ class _GrowingGraph:
         return self._near[1]
 
 
-def _acceleration(params: FlockingParams, model: flocking.Model, leader: Leader | None, t: float,
-                  x: Array, v: Array) -> Array:
+def _acceleration(params: FlockingParams, model: flocking.Model, led: bool, t: float, x: Array,
+                  v: Array) -> Array:
     u = accelerations(x, v, params, model)
-    if leader is not None:
-        u[0] = leader.acceleration(t)
+    if led:
+        u[0] = leader_input(t)
     return u
 
 
 def _vicsek(x: Array, v: Array, steps: int, model: Model,
-            leader: Leader | None) -> Iterator[State]:
+            led: bool) -> Iterator[State]:
     """Yield the first state, and that after every step."""
     yield x, v
     for n in range(steps):
         after = velocities_after(x, v, model == 'vicsek_mean_velocity')
-        if leader is not None:
-            after[0] = v[0] + VICSEK_STEP * np.asarray(leader.acceleration(n * VICSEK_STEP))
+        if led:
+            after[0] = v[0] + VICSEK_STEP * leader_input(n * VICSEK_STEP)
         # In this order: the present velocity leads to the next place.
         x, v = x + VICSEK_STEP * v, after
         yield x, v
@@ -214,8 +197,11 @@ def velocities_after(positions: Array, velocities: Array, mean_velocity: bool = 
         mean: Array = seen @ velocities / seen.sum(axis=1, keepdims=True)
         return mean
     speed = np.linalg.norm(velocities, axis=1, keepdims=True)
-    total = seen @ (velocities / np.maximum(speed, 1e-12))
-    return speed * total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    heading = velocities / np.maximum(speed, 1e-12)
+    total = seen @ heading
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    # Headings that cancel have no mean: an agent then keeps its own.
+    return speed * np.where(length > 1e-12, total / np.maximum(length, 1e-12), heading)
 
 
 def adaptive(acceleration: Acceleration, start: State, times: Array,

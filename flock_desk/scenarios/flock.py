@@ -33,20 +33,15 @@ _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from
 
 
 class Part(Checked):
-    """A part of a scenario, checked as it is made; one number is an interval of that number."""
+    """A part of a scenario, checked as it is made."""
 
     def __post_init__(self) -> None:
-        intervals = [f.name for f in fields(self)  # type: ignore[arg-type]
-                     if f.type == 'Interval']
-        for name in intervals:
-            value = getattr(self, name)
-            if not isinstance(value, tuple):
-                object.__setattr__(self, name, (value, value))
         super().__post_init__()
-        for name in intervals:
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f'{name} = {[low, high]}: must be [lowest, highest]')
+        for field in fields(self):  # type: ignore[arg-type]
+            if field.type == 'Interval':
+                low, high = getattr(self, field.name)
+                if low > high:
+                    raise ValueError(f'{field.name} = {[low, high]}: must be [lowest, highest]')
 
 
 @dataclass(frozen=True)

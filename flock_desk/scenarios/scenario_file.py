@@ -112,7 +112,9 @@ def parse(text: str, path: str, variant: str = '') -> Scenario:
     stem = Path(path).stem
     try:
         root = yaml.safe_load(text)
-        variants = root.pop(_VARIANTS, {}) if isinstance(root, dict) else {}
+        variants = root.pop(_VARIANTS, None) or {} if isinstance(root, dict) else {}
+        if not isinstance(variants, dict):
+            raise ValueError(f'{_VARIANTS} = {variants!r}: must be a mapping of names to keys')
         scenario: Scenario = _part(Scenario, root, '', name=stem)
         if variant in variants:
             scenario = _part(Scenario, variants[variant], f'{_VARIANTS}.{variant}', scenario,
@@ -187,7 +189,11 @@ def _table(where: str, part: Any) -> str:
     rows = [f'\n## {where or "The file"}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
             '| key | default | valid | meaning |', '|---|---|---|---|']
     for field in fields(part):
+        if field.name == 'name':  # that of the file
+            continue
         default, valid = field.default, field.metadata.get('valid') or ''
+        if isinstance(default, tuple):
+            default = list(default)
         if default is MISSING or is_dataclass(default):
             default = 'needed' if field.default_factory is MISSING else 'see below'
         if isinstance(valid, tuple):

@@ -64,8 +64,9 @@ class EmbeddedAutopilot:
     """
     An autopilot with the personality of PX4 or ArduCopter.
 
+    :param personality: a key of ``PROFILES``.
     :param now: monotonic time, s, of the start; messages carry times since then.
-    :param start: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
+    :param start: one of ``STARTS``: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
     :param altitude: m, of an airborne start.
     :param yaw: rad, ENU, at the start.
     :param parameters: values that differ from the autopilot's defaults.
@@ -73,17 +74,13 @@ class EmbeddedAutopilot:
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, if the link is signed.
-    :raises ValueError: for an unknown personality, start or parameter.
+    :raises ValueError: for an unknown parameter, or a value that it cannot have.
     """
 
     def __init__(self, personality: str = 'px4', *, now: float, start: str = 'airborne',
                  altitude: float = 2.0, yaw: float = 0.0, system_id: int = 1,
                  parameters: Mapping[str, float] = _NO_PARAMETERS, arming_denial: str = '',
                  ready_after: float = 0.0, seed: int = 0, signing: Any = None) -> None:
-        for name, value, valid in (('personality', personality, tuple(PROFILES)),
-                                   ('start', start, STARTS)):
-            if value not in valid:
-                raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
         self._profile = PROFILES[personality]
         self._parameters = Parameters(self._profile)
         for name, number in parameters.items():
@@ -198,9 +195,11 @@ class EmbeddedAutopilot:
 
     def _due_messages(self, now: float) -> list[Any]:
         messages = self._status_texts()
-        if self.controller.mode != self._shown_mode:  # each change is shown at once
-            self._shown_mode = self.controller.mode
-            self._due[self._profile.mode_message] = now
+        if self.controller.mode != self._shown_mode:
+            self._shown_mode, shown_by = self.controller.mode, self._profile.mode_message
+            # PX4 shows a change in its stream; ArduCopter sends another HEARTBEAT at once.
+            delay = self._intervals[shown_by] if self._profile.px4 else 0.0
+            self._due[shown_by] = min(self._due[shown_by], now + delay)
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
                 name = _NAMES[message_id]
@@ -208,6 +207,8 @@ class EmbeddedAutopilot:
                     messages.append(mavlink.mavlink_map[message_id](*fields))
                 # From the time it was due: the mean rate is exact.
                 interval = self._intervals[message_id]
+                if name == 'CURRENT_MODE':
+                    interval = max(interval, CURRENT_MODE_PERIOD)
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
         return messages
 
@@ -228,6 +229,8 @@ class EmbeddedAutopilot:
                 results = [controller.take_off(message.param7, now)]
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 results = [self._set_interval(message.param1, message.param2, now)]
+            case mavlink.MAV_CMD_RUN_PREARM_CHECKS if controller.armed and not self._profile.px4:
+                results = [int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)]
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
                 controller.check_arming(now)
                 results = [ACCEPTED]
@@ -242,9 +245,7 @@ class EmbeddedAutopilot:
         fixed = self._profile.px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         if message_id not in self._intervals or not microseconds > 0.0 or fixed:
             return self._profile.unknown_message
-        slowest = (CURRENT_MODE_PERIOD if message_id == mavlink.MAVLINK_MSG_ID_CURRENT_MODE
-                   else STEP)
-        self._intervals[int(message_id)] = max(microseconds * 1e-6, slowest)
+        self._intervals[int(message_id)] = max(microseconds * 1e-6, STEP)
         self._due[int(message_id)] = now
         return ACCEPTED
 
@@ -294,7 +295,7 @@ class EmbeddedAutopilot:
             case 'EKF_STATUS_REPORT':
                 return self.estimator_flags(now), 0.0, 0.0, 0.0, 0.0, 0.0
             case 'ESTIMATOR_STATUS':
-                # Without aiding nothing is compared any more, and the accuracy grows.
+                # Without aiding nothing is compared any more.
                 ratio, accuracy = ((0.02, 0.03) if controller.conditions(now)['aided']
                                    else (math.nan, 100.0))
                 return (self._boot_ms(now) * 1000, self.estimator_flags(now), ratio, ratio,

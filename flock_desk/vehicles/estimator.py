@@ -101,23 +101,24 @@ class Estimator:
     def on_odometry(self, message: Any, now: float, age: float) -> None:
         """Take an ODOMETRY of an age, s, if it is one that the autopilot uses."""
         profile, (w, x, y, z) = self._profile, message.q
+        numbers = [message.x, message.y, message.z, message.vx, message.vy, message.vz, w, x, y, z]
         # PX4 wants the six variances on the diagonals.
         filled = not profile.px4 or all(
             math.isfinite(matrix[i]) and matrix[i] > 0.0 for i in (0, 6, 11, 15, 18, 20)
             for matrix in (message.pose_covariance, message.velocity_covariance))
         if (not self.uses_vision or not -_FUTURE <= age <= profile.oldest_vision or not filled
                 or message.frame_id not in profile.frames
-                or message.child_frame_id != mavlink.MAV_FRAME_BODY_FRD):
+                or message.child_frame_id != mavlink.MAV_FRAME_BODY_FRD
+                or not np.all(np.isfinite(numbers)) or math.hypot(w, x, y, z) < 0.5):
             return
         attitude = quaternion_ned_frd_to_enu_flu(normalize_quaternion([x, y, z, w]))
-        innovation = ned_to_enu([message.x, message.y, message.z]) - self.position
+        innovation = ned_to_enu(numbers[:3]) - self.position
         starts = message.reset_counter != self._reset_counter
         if not starts and np.linalg.norm(innovation) > INNOVATION_GATE:
             return
         gain = 1.0 if starts else -math.expm1(
             -min(now - self._vision_time, VISION_TIMEOUT) / _TIME_CONSTANT)
-        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(
-            [message.vx, message.vy, message.vz])
+        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(numbers[3:6])
         self._position_error = self._position_error + gain * innovation
         self._velocity_error = self._velocity_error + gain * (velocity - self.velocity)
         self.yaw_error = wrap_angle(

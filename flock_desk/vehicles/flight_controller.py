@@ -124,7 +124,11 @@ class FlightController(ABC):
         """Return the MAV_STATE of HEARTBEAT."""
         if self.in_failsafe:
             return int(mavlink.MAV_STATE_CRITICAL)
-        return int(mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY)
+        px4 = self.PROFILE.px4
+        if self.armed if px4 else self._flown:  # ArduCopter is active in the air only
+            return int(mavlink.MAV_STATE_ACTIVE)
+        unfit = px4 and self.missing(self.mode, self._time, self.PROFILE.arming)
+        return int(mavlink.MAV_STATE_UNINIT if unfit else mavlink.MAV_STATE_STANDBY)
 
     @property
     def landed_state(self) -> int:
@@ -255,16 +259,12 @@ class FlightController(ABC):
         self.vehicle.step(quaternion_to_matrix(quaternion_from_yaw(-error)) @ wanted,
                           wrap_angle(self._yaw - error), dt, powered=self.armed, wind=self.wind)
         self._flown = self.armed and (self._flown or not self.vehicle.landed)
-        if not (self.armed and self.vehicle.landed and self._rests):
+        # PX4 counts from the report of its land detector on.
+        if not (self.armed and self.vehicle.landed and (self.on_ground or not self.PROFILE.px4)):
             self._landed_since = now
         elif 0.0 < self._disarms_after <= now - self._landed_since:
             self._flown = self.in_failsafe = False
             self._disarm(now)
-
-    @property
-    def _rests(self) -> bool:
-        """Return whether the time until it disarms passes, on the ground."""
-        return True
 
     def _choose(self, name: str, now: float) -> None:
         """Change the mode by a request on the link."""

@@ -232,8 +232,7 @@ class Parameters(dict[str, float]):
 
     def __init__(self, profile: Profile) -> None:
         super().__init__({name: float(value) for name, (_, value) in profile.parameters.items()})
-        self._types = {name: kind for name, (kind, _) in profile.parameters.items()}
-        self._bytewise = profile.px4
+        self._profile = profile
 
     def set(self, name: str, value: float) -> None:
         """
@@ -243,7 +242,7 @@ class Parameters(dict[str, float]):
         """
         if name not in self:
             raise ValueError(f'{name}: must be one of {", ".join(self)}')
-        if self._types[name] == FLOAT:
+        if self._profile.parameters[name][0] == FLOAT:
             Range().check(name, value)
         else:
             _WHOLE.check(name, int(value) if float(value).is_integer() else value)
@@ -254,8 +253,9 @@ class Parameters(dict[str, float]):
         name = str(message.param_id)
         if name not in self:
             return []
-        value, bytewise = self[name], self._bytewise and self._types[name] != FLOAT
+        value, kind = self[name], self._profile.parameters[name][0]
+        bytewise = self._profile.px4 and kind != FLOAT
         return [mavlink.MAVLink_param_value_message(
             name.encode(),
             struct.unpack('<f', struct.pack('<i', int(value)))[0] if bytewise else value,
-            self._types[name], len(self), _UNKNOWN_INDEX)]
+            kind, len(self), _UNKNOWN_INDEX)]

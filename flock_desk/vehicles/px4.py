@@ -178,9 +178,5 @@ class Px4(FlightController):
                           or self._resting_for >= _LANDING_TIME)
 
     @property
-    def _rests(self) -> bool:
-        return self.on_ground
-
-    @property
     def _disarms_after(self) -> float:
         return self.parameters['COM_DISARM_LAND' if self._flown else 'COM_DISARM_PRFLT']

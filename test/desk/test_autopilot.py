@@ -30,6 +30,7 @@ import pytest
 
 from flock_desk import autopilot
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
+from flock_desk.vehicles.profiles import PX4
 from flock_desk.vehicles.quadrotor import Quadrotor
 from flock_follower.geometry import GRAVITY
 
@@ -58,6 +59,14 @@ def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
     assert vehicle.rotation[2, 1] > 0.05 and abs(vehicle.rotation[2, 0]) < 1e-9
 
 
+def test_wind_pushes_the_vehicle_and_the_hover_thrust_errs():
+    vehicle = Quadrotor((0, 0, 50))
+    for _ in range(100):
+        vehicle.step([0.0, 0.0, 0.0], 0.0, STEP, wind=[5.0, 0.0, 0.0])
+    gained = 1.0 - math.exp(-0.1)  # drag of 0.1 1/s, for 1 s
+    assert vehicle.velocity == pytest.approx([5.0 * gained, 0.0, 0.08 * gained], rel=0.01)
+
+
 # PX4.
 
 
@@ -82,7 +91,9 @@ def test_setpoints_px4_would_drop_do_not_count_as_a_stream(dropped):
 def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
     flight = Flight(start='landed')
     assert flight.mode('OFFBOARD') == [0, 0] and flight.arm() == [1]
+    assert flight.controller.system_status == mavlink.MAV_STATE_UNINIT
     flight.send(setpoint())
+    assert flight.controller.system_status == mavlink.MAV_STATE_STANDBY
     assert flight.arm() == [0] and flight.controller.mode == 'OFFBOARD'
     assert flight.arm(False) == [0] and flight.mode('AUTO.LAND') == [0, 0]
     assert flight.arm() == [1] and flight.controller.mode == 'AUTO.LAND'
@@ -141,6 +152,7 @@ def test_px4_without_an_origin_stays_in_its_take_off_until_it_gets_one():
     assert flight.controller.mode == 'AUTO.TAKEOFF'
     assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
     assert flight.mode('AUTO.LOITER') == [0, 1] and flight.mode('POSCTL') == [0, 1]
+    assert not flight.all('HOME_POSITION')
     answers = flight.send(ORIGIN)
     assert [m.get_type() for m in answers] == ['GPS_GLOBAL_ORIGIN']
     flight.fly(0.1, seen(flight))
@@ -160,6 +172,19 @@ def test_px4_without_a_position_falls_back_until_something_can_be_flown():
     assert state(flight) == ('AUTO.LAND', True)
     flight.fly(0.1, setpoint())
     assert state(flight) == ('OFFBOARD', False)
+
+
+@pytest.mark.parametrize(('rate', 'least', 'most'), [(50.0, 0.01, 0.03), (5.0, 0.1, 0.25)])
+def test_px4_shows_a_change_of_the_mode_in_its_stream(rate, least, most):
+    flight = Flight()
+    flight.ask('CURRENT_MODE', rate)
+    flight.fly(3.03)
+    assert len(flight.all('CURRENT_MODE')) == 7  # twice a second while the mode stays
+    flight.mode('AUTO.LAND')
+    changed = flight.now
+    while flight.last('CURRENT_MODE').custom_mode != PX4.modes['AUTO.LAND'].number:
+        flight.fly(0.01)
+    assert least <= round(flight.now - changed, 3) <= most
 
 
 @pytest.mark.parametrize(('above_home', 'reached'), [(4.0, 4.0), (-400.0, 2.5)])
@@ -182,11 +207,19 @@ def test_arducopter_says_why_it_does_not_arm_and_stays_in_land():
     assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [0]
     assert flight.texts() == ['PreArm: Compass not calibrated']
     flight = Flight('arducopter')
+    assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [1] and flight.texts() == []
     flight.mode('LAND')
     flight.fly(8.0)
     assert (flight.controller.mode, flight.controller.armed) == ('LAND', False)
     assert flight.arm() == [4] and flight.texts()[-1] == 'Arm: LAND mode not armable'
     assert flight.mode('GUIDED') == [0] and flight.arm() == [0]
+
+
+def test_arducopter_obeys_nan_and_falls():
+    flight = Flight('arducopter', altitude=20.0)
+    flight.mode('GUIDED')
+    flight.fly(1.0, setpoint(math.nan))
+    assert flight.vehicle.velocity[2] < -5.0
 
 
 def test_brake_holds_the_position_and_is_refused_without_one():
@@ -255,16 +288,19 @@ def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality):
     assert len(flight.all('LOCAL_POSITION_NED')) > 50
 
 
-@pytest.mark.parametrize(('options', 'message'), [
-    ({'personality': 'betaflight'}, "personality = 'betaflight': must be one of px4, arducopter"),
-    ({'start': 'diving'}, "start = 'diving': must be one of airborne, armed, landed"),
-    ({'parameters': {'GUID_TIMEOUT': 1.0}}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
-    ({'parameters': {'COM_OBL_RC_ACT': 1.5}}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
-    ({'parameters': {'COM_OF_LOSS_T': math.inf}}, 'COM_OF_LOSS_T = inf: must be a finite number')])
-def test_bad_options_are_named(options, message):
-    with pytest.raises(ValueError) as error:
-        EmbeddedAutopilot(now=0.0, **options)
-    assert str(error.value).startswith(message)
+def test_a_reboot_in_the_air_brings_it_down():
+    flight = Flight(altitude=30.0, faults=[Fault('reboot', 0.5, duration=3.0)])
+    flight.fly(2.5)
+    assert flight.vehicle.velocity[2] < -8.0
+
+
+@pytest.mark.parametrize(('parameters', 'message'), [
+    ({'GUID_TIMEOUT': 1.0}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
+    ({'COM_OBL_RC_ACT': 1.5}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
+    ({'COM_OF_LOSS_T': math.inf}, 'COM_OF_LOSS_T = inf: must be a finite number')])
+def test_bad_parameters_are_named(parameters, message):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        EmbeddedAutopilot(now=0.0, parameters=parameters)
 
 
 # The command.

@@ -37,6 +37,7 @@ def height(message):
     ('px4', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, True), ('px4', {}, True),
     ('px4', {'variance': math.nan}, False), ('px4', {'variance': 0.0}, False),
     ('px4', {'child': mavlink.MAV_FRAME_LOCAL_FRD}, False),
+    ('px4', {'error': (math.nan, 0.0, 0.0)}, False),
     ('px4', {'frame': mavlink.MAV_FRAME_BODY_FRD}, False),
     ('arducopter', {}, True), ('arducopter', {'variance': math.nan}, True),
     ('arducopter', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, False),
@@ -86,6 +87,19 @@ def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learnt(
             round((1000.0 + flight.now) * 1e9), flight.last('TIMESYNC').ts1))
     flight.fly(0.5, lambda: odometry((0.0, 0.0, 0.0), time=1000.0 + flight.now - age))
     assert flight.controller.position_known(flight.now) == used
+
+
+@pytest.mark.parametrize(('personality', 'seconds', 'error'), [
+    ('px4', 13.0, 1.6), ('arducopter', 7.0, 0.11)])
+def test_without_vision_the_velocity_is_sent_on_and_drifts(personality, seconds, error):
+    flight = Flight(personality, parameters=BLIND[personality])
+    flight.fly(1.2, seen(flight), setpoint())
+    flight.mode('OFFBOARD' if personality == 'px4' else 'GUIDED')
+    flight.fly(seconds, setpoint())
+    assert flight.controller.mode in ('OFFBOARD', 'GUIDED')
+    sent, true = flight.last('LOCAL_POSITION_NED'), flight.vehicle.velocity
+    assert flight.now - sent.time_boot_ms * 1e-3 < 0.1
+    assert math.hypot(sent.vy - true[0], sent.vx - true[1]) == pytest.approx(error, rel=0.1)
 
 
 def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():

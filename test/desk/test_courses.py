@@ -30,9 +30,9 @@ SHUTTLE = LeaderMotion('legs', legs=(Leg(6.0, (1.2, 0.0, 0.0)), Leg(6.0, (-1.2, 
                        repeat=True)
 MOTIONS = {
     'legs': SHUTTLE,
-    'circle': LeaderMotion('circle', speed=1.2, size=1.6),
-    'figure_eight': LeaderMotion('figure_eight', speed=1.2, size=2.0),
-    'wander': LeaderMotion('wander', speed=0.4),
+    'circle': LeaderMotion('circle', speed=(1.2, 1.2), size=1.6),
+    'figure_eight': LeaderMotion('figure_eight', speed=(1.2, 1.2), size=2.0),
+    'wander': LeaderMotion('wander', speed=(0.4, 0.4)),
 }
 RANDOM = [f'{speed}{name}' for speed in ('', 'fast_')
           for name in ('spline', 'random_walk', 'stairs', 'approach')]

@@ -15,6 +15,7 @@
 """A flight in real time without clock, socket or ROS: its sensors show the truth."""
 
 import math
+from types import SimpleNamespace
 
 from marker_images import seen_corners
 import numpy as np
@@ -41,6 +42,7 @@ from flock_desk.scenarios.scenario import (
     Sensing,
     VioErrors,
 )
+from flock_desk.sensors.vio import Odometry
 from flock_follower.geometry import (
     enu_to_ned,
     matrix_to_rotation_vector,
@@ -124,7 +126,7 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
 
 
 def test_the_image_shows_the_marker_where_truth_camera_and_mounting_put_it(camera):
-    motion = LeaderMotion(motion='circle', wait=0.0, speed=0.5, size=1.0)
+    motion = LeaderMotion(motion='circle', wait=0.0, speed=(0.5, 0.5), size=1.0)
     flown = Commanded(camera, (0.2, -0.1, 0.05), yaw=-0.1, leader=motion).fly(2.0)
     k = calibration(camera.camera)
     model = CameraModel(np.reshape(k['k'], (3, 3)), k['d'], k['distortion_model'], k['width'],
@@ -166,7 +168,7 @@ def test_light_changes_hide_the_marker_for_as_long_as_the_scenario_says():
 
 
 def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pose():
-    motion = LeaderMotion(motion='circle', wait=0.0, speed=1.0, size=1.5, heading='course')
+    motion = LeaderMotion(motion='circle', wait=0.0, speed=(1.0, 1.0), size=1.5, heading='course')
     live, time, h = ScenarioRun(scenario(leader=motion), 1), 9.0, 0.01
     before, state, after, opposite = (live.motion(0, t) for t in (
         time - h, time, time + h, time + math.pi * 1.5 / 1.0))
@@ -179,6 +181,16 @@ def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pos
     assert state.angular == pytest.approx(matrix_to_rotation_vector(turn) / (2 * h), abs=0.02)
     assert yaw_from_quaternion(state.quaternion) == pytest.approx(
         math.atan2(*(rotation @ state.linear)[1::-1]), abs=0.05)
+
+
+def test_a_leader_that_faces_away_turns_its_tail_to_the_follower():
+    live = ScenarioRun(scenario(leader=LeaderMotion(heading='away')), 0)
+    follower = Odometry(0.0, np.array([1.5, -1.5, 1.5]), quaternion_from_yaw(0.0), np.zeros(3),
+                        np.zeros(3))
+    for k in range(1500):
+        live.step(follower, 0.01 * k, offboard=True)
+    assert yaw_from_quaternion(live.motion(0, 15.0).quaternion) == pytest.approx(
+        math.pi / 2, abs=0.01)
 
 
 # Vehicles flown elsewhere.
@@ -203,7 +215,8 @@ class Elsewhere:
         self.motion, self.ahead = ExternalMotion(), ExternalMotion()
         self.sent_ns, self.led_ns = START - PERIOD, START - PERIOD
         self.report(START)
-        self.vehicle = ExternalVehicle(self.motion, START, height=0.0)
+        autopilot = SimpleNamespace(motion=self.motion, armed=True, mode='')
+        self.vehicle = ExternalVehicle(autopilot, START, height=0.0)
         self.flight = RealTimeFlight(
             scenario(sensing=STILL, odometry=EXACT), 0, self.vehicle, camera,
             LATEST_NS + 40_000_000 * led,
@@ -287,3 +300,7 @@ def test_a_leader_elsewhere_is_where_it_reports_and_the_scenarios_does_not_fly(c
         # Every pose that the image shows had been reported.
         assert START + frame.stamp_ns + round(0.5e9 * SENSOR.exposure) <= flown.ahead.newest
     assert len(flown.frames) >= 73 and flown.flight.skipped_images == 0
+    leader = ExternalLeader(flown.ahead, START, np.zeros(3))
+    for stalled, there in ((0.1, True), (0.2, False)):
+        at = flown.ahead.newest - START + round(stalled * 1e9)
+        assert (leader.motion(at, 0.0) is not None) == there

@@ -139,6 +139,15 @@ def test_the_surroundings_move_against_the_turn_of_the_camera_and_have_no_seam(l
     np.testing.assert_allclose(turned(np.pi - 1e-7), turned(-np.pi + 1e-7), atol=1e-3)
 
 
+def test_the_poses_of_an_exposure_are_spread_about_its_stamp_and_count_alike(live):
+    times = Sensor(exposure=0.02, sub_poses=10).times(5.0)
+    assert [times.mean(), np.ptp(times)] == pytest.approx([5.0, 0.018])
+    poses = [POSES['ahead'], POSES['far']]
+    both = live.radiance([T_WORLD_OPTICAL] * 2, poses)
+    np.testing.assert_allclose(both, np.mean(
+        [live.radiance([T_WORLD_OPTICAL], [pose]) for pose in poses], axis=0), atol=1e-6)
+
+
 @pytest.mark.parametrize('pose', POSES.values(), ids=POSES)
 def test_perception_finds_the_marker_where_it_is(live, pose):
     image = live.image(3, [T_WORLD_OPTICAL] * 2, [pose] * 2)

@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 
 from flock_desk.scenarios.scenario_file import (
+    key_tables,
     load,
     load_for_real_time,
     names,
@@ -62,6 +63,8 @@ def test_a_file_of_ones_own_is_read_with_integers_and_single_values(tmp_path: Pa
     path.write_text(GOOD + 'wind: {speed: 2}\nduration: 30\n')
     scenario = load(str(path))
     assert (scenario.name, scenario.duration, scenario.wind.speed) == ('mine', 30.0, (2.0, 2.0))
+    assert parse(GOOD + 'variants:\n', 'mine.yaml') == parse(GOOD, 'mine.yaml')
+    assert '| `name`' not in key_tables() and '| `outages` | [] |' in key_tables()
     assert scenario.leader.legs[0].velocity == (1.2, 0.0, 0.0)
 
 
@@ -95,6 +98,8 @@ FLOCK = 'summary: a test\nflock: {followers: 4, cameras: [front]}'
     (('summary: a test', FLOCK.replace('}', ', fails: {follower: 5, at: 9}}')),
      'flock.fails = follower 5: must be an integer in [1, followers], where followers = 4'),
     (('summary: a test', FLOCK.replace('}', ', ranges: true}')), 'ranges: rate = 0: must be'),
+    (('summary: a test', 'summary: a test\nvariants: [windy]'),
+     "variants = ['windy']: must be a mapping of names to keys"),
 ])
 def test_a_wrong_file_is_refused_with_key_and_valid_values(change: tuple[str, str],
                                                            message: str) -> None:

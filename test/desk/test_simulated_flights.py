@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import replace
+import json
 import os
 from pathlib import Path
 import signal
@@ -26,7 +27,6 @@ import sys
 import time
 from typing import Any
 
-from flights_command import flown_by_the_command
 import numpy as np
 import pytest
 
@@ -235,17 +235,29 @@ def test_metrics_have_the_documented_meaning() -> None:
         4, 0.5, pytest.approx(0.8))
 
 
+@pytest.mark.parametrize(('flock', 'all_jobs', 'controllers', 'different', 'figures', 'printed'), [
+    ('', '12', ['law', 'guard', 'pd', 'cucker_smale', 'cucker_dong'], 4,  # the guard does not act
+     {'out_of_band_s', 'guard_active'}, 'kept band'),
+    ('flock: {followers: 2}', '1', ['law', 'guard'], 1, {
+        'lost_for_good', 'rms_acceleration_m_s2', 'edges', 'neighbors_in_sight'}, 'nearest pair')])
 def test_the_command_writes_the_same_file_whatever_the_jobs(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch) -> None:
+        tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+        flock: str, all_jobs: str, controllers: list[str], different: int, figures: set[str],
+        printed: str) -> None:
     monkeypatch.setattr('flock_desk.flights.CHUNK', 2)
-    results = flown_by_the_command(
-        tmp_path, 'summary: short\nduration: 4\nleader: {motion: legs}\n')
-    assert list(results) == ['law', 'guard', 'pd', 'cucker_smale', 'cucker_dong']
-    assert len({str(values) for values in results.values()}) == 4  # the guard does not act
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text(f'summary: short\nduration: 4\nleader: {{motion: legs}}\n{flock}')
+    for jobs in all_jobs:
+        assert main(['--scenario', str(mine), '--runs', '3', '--jobs', jobs,
+                     '--output', str(tmp_path / jobs)]) == 0
+    text, *others = [(tmp_path / jobs / 'flights.json').read_text() for jobs in all_jobs]
+    assert all(other == text for other in others)
+    results = json.loads(text)['mine']
+    assert list(results) == controllers
+    assert len({str(values) for values in results.values()}) == different
     for values in results.values():
-        assert {'in_band', 'min_separation_m', 'out_of_band_s', 'guard_active'} <= set(values)
-    assert 'mine' in capsys.readouterr().out
+        assert values['runs'] == 3 and {'in_band', 'min_separation_m', *figures} <= set(values)
+    assert printed in capsys.readouterr().out
 
 
 def test_a_wrong_scenario_is_a_message_not_a_traceback(

@@ -17,10 +17,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from flights_command import flown_by_the_command
 import numpy as np
 import pytest
 
@@ -118,16 +116,3 @@ def test_without_messages_a_flock_keeps_its_band_while_markers_are_hidden(ranges
                     outages=(Outage('marker', 4.0, 5.0),),
                     flock={'words': False, 'ranges': ranges})
     assert runs['min_separation'].min() >= 0.9 and runs['time_in_band'].mean() > 0.98
-
-
-def test_the_command_reports_the_figures_of_flocks(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('flock_desk.flights.CHUNK', 4)
-    results = flown_by_the_command(
-        tmp_path,
-        'summary: short\nduration: 3\nleader: {motion: legs}\nflock: {followers: 2}\n', ('1',))
-    for values in results.values():
-        assert {'in_band', 'min_separation_m', 'lost_for_good', 'rms_acceleration_m_s2',
-                'edges', 'neighbors_in_sight'} <= set(values)
-    assert 'nearest pair' in capsys.readouterr().out

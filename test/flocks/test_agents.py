@@ -78,12 +78,14 @@ def test_no_step_of_the_adaptive_integrator_straddles_a_break() -> None:
     assert [v[0, 0] for _, v in states] == pytest.approx([0.0, 0.5, 1.0, 0.0], abs=1e-14)
 
 
-@pytest.mark.parametrize(('mean_velocity', 'expected'), [
-    (False, [[2.0 ** 0.5, 2.0 ** 0.5], [0.5 ** 0.5, 0.5 ** 0.5], [0.0, 3.0]]),
-    (True, [[1.0, 0.5], [1.0, 0.5], [0.0, 3.0]])])
-def test_vicsek_turns_to_the_mean_of_those_in_sight(mean_velocity: bool,
-                                                    expected: list[list[float]]) -> None:
-    x, v = np.array([[0.0, 0.0], [0.5, 0.0], [9.0, 0.0]]), np.array([[2.0, 0], [0, 1], [0, 3]])
+@pytest.mark.parametrize(('second', 'mean_velocity', 'expected'), [
+    ([0.0, 1.0], False, [[2.0 ** 0.5, 2.0 ** 0.5], [0.5 ** 0.5, 0.5 ** 0.5], [0.0, 3.0]]),
+    ([0.0, 1.0], True, [[1.0, 0.5], [1.0, 0.5], [0.0, 3.0]]),
+    # Headings that cancel are kept.
+    ([-1.0, 0.0], False, [[2.0, 0.0], [-1.0, 0.0], [0.0, 3.0]])])
+def test_vicsek_turns_to_the_mean_of_those_in_sight(
+        second: list[float], mean_velocity: bool, expected: list[list[float]]) -> None:
+    x, v = np.array([[0.0, 0.0], [0.5, 0.0], [9.0, 0.0]]), np.array([[2.0, 0.0], second, [0, 3]])
     assert velocities_after(x, v, mean_velocity) == pytest.approx(np.array(expected))
 
 
