@@ -105,7 +105,8 @@ class Collector:
         if arrival < min(self._next_pair, self._next_picture):
             return None
         picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
-                          getattr(message, 'encoding', '') or message.format, len(message.data))
+                          getattr(message, 'encoding', '') or getattr(message, 'format', ''),
+                          len(message.data))
         due = arrival >= self._next_picture
         if due:
             self._next_picture = arrival + self._picture_period

@@ -90,13 +90,13 @@ def check_nodes(seen: Observations) -> Finding:
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = ', '.join(name for name, number in count.items() if number == 0)
     twice = ', '.join(name for name, number in count.items() if number > 1)
-    other = ', '.join(full for full in seen.nodes if full.rsplit('/', 1)[-1] in missing)
+    other = ', '.join(full for full in seen.nodes if count.get(full.rsplit('/', 1)[-1]) == 0)
     return first(
         'nodes', 'each of our three, once',
         (not seen.nodes, ERROR, f'no node is seen on domain {seen.machine.domain}', 'start them; '
          'set ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE alike here and there'),
         (twice, ERROR, f'twice: {twice}', 'end one of each: both command the vehicle'),
-        (missing and other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
+        (other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
          'check --namespace NAME; or start all in one namespace'),
         (missing, ERROR, f'not running: {missing}', f'start: {START}'),
         (True, OK, 'all three are running', ''))

@@ -127,6 +127,14 @@ def test_a_fault_in_a_bag_is_named(change: Change, row: tuple[str, str, str, str
     assert code == (row[0] == 'error')
 
 
+def test_a_bag_that_holds_less_than_it_announces_is_incomplete(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, shorter = (excerpt(tmp_path / name / 'bag', length) for name, length in (
+        ('whole', 1.5), ('shorter', 1.2)))
+    (shorter / 'bag.mcap').replace(bag / 'bag.mcap')
+    assert 'announced messages found' in checked(capsys, bag)[1]['bag']['measured']
+
+
 def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def longer(message: Any) -> None:
