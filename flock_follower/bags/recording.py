@@ -43,7 +43,7 @@ _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
 _CLOCK_STEP = 5.0  # s by which a clock may be set, back or ahead, within a recording
 _MEGABYTE = 1_000_000
 FILE_SIZE = 64.0  # MB, from which on the next file begins
-KEPT = 10  # the newest files, which are never deleted
+KEPT = 15  # the newest files, which are never deleted: at 1.5 MB/s the last 10 minutes
 
 
 @dataclass(frozen=True)
