@@ -153,7 +153,10 @@ class Collector:
             if not markers.keys() & set(found.ids.tolist()):  # thoroughly, which takes longer
                 found = everywhere(pixels, config.dictionary,
                                    [of.marker for of in markers.values()])
-            picture.markers = _sides(found)
+            picture.markers = {
+                int(number): float(np.linalg.norm(corners - np.roll(corners, 1, axis=0),
+                                                  axis=1).mean())
+                for number, corners in zip(found.ids, found.corners)}
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):
                 seen.sightings += sightings(picture.stamp, pixels, camera, found, config)
@@ -192,10 +195,3 @@ def sightings(stamp: float, image: GrayImage, camera: CameraModel, found: Detect
             position = (measured.T_camera_body @ marker.T_body_marker).translation
             rows.append([stamp, float(number), *position.tolist()])
     return rows
-
-
-def _sides(found: Detections) -> dict[int, float]:
-    """Return the mean side of each marker found, px, by its id."""
-    return {int(number): float(np.mean(np.linalg.norm(
-        corners - np.roll(corners, 1, axis=0), axis=1)))
-        for number, corners in zip(found.ids, found.corners)}

@@ -168,7 +168,8 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
          'set up its source to send position, attitude and velocity in the axes of REP-103 '
          '(ENU, FLU)'),
         ('z' in still and height <= BELOW, WARNING, f'z moved too little, and is {height:.1f} m',
-         'if it was not started higher up, z points down: set up its source to send ENU (REP-103)'),
+         'if it was not started higher up, z points down: set up its source to send ENU '
+         '(REP-103)'),
         (still, UNMEASURED, f'{still} moved too little: carry it, and lift it', ''),
         (True, OK, 'as the velocity says', ''))
 
