@@ -157,7 +157,7 @@ def test_the_table_names_the_topic_to_remap_and_ends_with_the_verdict(
     assert any(line.startswith('ERROR   odom: the bag lacks /odom') for line in lines)
     assert any('--remap odom:=/vio/odometry' in line for line in lines)
     assert any(line.startswith('warning bag: incomplete: still being written') for line in lines)
-    assert lines[-1].startswith('not usable as it is: 1 errors, 1 warnings, ')
+    assert lines[-1].startswith('not usable as it is: 1 error, 1 warning, ')
     assert checked(capsys, bag, '--remap', 'odom:=/vio/odometry')[0] == 0
     assert main([str(SAMPLE)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
