@@ -28,6 +28,7 @@ import argparse
 from collections.abc import Iterable, Sequence
 import csv
 from functools import partial
+import io
 from itertools import groupby
 import json
 from pathlib import Path
@@ -42,6 +43,7 @@ from flock_desk.flocks.flock_metrics import extremum
 from flock_desk.flocks.paper import random_start
 from flock_desk.runs import paper_plots as plots
 from flock_desk.runs.console import aligned, guarded, progress
+from flock_follower.files import whole_file
 
 MODELS: dict[Model, str] = {
     'flocking': 'Flocking law',
@@ -171,10 +173,10 @@ def row(scenario: str, name: str, run: Simulation) -> Row:
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Write a table with its columns' names."""
-    with open(path, 'w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(columns)
-        writer.writerows(rows)
+    text = io.StringIO()
+    csv.writer(text, lineterminator='\n').writerows([columns, *rows])
+    with whole_file(path) as file:  # which names the file if the disk is full
+        file.write(text.getvalue().encode())
 
 
 def _text(value: float, digits: int) -> str:

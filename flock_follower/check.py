@@ -162,8 +162,10 @@ def table(seen: Observations, findings: Sequence[Finding]) -> str:
                    seen.live, ready(findings)]
     unknown = [finding.what for finding in findings if finding.level == UNMEASURED]
     needed = still_needed(findings)
-    counts = ', '.join(f'{levels.count(level)} {name}' for level, name in (
-        (ERROR, 'errors'), (WARNING, 'warnings'), (OK, 'ok'), (UNMEASURED, 'not measured')))
+    counts = ', '.join(
+        f'{count} {name.removesuffix("s") if count == 1 else name}' for count, name in (
+            (levels.count(ERROR), 'errors'), (levels.count(WARNING), 'warnings'),
+            (levels.count(OK), 'ok'), (levels.count(UNMEASURED), 'not measured')))
     if unknown:
         counts += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
     return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {counts}', COLUMNS)])

@@ -217,4 +217,5 @@ def healthy(live: bool = True) -> Observed:
 
 
 BRIDGE = {'link': 'alive', 'autopilot': 'PX4', 'mode': 'POSCTL', 'armed': 'False',
-          'not ready to arm': '', 'offboard would be refused': ''}
+          'parameters': '0 of 9 differ, 0 unanswered', 'not ready to arm': '',
+          'offboard would be refused': ''}

@@ -32,8 +32,6 @@ class Camera:
     The intrinsic calibration, as in ``sensor_msgs/CameraInfo``.
 
     Distortion is computed here, not by the perception that the images are to test.
-
-    :raises ValueError: for an unknown model or a wrong number of coefficients.
     """
 
     width: int = 640
@@ -46,13 +44,6 @@ class Camera:
     model: str = 'plumb_bob'
     """'plumb_bob' (k1, k2, p1, p2, k3) or 'equidistant' (k1, k2, k3, k4)."""
     distortion: tuple[float, ...] = (-0.116, 0.087, 0.0007, -0.0005, 0.0)
-
-    def __post_init__(self) -> None:
-        count = {'plumb_bob': 5, 'equidistant': 4}.get(self.model)
-        if count is None:
-            raise ValueError(f'model = {self.model!r}: must be plumb_bob or equidistant')
-        if len(self.distortion) != count:
-            raise ValueError(f'distortion = {self.distortion}: {self.model} takes {count} values')
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Return where the lens shows directions (x, y, 1), before focal lengths and centre."""

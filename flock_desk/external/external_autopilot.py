@@ -100,7 +100,8 @@ class ExternalAutopilot:
         while self._arrived:
             self.motion.take(*self._arrived.popleft())
 
-    def known(self, now: float) -> float:
+    @property
+    def known(self) -> float:
         """Return until when, s on the monotonic clock, the motion is known."""
         newest = self.motion.newest
         return -math.inf if newest is None else newest * 1e-9
@@ -124,7 +125,7 @@ class ExternalAutopilot:
                 if why_truth:
                     raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
                                      f'estimate will not do where {why_truth}')
-                self.motion.use_estimate()
+                self.motion.source = ESTIMATE
             if now > deadline:
                 raise ValueError(f'{self.parameter} = {self.url!r}: no pose of a vehicle within '
                                  f'{timeout:g} s: {self.silence()}')
@@ -237,7 +238,7 @@ class ExternalVehicles:
 
     def known(self, now: float) -> float:
         """Return until when, s on the monotonic clock, the follower's motion is known."""
-        return self.follower.known(now)
+        return self.follower.known
 
     def step(self, now: float) -> None:
         """Do nothing: they fly by themselves."""
@@ -265,7 +266,7 @@ class ExternalVehicles:
             # Whether the leader's poses reach up to now is known a little later.
             at = self.start_ns + time_ns - (LONGEST_GAP if name == 'leader' else 0)
             lacking = 'no image' if name == 'leader' else 'no image, no odometry'
-            age = now - link.known(now)
+            age = now - link.known
             if age > LATE:
                 problems.append(
                     f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')

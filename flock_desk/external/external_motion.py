@@ -78,17 +78,13 @@ class ExternalMotion:
 
     def __init__(self) -> None:
         self.source = ''
-        """Name of the message that places it; '' until a truth comes, or ``use_estimate``."""
+        """Name of the message that places it; '' until a truth comes, or ESTIMATE is set."""
         self.times: list[tuple[float, float]] = []
         """Own time and the autopilot's since it booted, s: simulators may be slow."""
         self._poses: deque[Motion] = deque(maxlen=MEMORY)
         self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self.origin: Array | None = None
         """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""
-
-    def use_estimate(self) -> None:
-        """Take the autopilot's own estimate from now on, if no truth has come."""
-        self.source = self.source or ESTIMATE
 
     @property
     def estimated(self) -> bool:
@@ -102,9 +98,9 @@ class ExternalMotion:
             self._truth(message, now)
         elif kind == CLOCK:
             self.times.append((now * 1e-9, message.time_boot_ms * 1e-3))
-        elif kind == ESTIMATE and self.source == ESTIMATE:
+        elif kind == ESTIMATE and self.estimated:
             self._estimate(message, now)
-        elif kind == ATTITUDE and self.source == ESTIMATE:
+        elif kind == ATTITUDE and self.estimated:
             self._turned = _attitude(
                 [message.q1, message.q2, message.q3, message.q4],
                 (message.rollspeed, message.pitchspeed, message.yawspeed))

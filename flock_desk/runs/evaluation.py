@@ -194,30 +194,35 @@ class Evaluation(Listener):
         :param camera: the name of the camera, if there are several.
         :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
         """
+        if name == 'camera_info' and not self._is_new(camera, data[_AFTER_STAMP:]):
+            return
         try:
-            if name == 'odom':
-                self._take_odometry(time, read_odometry(data) if message is None else message)
-            elif name != 'camera_info' or self._is_new(camera, data[_AFTER_STAMP:]):
-                message = deserialize(data, msgtype) if message is None else message
-                if name == 'camera_info':
-                    self.follower.camera_info(time, message, camera)
-                elif name == 'ranges':
-                    self.follower.range(time, from_range(message))
-                else:
-                    self.follower.image(time, message if pixels is None else pixels,
-                                        read_stamp(message.header.stamp), camera)
+            if message is None:
+                message = read_odometry(data) if name == 'odom' else deserialize(data, msgtype)
+            if name == 'camera_info':
+                self.follower.camera_info(time, message, camera)
+            elif name == 'odom':
+                state = self.source.take(message, time)
+            elif name == 'ranges':
+                measured = from_range(message)
+            else:
+                stamp = read_stamp(message.header.stamp)
         except ValueError as error:
             self.follower.advance(time)
             self.rejected(INVALID_IMAGE if name == RAW_IMAGES else f'invalid {name}', str(error))
             if name == RAW_IMAGES:
                 self.image(ImageOutcome(time, camera=camera))
-
-    def _take_odometry(self, time: int, message: Any) -> None:
-        state = self.source.take(message, time)
-        for event in self.source.new_events():
-            self.rejected(*event)
-        if state is not None:
-            self.follower.odometry(time, state)
+            return
+        # Outside of the try: an error in the follower is no fault of the message.
+        if name == 'odom':
+            for event in self.source.new_events():
+                self.rejected(*event)
+            if state is not None:
+                self.follower.odometry(time, state)
+        elif name == 'ranges':
+            self.follower.range(time, measured)
+        elif name == RAW_IMAGES:
+            self.follower.image(time, message if pixels is None else pixels, stamp, camera)
 
     def _is_new(self, camera: str, calibration: bytes) -> bool:
         """Return whether a calibration differs from the last one of its camera; most do not."""

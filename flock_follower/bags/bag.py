@@ -184,13 +184,16 @@ def open_bag(path: str | Path) -> Bag:
     if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
     with failures(path, _UNREADABLE):
+        _refuse_unclosed(path)
         files = mcap_files(path) if path.is_dir() else [path] if path.suffix == '.mcap' else []
         reason = incomplete(path) or _missing_end(path, files)
         reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader
         if files and reason:
             reader = UnfinishedReader(files)
+        elif path.suffix == '.bag' and path.is_file():
+            reader = Rosbag1Reader(path)
         else:
-            reader = Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path)
+            reader = Rosbag2Reader(path)
     with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
         reader.open()
         bag = Bag(path, reader, reason)
@@ -199,6 +202,19 @@ def open_bag(path: str | Path) -> Bag:
             reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
             raise BagError(f'{path}: holds no message that can be read{reasons}')
     return bag
+
+
+def _refuse_unclosed(path: Path) -> None:
+    """
+    Refuse a folder that no recorder finished, and an SQLite file that none closed.
+
+    SQLite's readers ignore rows in a write-ahead log, as if nothing were missing.
+    """
+    if path.is_dir() and not mcap_files(path) and not (path / METADATA).is_file():
+        raise BagError(f'{path}: no {METADATA} in it, so not a finished ROS 2 bag')
+    for log in path.glob('*.db3-wal') if path.is_dir() else [Path(f'{path}-wal')]:
+        if log.exists() and log.stat().st_size:
+            raise BagError(f'{path}: recording was not closed: {log.name} holds part of it')
 
 
 def _missing_end(path: Path, files: Sequence[Path]) -> str:

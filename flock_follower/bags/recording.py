@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 import errno
 import fcntl
 import os
@@ -43,15 +42,7 @@ _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
 _CLOCK_STEP = 5.0  # s by which a clock may be set, back or ahead, within a recording
 _MEGABYTE = 1_000_000
 FILE_SIZE = 64.0  # MB, from which on the next file begins
-KEPT = 10  # the newest files, which are never deleted
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What recordings may take of a disk, and what stays free, MB."""
-
-    disk_used: float
-    disk_free: float
+KEPT = 15  # the newest files, which are never deleted: at 1.5 MB/s the last 10 minutes
 
 
 class FlightRecording:
@@ -59,13 +50,15 @@ class FlightRecording:
     The recordings in a folder, and the current one, which begins with the first message.
 
     :param folder: for the recordings of one vehicle; created if missing.
+    :param disk_used: what all recordings may take of the disk, MB.
+    :param disk_free: what stays free on it, MB.
     :raises OSError: it cannot be made, or another process records there.
     """
 
-    def __init__(self, folder: Path, limits: Limits) -> None:
+    def __init__(self, folder: Path, disk_used: float, disk_free: float) -> None:
         self.folder = folder
         self.path: Path | None = None
-        self._limits = limits
+        self._disk_used, self._disk_free = disk_used, disk_free
         self._lock = _locked(folder)
         self._files: list[McapFile] = []  # of the current recording
         self._file: McapFile | None = None  # the last of them, while it is open
@@ -175,19 +168,18 @@ class FlightRecording:
 
         :raises OSError: too little is free, and there is nothing more to delete.
         """
-        limits = self._limits
         files = [file for path in self._recordings() for file in mcap_files(path)]
         sizes = [file.stat().st_size for file in files]
-        used, least = sum(sizes), limits.disk_free * _MEGABYTE
+        used, least = sum(sizes), self._disk_free * _MEGABYTE
         for file, size in list(zip(files, sizes))[:-KEPT]:
-            if used <= limits.disk_used * _MEGABYTE and _free(self.folder) >= least:
+            if used <= self._disk_used * _MEGABYTE and _free(self.folder) >= least:
                 break
             with suppress(OSError):  # of another owner: the next one, then
                 self._delete(file)
                 used -= size
         if _free(self.folder) < least:
             self._close_file()
-            raise OSError(errno.ENOSPC, f'less than {limits.disk_free:.0f} MB free')
+            raise OSError(errno.ENOSPC, f'less than {self._disk_free:.0f} MB free')
 
     def _delete(self, file: Path) -> None:
         """Delete a file, and its recording with the last one; the rest is an incomplete bag."""

@@ -89,7 +89,8 @@ class UnfinishedReader:
                     ConnectionExtRosbag2(
                         channel.message_encoding, parse_qos(qos) if qos else []), None)
         if not counts:
-            raise ValueError('cut short before its first message, nothing is in it')
+            raise ValueError(
+                'cut short before its first message, or no MCAP file: nothing is in it')
         for key, count in counts.items():
             self._connections[key] = self._connections[key]._replace(msgcount=count)
 

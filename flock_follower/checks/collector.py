@@ -105,7 +105,8 @@ class Collector:
         if arrival < min(self._next_pair, self._next_picture):
             return None
         picture = Picture(stamp, getattr(message, 'width', 0), getattr(message, 'height', 0),
-                          getattr(message, 'encoding', '') or message.format, len(message.data))
+                          getattr(message, 'encoding', '') or getattr(message, 'format', ''),
+                          len(message.data))
         due = arrival >= self._next_picture
         if due:
             self._next_picture = arrival + self._picture_period
@@ -152,7 +153,10 @@ class Collector:
             if not markers.keys() & set(found.ids.tolist()):  # thoroughly, which takes longer
                 found = everywhere(pixels, config.dictionary,
                                    [marker for _, marker in markers.values()])
-            picture.markers = _sides(found)
+            picture.markers = {
+                int(number): float(np.linalg.norm(corners - np.roll(corners, 1, axis=0),
+                                                  axis=1).mean())
+                for number, corners in zip(found.ids, found.corners)}
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):
                 seen.sightings += sightings(picture.stamp, pixels, camera, found, config)
@@ -191,10 +195,3 @@ def sightings(stamp: float, image: GrayImage, camera: CameraModel, found: Detect
             position = (measured.T_camera_body @ marker.T_body_marker).translation
             rows.append([stamp, float(number), *position.tolist()])
     return rows
-
-
-def _sides(found: Detections) -> dict[int, float]:
-    """Return the mean side of each marker found, px, by its id."""
-    return {int(number): float(np.mean(np.linalg.norm(
-        corners - np.roll(corners, 1, axis=0), axis=1)))
-        for number, corners in zip(found.ids, found.corners)}

@@ -81,9 +81,9 @@ class OwnPath:
         same = np.concatenate([[1.0], np.cumprod(np.where(turned, -1.0, 1.0))])
         self._stamps = np.array([state.stamp for state in states]) / NANOSECONDS
         self._quaternions = quaternions * same[:, None]
-        self._positions = np.array([state.position for state in states])
-        self._velocities = np.array([state.velocity @ quaternion_to_matrix(state.quaternion)
-                                     for state in states])
+        self._motion = np.array([
+            [*state.position, *(state.velocity @ quaternion_to_matrix(state.quaternion))]
+            for state in states])
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return attitudes (m, 4) at stamps (m,), s, and where they are known (m,)."""
@@ -96,16 +96,11 @@ class OwnPath:
         known = (part >= 0.0) & (part <= 1.0) & (span <= LONGEST)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), known
 
-    def position(self, times: Array) -> Array:
-        """Return positions (m, 3), m, in odom at stamps (m,), s."""
-        return self._interpolated(times, self._positions)
-
-    def velocity(self, times: Array) -> Array:
-        """Return velocities (m, 3), m/s, along base_link's axes at stamps (m,), s."""
-        return self._interpolated(times, self._velocities)
-
-    def _interpolated(self, times: Array, values: Array) -> Array:
-        return np.column_stack([np.interp(times, self._stamps, column) for column in values.T])
+    def motion(self, times: Array) -> tuple[Array, Array]:
+        """Return positions (m, 3), m, in odom, and velocities (m, 3), m/s, in base_link."""
+        rows = np.column_stack([np.interp(times, self._stamps, column)
+                                for column in self._motion.T])
+        return rows[:, :3], rows[:, 3:]
 
 
 def small(image: GrayImage) -> Array:
@@ -196,7 +191,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     for _ in range(2):  # an error of the mounting looks like an offset, too
         offset = _summit(offsets, curve)
         turned, known = _turned(rows, path, offset)
-        moved = np.diff(known[:, :2]) * path.velocity(known[:, :2].mean(axis=1) - offset)
+        moved = np.diff(known[:, :2]) * path.motion(known[:, :2].mean(axis=1) - offset)[1]
         solution, covariance = _refined(
             turned @ R, moved @ R, known[:, 4:].reshape(-1, ROWS * COLUMNS, 3), camera)
         curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))

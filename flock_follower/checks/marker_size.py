@@ -84,7 +84,7 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
     rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
     R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
     found = distance_ratio(
-        rows[known, 2:] @ R_base_optical.T, path.position(rows[known, 0]), rotations,
+        rows[known, 2:] @ R_base_optical.T, path.motion(rows[known, 0])[0], rotations,
         np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0])))
     if found is None or not found.at_rest or SURE * found.deviation > 3.0 * SIZE:
         moves = found is not None and found.moved >= MOVED and not found.at_rest

@@ -63,8 +63,9 @@ SLOW: Final = 0.06
 #: Relative error of a focal length that is an error: 0.965 was measured with the right one.
 ZOOM: Final = 0.1
 #: Axes of the positions: least number of windows; least error of the velocity, m/s; the squared
-#: errors must fall by so many variances; smaller turns are those of an estimator.
-FEW, STILL, EVIDENT, SIN_TURNED = 6, 0.02, 60.0, 0.4
+#: errors must fall by so many variances; smaller turns are those of an estimator. A vehicle that
+#: is lower than this, m, was started higher up, or z points down.
+FEW, STILL, EVIDENT, SIN_TURNED, BELOW = 6, 0.02, 60.0, 0.4, -0.5
 #: Events of the reader: the property, the level and the action.
 EVENTS: Final = (
     ('odom jumped', 'odom jumps', WARNING,
@@ -93,7 +94,8 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     for event, what, level, advice in EVENTS:
         if times := motion.events[event]:
             yield Finding(level, what, f'{times} in {count} messages', 'none', advice)
-    yield from _positions(motion.source.twist)
+    yield from _positions(motion.source.twist, float(np.median(
+        [state.position[2] for state in motion.states])))
     yield _twist(motion)
     if missing := [name for name in motion.source.missing if name != 'velocity']:
         yield Finding(WARNING, 'odom lacks', ', '.join(missing), 'nothing', 'works: derived, or '
@@ -132,9 +134,9 @@ def _parameters_alike(seen: Observations) -> Iterator[Finding]:
                           'set it under /** in one file')
 
 
-def _positions(twist: TwistFrame) -> Iterator[Finding]:
+def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
     """
-    Check that the positions have the axes of attitude and velocity.
+    Check that the positions have the axes of attitude and velocity; ``height`` is their z, m.
 
     They have others if a rotation, or a reflection, of the velocity explains them, and neither
     reading of the velocity does without it (Kabsch's method).
@@ -165,6 +167,9 @@ def _positions(twist: TwistFrame) -> Iterator[Finding]:
          f'x, y, z move as {axes} of the velocity, turned by {turn:.0f} deg',
          'set up its source to send position, attitude and velocity in the axes of REP-103 '
          '(ENU, FLU)'),
+        ('z' in still and height <= BELOW, WARNING, f'z moved too little, and is {height:.1f} m',
+         'if it was not started higher up, z points down: set up its source to send ENU '
+         '(REP-103)'),
         (still, UNMEASURED, f'{still} moved too little: carry it, and lift it', ''),
         (True, OK, 'as the velocity says', ''))
 

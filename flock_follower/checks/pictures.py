@@ -76,12 +76,16 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     others = sorted({f'{picture.width}x{picture.height}' for picture in pictures} - {size})
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     shares = camera.matrix[:2, 2] / (camera.width, camera.height)
+    straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     return first(
         what, wanted,
         (others, ERROR, f'for {size}, images are {"".join(others[:1])}', calibrate),
         (np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width, ERROR,
          f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the image: K is for '
          'another resolution', calibrate),
+        (straight and np.any(camera.distortion), ERROR,
+         f'{measured}, distorted, but the topic is marked as rectified',
+         'start relative_pose with rectified:=true'),
         (True, OK, measured, ''))
 
 

@@ -159,6 +159,9 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
             yield Finding(WARNING, 'autopilot parameter',
                           f'{key.removeprefix(PARAMETER)} {values[key]}', 'as config/ recommends',
                           'set it in the ground station, or know why not')
+    if 'parameters' not in values:
+        yield Finding(UNMEASURED, 'autopilot parameters', 'not compared yet: check again in '
+                      'some seconds', 'as config/ recommends')
     wanted = 'nothing speaks against it'
     for what, key, advice in (
             ('ready to arm', NOT_READY, 'these are its own words: settle them, then check again'),

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -52,15 +52,6 @@ AHEAD: Final = (0.003, 0.03)
 STOPPED: Final = (1.0, 3.0)
 
 
-class _Limits(NamedTuple):
-    """Limits of a topic: a warning and an error beyond each pair, Hz and s; the advice."""
-
-    rate: tuple[float, float]
-    latency: tuple[float, float]
-    faster: str
-    sooner: str
-
-
 def check_topics(seen: Observations) -> Iterator[Finding]:
     """Check nodes and topics; of a bag, its content."""
     if seen.live:
@@ -72,15 +63,15 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     for name in (seen.image_name, 'camera_info', 'odom'):
         yield _needed(seen, name)
     late = float(seen.value('planner', 'odom_timeout', 0.3))
-    yield from _stream(seen, 'images', seen.topic(seen.image_name), _Limits(
-        (10.0, 3.0), (0.2, 0.4),
-        'raise the frame rate of the camera; less exposure time where it is dark',
-        'send smaller images, or grey ones; have the camera on this computer'))
-    yield from _stream(seen, 'odom', seen.topic('odom'), _Limits(
-        (18.0, 8.0), (0.5 * late, 0.8 * late),
-        'raise the output rate of the odometry (IMU rate, where its driver offers that)',
-        'give its source more processor time, or smaller images; have it publish per IMU '
-        'message where it can'))
+    yield from _stream(
+        seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
+        faster='raise the frame rate of the camera; less exposure time where it is dark',
+        sooner='send smaller images, or grey ones; have the camera on this computer')
+    yield from _stream(
+        seen, 'odom', seen.topic('odom'), rates=(18.0, 8.0), latencies=(0.5 * late, 0.8 * late),
+        faster='raise the output rate of the odometry (IMU rate, where its driver offers that)',
+        sooner='give its source more processor time, or smaller images; have it publish per IMU '
+        'message where it can')
     if seen.live:
         yield from _publishers(seen)
 
@@ -90,13 +81,13 @@ def check_nodes(seen: Observations) -> Finding:
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = ', '.join(name for name, number in count.items() if number == 0)
     twice = ', '.join(name for name, number in count.items() if number > 1)
-    other = ', '.join(full for full in seen.nodes if full.rsplit('/', 1)[-1] in missing)
+    other = ', '.join(full for full in seen.nodes if count.get(full.rsplit('/', 1)[-1]) == 0)
     return first(
         'nodes', 'each of our three, once',
         (not seen.nodes, ERROR, f'no node is seen on domain {seen.machine.domain}', 'start them; '
          'set ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE alike here and there'),
         (twice, ERROR, f'twice: {twice}', 'end one of each: both command the vehicle'),
-        (missing and other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
+        (other, ERROR, f'not in /{seen.namespace.strip("/")}: {missing}, but {other}',
          'check --namespace NAME; or start all in one namespace'),
         (missing, ERROR, f'not running: {missing}', f'start: {START}'),
         (True, OK, 'all three are running', ''))
@@ -142,9 +133,14 @@ def _needed(seen: Observations, name: str) -> Finding:
         (True, OK, f'{full}, {len(topic.arrivals)} messages', ''))
 
 
-def _stream(seen: Observations, name: str, topic: TopicSeen, limits: _Limits
-            ) -> Iterator[Finding]:
-    """Check rate, stamps and latency of a topic, and whether it has stopped."""
+def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[float, float],
+            latencies: tuple[float, float], faster: str, sooner: str) -> Iterator[Finding]:
+    """
+    Check rate, stamps and latency of a topic, and whether it has stopped.
+
+    :param rates: below which there is a warning, and an error, Hz; ``faster``: the advice.
+    :param latencies: above which there is a warning, and an error, s; ``sooner``: the advice.
+    """
     if not topic.arrivals:
         return
     gap = float(np.max(np.diff(topic.arrivals), initial=0.0))
@@ -153,12 +149,12 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, limits: _Limits
     if seen.live and silence > max(STOPPED[0], STOPPED[1] * gap):
         yield Finding(ERROR, name, f'stopped: none in the last {silence:.1f} s',
                       'messages to the end', 'see the log of its driver; is it still running?')
-    wanted, rate = f'{limits.rate[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
+    wanted, rate = f'{rates[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
     yield first(
         f'{name} rate', wanted,
         (len(topic.arrivals) <= 2, UNMEASURED, f'{len(topic.arrivals)} messages are too few', ''),
-        (topic.rate < limits.rate[1], ERROR, rate, limits.faster),
-        (topic.rate < limits.rate[0], WARNING, rate, limits.faster),
+        (topic.rate < rates[1], ERROR, rate, faster),
+        (topic.rate < rates[0], WARNING, rate, faster),
         (True, OK, rate, ''))
     late = np.array(topic.arrivals) - np.array(topic.stamps)
     middle, most = float(np.median(late)), float(np.percentile(late, 95))
@@ -166,7 +162,7 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, limits: _Limits
     synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
     measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
     yield first(
-        f'{name} latency', f'below {limits.latency[0]:g} s after its stamp',
+        f'{name} latency', f'below {latencies[0]:g} s after its stamp',
         (abs(middle) > OTHER_CLOCK, ERROR,
          f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
@@ -174,9 +170,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, limits: _Limits
          '--use-sim-time)'),
         (middle < -AHEAD[1], ERROR, ahead, synchronise),
         (middle < -AHEAD[0], WARNING, ahead, synchronise),
-        (middle > limits.latency[1], ERROR, measured, limits.sooner),
-        (middle > limits.latency[0] or most > limits.latency[1], WARNING, measured,
-         limits.sooner),
+        (middle > latencies[1], ERROR, measured, sooner),
+        (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
         (True, OK, measured, ''))
 
 

@@ -41,7 +41,7 @@ import yaml
 from flock_follower.bags.bag import deserialize, serialize
 from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
-from flock_follower.bags.recording import FlightRecording, Limits
+from flock_follower.bags.recording import FlightRecording
 from flock_follower.checks.observations import OURS
 from flock_follower.checks.topic_names import COMPRESSED, full_name, IMAGE, INFO, TYPES
 from flock_follower.files import resource
@@ -104,7 +104,7 @@ class BlackBox(FlockNode):
         super().__init__('black_box', **kwargs)
         values = self.declare(SPECS, build).values
         self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
-        self._limits = Limits(values['disk_used'], values['disk_free'])
+        self._limits = values['disk_used'], values['disk_free']
         self._recording: FlightRecording | None = None
         # One thread takes, one writes, and the executor's notes: none needs a lock.
         self._notes: dict[str, str] = {}
@@ -245,7 +245,7 @@ class BlackBox(FlockNode):
             if now < self._retry:
                 raise OSError(0, self._fault)
             if self._recording is None:
-                self._recording = FlightRecording(self._folder, self._limits)
+                self._recording = FlightRecording(self._folder, *self._limits)
             while self._notes:
                 name, text = self._notes.popitem()
                 try:

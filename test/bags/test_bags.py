@@ -266,7 +266,8 @@ def test_a_missing_bag_an_unknown_format_and_an_empty_one_are_one_line(tmp_path)
     assert 'notes.txt: unknown format: must be .bag, .mcap, .db3' in error_of(
         tmp_path / 'notes.txt')
     (tmp_path / 'folder').mkdir()
-    assert 'Expected metadata file' in error_of(tmp_path / 'folder')
+    assert error_of(tmp_path / 'folder').endswith(
+        'folder: no metadata.yaml in it, so not a finished ROS 2 bag')
     with BagWriter(tmp_path / 'mcap'):
         pass
     write_sqlite3(tmp_path / 'sqlite3', 0)
@@ -293,6 +294,14 @@ def test_only_a_file_without_its_end_needs_the_library_mcap(tmp_path, monkeypatc
     assert len(read_all(tmp_path / 'bag')) == 300
     file.write_bytes(file.read_bytes()[:-200])
     assert error_of(file).endswith('needs the library mcap: pip install mcap')
+
+
+def test_an_unclosed_sqlite3_recording_is_noticed(tmp_path):
+    file = storage_file(write_sqlite3(tmp_path / 'bag.bag'))  # a folder may have any name
+    assert len(read_all(tmp_path / 'bag.bag')) == 300
+    file.with_name(f'{file.name}-wal').write_bytes(b'rows not merged yet')
+    for path in (file, tmp_path / 'bag.bag'):
+        assert 'recording was not closed' in error_of(path)
 
 
 def good_bags(tmp_path):

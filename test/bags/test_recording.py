@@ -32,14 +32,14 @@ from flock_follower.bags import mcap_file, recording
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, serialize
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import typestore
-from flock_follower.bags.recording import FlightRecording, Limits
+from flock_follower.bags.recording import FlightRecording
 from flock_follower.bags.schedule import NANOSECONDS
 
 START = 1_700_000_000 * NANOSECONDS
 STRING = 'std_msgs/msg/String'
 WORDS = RecordedTopic('/words', STRING)
 STATE = RecordedTopic('/state', STRING, latched=True, source='/drone1/state')
-LIMITS = Limits(disk_used=10.0, disk_free=10.0)
+LIMITS = 10.0, 10.0  # MB used, free
 
 
 @pytest.fixture(autouse=True)
@@ -78,13 +78,13 @@ def numbers(path: Path) -> list[int]:
 
 
 def test_a_recording_is_a_bag_of_rosbag2_with_what_was_written(tmp_path: Path) -> None:
-    box = FlightRecording(tmp_path, LIMITS)
+    box = FlightRecording(tmp_path, *LIMITS)
     box.note('parameters.yaml', 'planner: {}\n')
     box.write([TakenMessage(STATE, START, word(7)), *second(0)], 0.0)
     path = tmp_path / '0001_20231114T221320Z'
     assert box.path == path and read(path)[0].startswith('still being written')
     with pytest.raises(OSError, match='another process records in'):
-        FlightRecording(tmp_path, LIMITS)
+        FlightRecording(tmp_path, *LIMITS)
     box.close()
     assert sorted(file.name for file in path.iterdir()) == [
         '0001_20231114T221320Z_0.mcap', 'metadata.yaml', 'parameters.yaml']
@@ -130,7 +130,7 @@ def test_every_write_is_on_the_disk_when_it_returns(
                                            [*range(10, 20)]])])
 def test_messages_out_of_order_are_put_in_order_or_begin_another_recording(
         tmp_path: Path, writes: Sequence[list[TakenMessage]], recordings: list[list[int]]) -> None:
-    box = FlightRecording(tmp_path, LIMITS)
+    box = FlightRecording(tmp_path, *LIMITS)
     for now, messages in enumerate(writes):
         box.write(messages, float(now))
     box.close()
@@ -141,7 +141,7 @@ def test_messages_out_of_order_are_put_in_order_or_begin_another_recording(
 
 
 def test_files_turn_over_and_each_has_what_is_latched(tmp_path: Path) -> None:
-    box = FlightRecording(tmp_path, LIMITS)
+    box = FlightRecording(tmp_path, *LIMITS)
     box.write([TakenMessage(STATE, START, word(7))], 0.0)
     path = fill(box, 0.0, *range(6), size=60_000)
     box.close()
@@ -157,10 +157,10 @@ def test_files_turn_over_and_each_has_what_is_latched(tmp_path: Path) -> None:
 
 def test_the_oldest_files_make_way_but_none_of_the_newest(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    earlier = FlightRecording(tmp_path, LIMITS)
+    earlier = FlightRecording(tmp_path, *LIMITS)
     first = fill(earlier, 0.0, *range(8), size=60_000)  # 0.6 MB each; a file has two of them
     earlier.close()
-    box = FlightRecording(tmp_path, LIMITS)
+    box = FlightRecording(tmp_path, *LIMITS)
     path = fill(box, 1000.0, *range(12), size=60_000)
     assert (read(first)[0], numbers(first)[0]) == ('no metadata.yaml in it', 20)
 
@@ -176,7 +176,7 @@ def test_the_oldest_files_make_way_but_none_of_the_newest(
     assert read(path)[0] == '' and kept == list(range(kept[0], 40))
     assert 8e6 < sum(file.stat().st_size for file in path.glob('*.mcap')) < 14e6
     monkeypatch.setattr(recording, 'KEPT', 100)
-    box = FlightRecording(tmp_path / 'other', LIMITS)
+    box = FlightRecording(tmp_path / 'other', *LIMITS)
     path = fill(box, 0.0, *range(40), size=60_000)
     box.close()
     assert len(numbers(path)) == 400
@@ -191,7 +191,7 @@ def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
         return 15e6 - used_by_others - own
 
     monkeypatch.setattr(recording, '_free', free)
-    box = FlightRecording(tmp_path, Limits(1000.0, 10.0))
+    box = FlightRecording(tmp_path, 1000.0, 10.0)
     path = fill(box, 0.0, *range(40), size=60_000)
     kept = numbers(path)
     assert kept == list(range(kept[0], 400)) and 60 < len(kept) < 170
@@ -209,7 +209,7 @@ def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
 @pytest.mark.parametrize('size', [20_000, 20_050])
 def test_a_full_disk_keeps_what_was_written_and_recording_goes_on_when_there_is_room(
         tmp_path: Path, size: int) -> None:
-    box = FlightRecording(tmp_path, LIMITS)
+    box = FlightRecording(tmp_path, *LIMITS)
     done = 0
     with disk_of(size), pytest.raises(OSError) as caught:
         for done in range(1000):
@@ -226,7 +226,7 @@ def test_a_full_disk_keeps_what_was_written_and_recording_goes_on_when_there_is_
 @pytest.fixture
 def recorded(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
     """Return a recording of 8 chunks, and its messages."""
-    box = FlightRecording(tmp_path / 'box', LIMITS)
+    box = FlightRecording(tmp_path / 'box', *LIMITS)
     for number in range(8):
         box.write([TakenMessage(STATE, START + number * NANOSECONDS, word(number)),
                    *second(number)], number)

@@ -28,6 +28,8 @@ import numpy as np
 from observed import FOCAL, healthy, Observed, odometry_rows, shift_rows, sighting_rows
 import pytest
 
+from flock_follower.bags.message_types import empty
+from flock_follower.checks.collector import Collector
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
@@ -159,12 +161,14 @@ def positions(columns: list[int], signs: list[float], twist_in_odom: bool) -> Ch
     return make
 
 
-def level_flight(seen: Observed) -> None:
-    """Have the vehicle stay at a height, and see no marker."""
-    seen.sightings = []
-    for row in seen.rows:
-        up = quaternion_to_matrix(row[5:9])
-        row[4], row[9:12] = 1.5, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
+def level_flight(height: float) -> Change:
+    """Return a change to a vehicle that stays at a height, m, and sees no marker."""
+    def make(seen: Observed) -> None:
+        seen.sightings = []
+        for row in seen.rows:
+            up = quaternion_to_matrix(row[5:9])
+            row[4], row[9:12] = height, (up.T @ ((up @ row[9:12]) * [1.0, 1.0, 0.0])).tolist()
+    return make
 
 
 def at_rest(seen: Observed) -> None:
@@ -351,7 +355,21 @@ FAULTS: list[Fault] = [
           lambda seen: [row.__setitem__(2, row[2] + 0.3 * math.sin(0.4 * n))
                         for n, row in enumerate(seen.sightings)]),
     Fault('an axis that does not move', LIVE, UNMEASURED, 'odom positions',
-          'z moved too little', '', level_flight),
+          'z moved too little', '', level_flight(1.5)),
+    Fault('a height below the start', BOTH, WARNING, 'odom positions',
+          'z moved too little, and is -1.5 m', 'z points down', level_flight(-1.5)),
+    Fault('parameters that the bridge has not compared', LIVE, UNMEASURED, 'autopilot parameters',
+          'not compared yet', '',
+          lambda seen: seen.statuses['mavlink_bridge'].values.pop('parameters')),
+    Fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
+          'but the topic is marked as rectified', 'rectified:=true',
+          together(moved('image_raw', '/image_rect'),
+                   lambda seen: seen.names.update(image_raw='/image_rect'),
+                   change(lambda seen: seen.calibration, d=[0.1, 0.0, 0.0, 0.0, 0.0]))),
+    Fault('a node missing, and one whose name is a part of its name', LIVE, ERROR, 'nodes',
+          'not running: relative_pose', 'ros2 launch',
+          lambda seen: vars(seen).update(nodes=['/pose', *(
+              node for node in seen.nodes if node != '/relative_pose')])),
     *(Fault('a vehicle at rest', LIVE, UNMEASURED, what, measured, '', at_rest)
       for what, measured in (('odom velocity', 'moved too little'), ('marker size', HOW),
                              *((name, 'turned too little') for name in (
@@ -399,6 +417,12 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
         finding.level != ERROR for finding in findings))
     if one.level in (OK, WARNING, UNMEASURED):
         assert all(finding.level != ERROR for finding in findings)
+
+
+def test_an_image_without_an_encoding_is_a_fault() -> None:
+    seen, message = Observations(), empty(TYPES['image_raw'])
+    Collector(seen, 5.0).take('image_raw', '/image_raw', message, 1.0)
+    assert 'encoding' in seen.pictures[0].fault
 
 
 def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:
             quaternions, known = path.attitude(times)
             if np.any(known):
                 one = distance_ratio(
-                    arms[known], path.position(times[known]),
+                    arms[known], path.motion(times[known])[0],
                     np.array([quaternion_to_matrix(q) for q in quaternions[known]]),
                     recording.T_base_camera.translation)
                 found += [one] if one is not None and one.at_rest else []

@@ -102,8 +102,8 @@ def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(personality, s
         return True
     try:
         external.await_pose(DEADLINE, 'a reason', fly)
-        known, deadline = external.known(0.0), time.monotonic() + DEADLINE
-        while not external.flying or external.known(0.0) < known + 0.1:
+        known, deadline = external.known, time.monotonic() + DEADLINE
+        while not external.flying or external.known < known + 0.1:
             assert fly() and time.monotonic() < deadline
         assert (external.motion.source, external.armed) == (source, True)
         assert external.mode in ('AUTO.LOITER', 'LOITER')

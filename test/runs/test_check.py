@@ -127,6 +127,14 @@ def test_a_fault_in_a_bag_is_named(change: Change, row: tuple[str, str, str, str
     assert code == (row[0] == 'error')
 
 
+def test_a_bag_that_holds_less_than_it_announces_is_incomplete(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, shorter = (excerpt(tmp_path / name / 'bag', length) for name, length in (
+        ('whole', 1.5), ('shorter', 1.2)))
+    (shorter / 'bag.mcap').replace(bag / 'bag.mcap')
+    assert 'announced messages found' in checked(capsys, bag)[1]['bag']['measured']
+
+
 def test_a_flight_behind_a_moving_leader_shows_focal_length_and_mounting(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def longer(message: Any) -> None:
@@ -149,7 +157,7 @@ def test_the_table_names_the_topic_to_remap_and_ends_with_the_verdict(
     assert any(line.startswith('ERROR   odom: the bag lacks /odom') for line in lines)
     assert any('--remap odom:=/vio/odometry' in line for line in lines)
     assert any(line.startswith('warning bag: incomplete: still being written') for line in lines)
-    assert lines[-1].startswith('not usable as it is: 1 errors, 1 warnings, ')
+    assert lines[-1].startswith('not usable as it is: 1 error, 1 warning, ')
     assert checked(capsys, bag, '--remap', 'odom:=/vio/odometry')[0] == 0
     assert main([str(SAMPLE)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (

@@ -19,9 +19,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from bag_excerpts import Change, excerpt
+import numpy as np
+import pytest
 
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_follower.bags.bag import BagMessage
+from flock_follower.follower import Follower
+from flock_follower.messages import OdometryState
 from flock_follower.parameters.files import parse_parameters, TABLE
 
 IMAGE, ODOM = '/image_raw/compressed', '/odom'
@@ -43,6 +47,15 @@ def stops(topic: str, after: float) -> Change:
         late = message.stamp_ns - began[0] > after * 1e9
         return None if late and message.topic == topic else message
     return change
+
+
+def test_an_error_in_the_follower_is_no_fault_of_a_message(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Follower, time: int, state: OdometryState) -> None:
+        raise np.linalg.LinAlgError('Singular matrix')  # a ValueError
+    monkeypatch.setattr(Follower, 'odometry', fail)
+    with pytest.raises(np.linalg.LinAlgError):
+        played(tmp_path, 0.1, lambda message: message)
 
 
 def test_where_odometry_stops_images_wait_then_drop_and_setpoints_end(tmp_path: Path) -> None:
