@@ -130,6 +130,20 @@ def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
     assert retreat(loss, PARAMS) == pytest.approx(moved, abs=0.01)
 
 
+@pytest.mark.parametrize('speed', [1.8, -1.8])
+def test_without_a_known_place_after_a_jump_of_the_odometry_it_soon_stops(speed: float) -> None:
+    params = PlannerParams(v_max=2.0)
+    follower = Follower(params, params.response_time)
+    follower.velocity = np.array([speed, 0.0, 0.0])
+    for _ in range(10):
+        follower.tick(seen(follower.now, follower.position + AHEAD, follower.velocity))
+    follower.jumped, begin = np.array([0.0, 5.0, 0.0]), follower.position
+    for _ in range(40):
+        assert follower.tick().state in (State.COAST, State.HOLD)
+    assert math.dist(begin, follower.position) < 2.0
+    assert follower.memory.lost is not None and follower.memory.lost.approach == 0.0
+
+
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])
 @pytest.mark.parametrize('fault', ['nobody seen', 'no odometry', 'no image'])
 def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str) -> None:
