@@ -200,6 +200,17 @@ def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
     assert command.acceleration[:2] == pytest.approx(0.2 * whole.acceleration[:2], rel=0.01)
 
 
+def test_engaging_again_and_being_told_active_again_change_nothing() -> None:
+    flight, other = taken_off(), taken_off()
+    for each in (flight, other):
+        each.bridge('ACTIVE')
+        each.commanded()
+    for _ in range(10):
+        flight.loop.engage(True)
+        flight.bridge('ACTIVE: flying')
+        assert repr(flight.commanded()) == repr(other.commanded())
+
+
 @pytest.mark.parametrize('text', ['READY', 'INACTIVE', 'TAKEN_OVER: x', 'NO_AUTOPILOT', 'ACTIV'])
 def test_any_other_word_stops_the_commands_at_the_next_tick(text: str) -> None:
     flight = taken_off()
@@ -243,6 +254,20 @@ def test_after_giving_up_only_engaging_makes_it_command_again() -> None:
         assert command is None and 'call planner/engage' in decision.reason
     flight.loop.engage(True)
     flight.commanded()
+
+
+@pytest.mark.parametrize('text', [None, '', 'TAKEN_OVER', 'ACTIVE'])
+def test_where_no_bridge_is_required_engaging_is_enough(text: str | None) -> None:
+    flight = Flight(require_bridge=False)
+    if text is not None:
+        flight.bridge(text)
+    assert flight.tick()[0].reason == 'not engaged'
+    flight.loop.engage(True)
+    for _ in range(20):
+        flight.commanded()
+        if text is not None:
+            flight.bridge(text)
+    assert flight.loop.memory.fading is None  # what the bridge says begins nothing anew
 
 
 EVENTS = st.one_of(

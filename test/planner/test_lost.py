@@ -61,10 +61,12 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     assert min(heights) > 2.0 - 0.01  # never descending
 
 
-def test_where_it_shall_not_retreat_it_stays() -> None:
-    follower = lost(params=PlannerParams(retreat_max=0.0))
+@pytest.mark.parametrize(('retreat_max', 'looked'), [(0.0, None), (1.0, 0.7)],
+                         ids=['no retreat', 'no camera'])
+def test_where_it_shall_not_retreat_it_stays(retreat_max: float, looked: float | None) -> None:
+    follower = lost(params=PlannerParams(retreat_max=retreat_max))
     for _ in range(100):
-        follower.tick()
+        follower.tick(looked=looked)
     assert abs(follower.position[0]) < 0.35  # what the leader had pushed it back before
 
 
