@@ -256,20 +256,6 @@ def test_after_giving_up_only_engaging_makes_it_command_again() -> None:
     flight.commanded()
 
 
-@pytest.mark.parametrize('text', [None, '', 'TAKEN_OVER', 'ACTIVE'])
-def test_where_no_bridge_is_required_engaging_is_enough(text: str | None) -> None:
-    flight = Flight(require_bridge=False)
-    if text is not None:
-        flight.bridge(text)
-    assert flight.tick()[0].reason == 'not engaged'
-    flight.loop.engage(True)
-    for _ in range(20):
-        flight.commanded()
-        if text is not None:
-            flight.bridge(text)
-    assert flight.loop.memory.fading is None  # what the bridge says begins nothing anew
-
-
 EVENTS = st.one_of(
     st.just('tick'), st.just('silence'), st.booleans(),
     st.sampled_from([*BRIDGE_STATES, 'ACTIVE: x', 'READY: x', '', 'active']).map(
