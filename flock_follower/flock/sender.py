@@ -79,7 +79,7 @@ class Sender:
         if self.frame is None:
             return True
         place, yaw = self.frame.stds
-        return place > POSITION_STD_MAX or yaw > YAW_STD_MAX
+        return not (place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX)  # NaN is vague
 
     def unusable(self, now: int) -> str:
         """Return why its messages are not used at a time, ns, or ''."""

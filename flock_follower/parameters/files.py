@@ -163,7 +163,7 @@ def files_in(arguments: Sequence[str]) -> list[str]:
 
 def unheeded(path: str | Path, node: str) -> str:
     """
-    Return a warning if ROS takes nothing from a file for a node; or ''.
+    Return a warning if ROS takes nothing from a file for a node, or not all that was meant; or ''.
 
     :param node: the node's full name, as '/drone1/planner'.
     :raises ValueError: if no section is for the node, but one has its name in another namespace,
@@ -172,10 +172,11 @@ def unheeded(path: str | Path, node: str) -> str:
     """
     with _naming(path):
         sections = [section for section, _ in _sections('', _read(path))]
-    if any(_means(section, node) for section in sections):
-        return ''
     meant = [section for section in sections if difflib.SequenceMatcher(
         None, _last(section), _last(node)).ratio() >= _MISSPELT]
+    if any(_means(section, node) for section in sections):
+        misspelt = [] if any(_last(section) == _last(node) for section in meant) else meant
+        return f'{path}: {misspelt[0]} is another node: did you mean {node}?' if misspelt else ''
     if meant:
         raise ValueError(f'{path}: holds parameters for {", ".join(meant)}, but none for {node}: '
                          f'name the section {node}, or /**/{_last(node)}')
@@ -203,10 +204,16 @@ def _names(specs: Sequence[Spec], values: Mapping[str, Any]) -> set[str]:
 
 
 def _sections(prefix: str, document: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the full names of the nodes, or their patterns, with their parameters."""
-    for key, content in document.items() if isinstance(document, Mapping) else ():
-        if key == 'ros__parameters' and isinstance(content, Mapping):
-            yield prefix, _flat('', content)
+    """
+    Yield the full names of the nodes, or their patterns, with their parameters.
+
+    :raises ValueError: for a value that is not below ros__parameters: ROS takes no such file.
+    """
+    if not isinstance(document, Mapping):
+        raise ValueError(f'{prefix or "the file"} = {document!r}: must be below ros__parameters')
+    for key, content in document.items():
+        if key == 'ros__parameters' and isinstance(content or {}, Mapping):
+            yield prefix, _flat('', content or {})
         else:
             yield from _sections(f'{prefix}/{str(key).strip("/")}', content)
 

@@ -154,8 +154,7 @@ class PlannerLoop:
         :raises ValueError: if it is not in the frame of the odometry.
         """
         reported = self._accelerations.get(neighbor.child)
-        if not received and reported is not None and (
-                abs(neighbor.stamp - reported.stamp) <= ACCELERATION_AGE):
+        if reported is not None and abs(neighbor.stamp - reported.stamp) <= ACCELERATION_AGE:
             neighbor = with_acceleration(neighbor, reported)
         if not self._frame:
             return  # without odometry nothing flies: step() reports that

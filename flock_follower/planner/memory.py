@@ -100,7 +100,7 @@ class Loss(NamedTuple):
     side: Array
     """Horizontal unit vector (3,) across the neighbor's path, towards the follower."""
     name: str
-    """Name of the lost neighbor."""
+    """Name of the lost neighbor; '' if its place is unknown."""
 
     def retreated(self, position: Array) -> float:
         """Return the horizontal distance of a position (3,) from the origin, m."""

@@ -146,11 +146,12 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
         ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
         return memory.lost._replace(origin=memory.lost.origin + ahead * along)
     near = [leader] if leader else [n for n in flock.values() if n.member.role != AVOID]
-    if not near:
-        return None
+    towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
+    if not near:  # the odometry jumped: the neighbor is at the near edge of the band, or farther
+        free = float(towards @ me.position) + math.sqrt(params.law.d0)
+        return Loss(towards, me.position, free, 0.0, float(me.position[2]), np.zeros(3), '')
     n = min(near, key=lambda n: math.dist(n.position, me.position))
     x, y, _ = awaited(n, memory, me.stamp, params).position - me.position
-    towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     soon = expected(n, memory.acceleration(n), TRUSTED_TIME, params)

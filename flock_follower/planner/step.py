@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -46,19 +45,6 @@ from flock_follower.planner.sight import Occlusion, occlusion, View
 from flock_follower.planner.vertical_yaw import Altitude, facing, searching, turning
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-class _Mode(NamedTuple):
-    """The state of one step, and the inputs that it depends on."""
-
-    state: State
-    reason: str
-    silent: bool
-    """Whether no command may be given: without fresh odometry, or after giving up."""
-    blinded: bool
-    """Whether no images are processed."""
-    newest: float | None
-    """Stamp of the newest estimate to follow, s: of one seen, else of one received."""
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
@@ -83,32 +69,34 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
             waiting or memory.given_up):
         memory, decision = relative.step(memory, memory.own, now, params, elapsed)
         return memory, decision._replace(rejected=rejected)
-    memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
-    if mode.state is State.IDLE:
-        return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
-    if memory.own is None or mode.silent:
+    blinded = blind(looked, now, params)
+    memory, state, reason, newest = _mode(
+        memory, now, engaged, params, blinded, waiting, view, frames)
+    if state is State.IDLE:
+        return memory.begun_afresh(), Decision(state, reason, rejected=rejected)
+    if memory.own is None or memory.given_up or odometry_fault(memory.own, now, params):
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
-        return memory, Decision(mode.state, mode.reason, rejected=rejected)
-    me, tracking = at(memory.own, now), mode.state is State.TRACK
+        return memory, Decision(state, reason, rejected=rejected)
+    me, tracking = at(memory.own, now), state is State.TRACK
     # Commands that are not flown yet count as velocity; part was flown since the measurement.
     coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
-    memory, scene = survey(memory, me, mode.state, mode.blinded, params, elapsed)
+    memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
     neighbors = scene.neighbors
     altitude, vertical = _altitude(memory, scene, ground, float(coming[2]), params, elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
     velocity = me.velocity + coming - bias * params.period * UP
-    wanted, fading = nominal(memory, mode.state, me, velocity, neighbors, params)
+    wanted, fading = nominal(memory, state, me, velocity, neighbors, params)
     command = constrain(wanted, vertical, altitude.climb, memory, scene, velocity, view, params)
     if me.stamp - memory.switched < relative.SETTLING:
         command = command._replace(
             acceleration=relative.without_step(command.acceleration, memory.command))
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, memory, scene, params, elapsed)
-    stamp = mode.newest if tracking else (
-        memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
+    stamp = newest if tracking else (
+        memory.followed if state is State.COAST and SEPARATION in command.reason else None)
     left = math.exp(-elapsed / params.response_time)
     memory = memory._replace(
-        followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
+        followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         shares=neighbors.shares, edges=neighbors.edges,
         faced=neighbors.faced.name if neighbors.faced else memory.faced,
         leader=last_known(memory, neighbors), looking=scene.leader is not None,
@@ -116,16 +104,21 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (
             command.acceleration - bias * UP))
     return memory, Decision(
-        mode.state, mode.reason, command.acceleration, yaw,
+        state, reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
-        command.reason, rejected, _warnings(memory, scene, mode.reason, params), bias,
+        command.reason, rejected, _warnings(memory, scene, reason, params), bias,
         tuple(sorted(neighbors.edges)))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
-          looked: float | None, waiting: str, view: View,
-          frames: Sequence[float]) -> tuple[Memory, _Mode]:
-    """Return the mode of this step, and the memory with what the mode rests on."""
+          blinded: str, waiting: str, view: View, frames: Sequence[float]
+          ) -> tuple[Memory, State, str, float | None]:
+    """
+    Return the memory, the state and the reason for it, and the stamp of the newest estimate, s.
+
+    That estimate is one to follow: one seen, else one received. The memory has given up if no
+    neighbor was followed for too long; it then sends no commands.
+    """
     fault = odometry_fault(memory.own, now, params)
     occluded = None if fault else _occluded(memory, now, frames, view)
     follow = [n for n in memory.neighbors.values() if n.member.role != AVOID and (
@@ -136,15 +129,13 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     begun = now if memory.begun is None else memory.begun
     given_up = memory.given_up or (
         now - begun if unfollowed is None else unfollowed) > params.resume_timeout
-    blinded = blind(looked, now, params)
     state, reason = next_state(
         engaged, fault or late(memory.own, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
         None if received is None else now - received, occluded is not None)
     if state is not State.IDLE:
         memory = memory._replace(given_up=given_up, begun=begun, occlusion=occluded)
-    newest = received if seen is None else seen
-    return memory, _Mode(state, reason, bool(fault) or given_up, bool(blinded), newest)
+    return memory, state, reason, received if seen is None else seen
 
 
 def _occluded(memory: Memory, now: float, frames: Sequence[float], view: View) -> Occlusion | None:

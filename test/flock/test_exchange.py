@@ -26,7 +26,9 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
+from flock_follower.flock.alignment import Frame
 from flock_follower.flock.exchange import Sharing
+from flock_follower.flock.sender import Sender
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.messages import from_odometry, odometry, OdometryState
 
@@ -158,6 +160,12 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
     assert near.senders['f2'].unusable(now) == 'sends 20 times in 1.4 s'
     assert 'ignored for a while' in reasons(near)
     assert reasons(apart).count('aligned anew with f2') > 10
+
+
+@pytest.mark.parametrize(('variance', 'usable'), [(1e-3, True), (0.1, False), (math.nan, False)])
+def test_a_frame_is_used_if_it_is_known_well_enough(variance: float, usable: bool) -> None:
+    frame = Frame(0.0, np.zeros(3), np.zeros(3), variance * np.eye(4), EPOCH)
+    assert Sender('f2', frame=frame).unusable(EPOCH).startswith('its frame is known') != usable
 
 
 def test_why_nothing_is_heard_is_told() -> None:

@@ -90,11 +90,14 @@ def test_a_node_takes_what_the_section_follower_of_its_namespace_sets(tmp_path: 
     ({**of('relative_pose', cameras=['a']), **of('planner', cameras=['b'])},
      r"cameras = \['a'\] for relative_pose and \['b'\] for planner: must be the same$"),
     (of('planner', odom_twist_frame='odom'), "^odom_twist_frame = .*'odom' for planner.*same$"),
+    ({**of('/**', cameras=['a']), **of('planner', **{'camera.a.rpy': [0.0, 0.0, 2.0]})},
+     r'^camera.a.rpy = .* and \[0.0, 0.0, 2.0\] for planner: must be the same$'),
     *((of('/**', **{name: 0.1}), f'unknown parameter {name} .*: it was removed, ')
       for name in ('period', 'check_parameters', 'altitude_hold', 'j_max')),
-    *((document, 'holds ros__parameters neither of /[*][*] nor of relative_pose') for document in (
-        of('camera_driver', fps=30), {'planner': {'v_max': 1.0}},
-        {'planner': {'ros__parameters': 3}}, 'text', None))])
+    ({**of('/**', a_max=1.0), 'planner': {'v_max': 1.0}}, '^/planner/v_max = 1.0: must be below'),
+    ({'planner': {'ros__parameters': 3}}, '^/planner/ros__parameters = 3: must be below'),
+    *((document, '^the file = .*: must be below ros__parameters') for document in ('text', None)),
+    (of('camera_driver', fps=30), 'holds ros__parameters neither of /[*][*] nor of relative')])
 def test_what_is_wrong_is_named(document: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_parameters(document, TABLE)
@@ -129,6 +132,7 @@ PARAMETERS = {'ros__parameters': {'v_max': 0.4}}
      '/drone1/planner, or /**/planner'),
     (['/drone1/planner', '/drone2/planner'], '/drone2/planner', ''),
     (['/drone1/planner', '/**'], '/drone2/planner', ''),
+    (['/**', 'plannner'], '/planner', '/plannner is another node: did you mean /planner?'),
     (['relative_pose', 'planner_server', 'camera'], '/planner',
      'holds no parameters for /planner, only for /camera, /drone3/camera, '
      '/planner_server, /relative_pose'),

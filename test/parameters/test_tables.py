@@ -12,15 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The table of the black box."""
+"""The tables of the black box and of the bridge."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from flock_follower.parameters import black_box_table
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.parameters import black_box_table, mavlink_bridge_table
 from flock_follower.parameters.spec import check_values
 
 
@@ -33,3 +35,9 @@ def test_recordings_go_to_the_given_folder_or_that_of_ros(
     values = black_box_table.build(
         check_values(black_box_table.SPECS, {'record_folder': folder}))
     assert black_box_table.folder(values, home, namespace) == expected
+
+
+def test_constants_of_the_gate_are_no_parameters() -> None:
+    missing = {field.name for field in fields(GateLimits)} - {
+        spec.name for spec in mavlink_bridge_table.SPECS}
+    assert missing == {'brake_time', 'speed_horizon', 'blind_timeout'}

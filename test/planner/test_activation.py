@@ -200,6 +200,17 @@ def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
     assert command.acceleration[:2] == pytest.approx(0.2 * whole.acceleration[:2], rel=0.01)
 
 
+def test_engaging_again_and_being_told_active_again_change_nothing() -> None:
+    flight, other = taken_off(), taken_off()
+    for each in (flight, other):
+        each.bridge('ACTIVE')
+        each.commanded()
+    for _ in range(10):
+        flight.loop.engage(True)
+        flight.bridge('ACTIVE: flying')
+        assert repr(flight.commanded()) == repr(other.commanded())
+
+
 @pytest.mark.parametrize('text', ['READY', 'INACTIVE', 'TAKEN_OVER: x', 'NO_AUTOPILOT', 'ACTIV'])
 def test_any_other_word_stops_the_commands_at_the_next_tick(text: str) -> None:
     flight = taken_off()

@@ -123,6 +123,14 @@ def test_a_climb_as_small_as_its_noise_is_none_and_a_real_one_counts() -> None:
         assert least <= altitude.climb <= most
 
 
+def test_an_absurd_acceleration_of_the_leader_does_no_harm() -> None:
+    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    for _ in range(5):
+        altitude = altitude.following(leader(2.0, 0.0, 1e300), PARAMS, PERIOD)
+    assert abs(altitude.climb) <= PARAMS.climb_rate
+    assert abs(altitude.held - 2.0) <= 5 * PERIOD * PARAMS.climb_rate
+
+
 def test_after_a_loss_the_climb_begins_gently_and_does_not_overshoot() -> None:
     """The vehicle flies each command 0.2 s late, as flights do."""
     before = 0.0
@@ -153,6 +161,12 @@ def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
         assert altitude.held <= 3.0
     assert (altitude.held, altitude.climb) == (
         pytest.approx(3.0 - INSIDE), pytest.approx(0.0, abs=1e-3))
+
+
+def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
+    altitude = Altitude.begun(me(0.6), 0.0, PARAMS)
+    assert followed(altitude, leader(0.2), 10.0).held == 0.6
+    assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
 
 
 def test_where_nobody_knows_the_ground_it_does_not_go_below_where_it_began() -> None:

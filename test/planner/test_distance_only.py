@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.bounds import clear_of_sphere
+from flock_follower.planner.bounds import clear_of_sphere, DEVIATIONS
 from flock_follower.planner.inputs import distance_known, Neighbor
 from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.modes import State
@@ -86,6 +86,16 @@ def test_fences_go_before_it_once_the_leader_may_have_come_round(age: float, sur
     found, = clear_of_sphere(ranged(0.0, 1.25), seen(-age), own(), np.zeros(3), PARAMS)
     assert found.seen is sure
     assert found.normal == pytest.approx(-AHEAD)
+
+
+def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> None:
+    def lowest(n: Neighbor) -> float:
+        return clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS)[0].least
+
+    sure, less = ranged(0.0, 1.5, along=0.0), ranged(0.0, 1.5 + 0.2 * DEVIATIONS, along=0.2)
+    assert lowest(less) == pytest.approx(lowest(sure))
+    ages = [lowest(ranged(-age, 2.0)) for age in (0.0, 0.4, 0.8, 1.2)]
+    assert ages[0] < ages[1] < ages[2] < ages[3]
 
 
 class Ranging(Follower):

@@ -84,6 +84,14 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
         assert reached <= max(v_max, speed * (1.0 + 1e-15))
 
 
+@settings(max_examples=150)
+@given(SEED, st.integers(1, 3))
+def test_near_the_band_the_vertical_part_stays(seed: int, count: int) -> None:
+    a, v, around = situation(seed, count)
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
+    assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
+
+
 @given(SEED, st.integers(0, 3))
 def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
@@ -176,6 +184,12 @@ def test_the_margin_leaves_room_in_a_narrow_band() -> None:
     for distance in np.linspace(1.0, 1.5, 51):
         lower, upper = radial_bounds((-distance, 0.0, 0.0), (0.0, 0.0, 0.0), narrow, PARAMS)
         assert lower.least < -upper.least
+
+
+def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
+    above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
+    command = guard(np.zeros(3), np.zeros(3), ordered(above), A_MAX, V_MAX, T)
+    assert np.array_equal(command.acceleration, np.zeros(3))
 
 
 @pytest.mark.parametrize('p', [(0.0, 0.0, 0.0), (math.nan, 1.0, 0.0), (1e308, 1e308, 0.0)])

@@ -117,6 +117,25 @@ def test_leaving_the_path_of_one_is_no_way_into_another_out_of_sight(y: float) -
         assert math.dist(follower.position, other) > 1.2
 
 
+@pytest.mark.parametrize('y', [-0.05, -0.2])
+def test_the_path_that_it_leaves_is_the_one_to_come(y: float) -> None:
+    """The leader turns for a second: its path passes on the other side than its velocity says."""
+    follower, v, a = Follower(PARAMS, PARAMS.response_time), np.array([-1.0, -1.0, 0.0]), np.array(
+        [0.0, 1.0, 0.0])
+
+    def leader(t: float) -> Array:
+        turned = min(t, 1.0)
+        return np.array([2.0, 0.0, 2.0]) + v * t + a * turned * (t - 0.5 * turned)
+
+    for t in (-0.4, -0.3, -0.2, -0.1, 0.0):
+        follower.position = np.array([0.0, y, 2.0])
+        follower.velocity, follower.acceleration = np.zeros(3), np.zeros(3)
+        follower.tick(seen(follower.now, leader(t), v + a * t, acceleration=a))
+    for k in range(45):
+        follower.tick()
+        assert math.dist(leader(0.1 * (k + 2)), follower.position) > 1.35
+
+
 @pytest.mark.parametrize(('offset', 'side'), [([-2.0, 0.3, 1.0], 1.0), ([-2.0, -0.3, 0.0], -1.0)])
 def test_the_side_of_a_path_is_its_own(offset: list[float], side: float) -> None:
     found = beside(np.array([-1.0, 0.0, 0.5]), np.array(offset))
@@ -148,12 +167,27 @@ def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
     assert climb_range([near([1.4, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
 
 
+def test_the_climb_keeps_the_height_that_the_slant_distance_asks_for() -> None:
+    level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
+    too_near = height - math.sqrt(1.0 - level ** 2)
+    assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
+        1] == pytest.approx(PARAMS.guarding.closing(too_near)[0])
+
+
 def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:
     params = PlannerParams(v_max=0.5)
     for height in (0.8, -0.8):
         up = math.copysign(1.0, height)
         coming = near([0.05, 0.0, height], [-0.2, 0.0, -0.3 * up])
         assert climb_range([coming], OWN, params) == pytest.approx((-0.6 * up, -0.6 * up), abs=0.1)
+
+
+def test_the_height_between_is_that_of_hulls() -> None:
+    params = PlannerParams(v_max=0.5, radius=0.3)
+    still = near([0.1, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
+    assert climb_range([still], OWN, params)[1] < -0.2
+    aside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0], 0.3)
+    assert climb_range([aside], OWN, params)[1] < 0.4
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:

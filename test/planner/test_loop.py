@@ -108,6 +108,20 @@ def test_what_came_is_handed_on_once() -> None:
     assert loop.tick(START + TICK + 1, PARAMS)[0].rejected == ()
 
 
+@pytest.mark.parametrize(('axis', 'state'), [
+    (0, State.SEARCH), (2, State.SEARCH), (3, State.TRACK), (5, State.TRACK)])
+def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
+        axis: int, state: State) -> None:
+    loop, covariance = engaged(), SURE.copy()
+    covariance[axis, axis] = 100.0
+    loop.take_odometry(own(START), START)
+    loop.take_neighbor(leader(START, covariance=covariance))
+    assert loop.tick(START, PARAMS)[0].state is state
+    if state is State.TRACK:
+        np.testing.assert_array_equal(
+            loop.memory.neighbors['leader'].position_covariance, SURE[:3, :3])
+
+
 @pytest.mark.parametrize(('std', 'known'), [(0.49, True), (0.51, False), (np.nan, False)])
 def test_the_yaw_of_a_neighbour_is_known_up_to_a_deviation(std: float, known: bool) -> None:
     loop, covariance = engaged(), SURE.copy()
@@ -171,3 +185,21 @@ def test_the_same_odometry_again_shows_no_rhythm_and_a_jump_back_ends_it() -> No
     for (stamp, arrival), ages in zip(arrived, ([], [], [], [3], [3], [3, 3], [])):
         loop.take_odometry(own(stamp * second), arrival * second)
         assert list(loop._ages) == ages
+
+
+def test_odometry_at_10_hz_is_not_late_between_its_messages() -> None:
+    loop = engaged()
+    for stamp in range(START, START + 10 * TICK, TICK):
+        loop.take_odometry(own(stamp), stamp + 60 * MS)
+        loop.take_neighbor(leader(stamp))
+        decision = loop.tick(stamp + 155 * MS, PARAMS)[0]
+        assert stamp == START or decision.state is State.TRACK
+
+
+def test_after_a_jump_of_the_odometry_the_height_at_arming_is_unknown() -> None:
+    loop = engaged()
+    loop.ground = 0.4
+    for now, height, ground in ((START, 2.0, 0.4), (START + TICK, 3.0, None)):
+        loop.take_odometry(own(now)._replace(position=np.array([0.0, 0.0, height])), now)
+        loop.tick(now, PARAMS)
+        assert loop.ground == ground

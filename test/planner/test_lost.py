@@ -61,10 +61,12 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     assert min(heights) > 2.0 - 0.01  # never descending
 
 
-def test_where_it_shall_not_retreat_it_stays() -> None:
-    follower = lost(params=PlannerParams(retreat_max=0.0))
+@pytest.mark.parametrize(('retreat_max', 'looked'), [(0.0, None), (1.0, 0.7)],
+                         ids=['no retreat', 'no camera'])
+def test_where_it_shall_not_retreat_it_stays(retreat_max: float, looked: float | None) -> None:
+    follower = lost(params=PlannerParams(retreat_max=retreat_max))
     for _ in range(100):
-        follower.tick()
+        follower.tick(looked=looked)
     assert abs(follower.position[0]) < 0.35  # what the leader had pushed it back before
 
 
@@ -128,6 +130,20 @@ def test_the_retreat_is_shorter_by_the_distance_beyond_the_band(distance: float,
     loss = Loss(np.array([1.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]), 4.0 + distance, 0.0, 0.0,
                 np.zeros(3), 'leader')
     assert retreat(loss, PARAMS) == pytest.approx(moved, abs=0.01)
+
+
+@pytest.mark.parametrize('speed', [1.8, -1.8])
+def test_without_a_known_place_after_a_jump_of_the_odometry_it_soon_stops(speed: float) -> None:
+    params = PlannerParams(v_max=2.0)
+    follower = Follower(params, params.response_time)
+    follower.velocity = np.array([speed, 0.0, 0.0])
+    for _ in range(10):
+        follower.tick(seen(follower.now, follower.position + AHEAD, follower.velocity))
+    follower.jumped, begin = np.array([0.0, 5.0, 0.0]), follower.position
+    for _ in range(40):
+        assert follower.tick().state in (State.COAST, State.HOLD)
+    assert math.dist(begin, follower.position) < 2.0
+    assert follower.memory.lost is not None and follower.memory.lost.approach == 0.0
 
 
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])

@@ -214,6 +214,15 @@ def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
     assert np.array_equal(commanded(with_bad), commanded(good))
 
 
+def test_the_newest_estimate_of_a_name_counts_whatever_the_order_of_arrival() -> None:
+    old, new = leader(0.1, (1.5, 0.0, 2.0)), leader(0.2, (2.5, 0.0, 2.0))
+    me = own(0.2, velocity=(0.0, 0.1, 0.0))
+    forward, backward, alone = (
+        commanded(decide(0.2, *order, me=me)) for order in ((old, new), (new, old), (new,)))
+    assert np.array_equal(forward, backward)
+    assert np.array_equal(forward, alone)
+
+
 def test_neighbors_drop_out_one_by_one_as_they_grow_old() -> None:
     near, far = leader(0.0, name='near'), leader(0.3, (0.0, 2.5, 2.0), name='far')
     me = own(0.4, velocity=(0.1, 0.1, 0.0))
