@@ -77,6 +77,14 @@ def test_steps_of_the_position_contradict_nothing(twist: str, seed: int) -> None
     assert watched.frame == twist
 
 
+def test_readings_that_hardly_differ_decide_nothing() -> None:
+    """At rest, noise and a bias of the velocity would decide in the end."""
+    watched = TwistFrame()
+    for k in range(round(60.0 * RATE)):
+        watched.take(k / RATE, np.zeros(3), np.zeros(3), np.array([0.04, 0.0, 0.0]))
+    assert watched.found == ''
+
+
 def test_a_velocity_that_is_no_such_thing_is_dropped_in_spite_of_steps() -> None:
     watched = TwistFrame()
     for k in range(200):
