@@ -17,7 +17,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field
 import fcntl
@@ -154,8 +154,8 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
            if (state := source.take(message, stamp_to_nanoseconds(message.header.stamp)))]
     leader_states, follower_states = (
         [*map(from_odometry, states)] for states in (true_leader, true_own))
-    table = compared(estimates(record['/neighbors']), own, follower_states, leader_states,
-                     stamps, np.ones(len(stamps)), int(stamps[0]))  # its leader is always in view
+    table = compared(estimates(_received(record)), own, follower_states, leader_states, stamps,
+                     np.ones(len(stamps)), int(stamps[0]))  # its leader is always in view
     # The bag's clock relative to the monotonic one of the logs.
     origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
     with np.load(out / 'autopilot.npz') as file:
@@ -218,11 +218,11 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
             [from_trajectory(message, 'odom').acceleration for _, message in commands],
             (-1, 3))
     sent = flown(log['setpoint_time'])
+    neighbors, stamps = _received(record), log['image_stamp']
     table = compared(
-        estimates(record.get('/neighbors', [])), _states(log, 'odom', log['odom_stamp']),
-        _states(log, 'follower', log['image_stamp']),
-        _states(log, LEADER_NAME, log['image_stamp']),
-        log['image_stamp'], log['image_usable'].astype(float), epoch)
+        estimates(neighbors), _states(log, 'odom', log['odom_stamp']),
+        _states(log, 'follower', stamps), _states(log, LEADER_NAME, stamps), stamps,
+        judged(log['image_usable'], stamps, neighbors), epoch)
     times, hidden = table['time'], table['visible'] == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
     return LiveFlight(
@@ -272,15 +272,18 @@ def read_record(path: Path) -> dict[str, list[tuple[float, Any]]]:
             for topic in {topic for topic, _, _ in messages}}
 
 
-def estimates(messages: Sequence[tuple[float, Any]]) -> dict[int, dict[str, Estimate]]:
-    """
-    Return the estimates that messages of ``neighbors`` hold, by stamp, ns, and name.
+def _received(record: Mapping[str, Sequence[tuple[float, Any]]]) -> list[OdometryState]:
+    return [from_odometry(message) for _, message in record.get('/neighbors', [])]
 
-    What a message does not hold is zero. Those of flight without odometry are in no frame of it.
+
+def estimates(states: Iterable[OdometryState]) -> dict[int, dict[str, Estimate]]:
+    """
+    Return the estimates of states published on ``neighbors``, by stamp, ns, and name.
+
+    What a state does not hold is zero. Those of flight without odometry are in no frame of it.
     """
     found: dict[int, dict[str, Estimate]] = {}
-    for _, message in messages:
-        state = from_odometry(message)
+    for state in states:
         if state.frame == RELATIVE:
             continue
         rotation, covariance = quaternion_to_matrix(state.quaternion), np.zeros((15, 15))
@@ -290,6 +293,18 @@ def estimates(messages: Sequence[tuple[float, Any]]) -> dict[int, dict[str, Esti
             state.stamp / NANOSECONDS, state.position, state.velocity, rotation,
             rotation @ state.angular_velocity, np.zeros(3), covariance)
     return found
+
+
+def judged(visible: Array, stamps: NDArray[np.int64], neighbors: Sequence[OdometryState]) -> Array:
+    """
+    Return 1 for images with the leader in view, 0 for others, NaN in flight without odometry.
+
+    There the leader is found, but in no frame that has a truth.
+
+    :param visible: (n,); :param stamps: (n,), ns; :param neighbors: as published.
+    """
+    relative = [state.stamp for state in neighbors if state.frame == RELATIVE]
+    return np.where(np.isin(stamps, relative), np.nan, visible)
 
 
 def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[OdometryState],
@@ -302,7 +317,7 @@ def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[Odometry
     twist in the leader's body, and holds the error of the leader's attitude, too.
 
     :param stamps: (n,) of the images, ns.
-    :param visible: (n,), 1 if the truth has the leader in view.
+    :param visible: (n,), see :func:`judged`.
     :param start: the time of zero in the table, ns.
     """
     errors = FrameErrors(

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_desk.runs.frame_errors import Table
-from flock_desk.runs.record import compared
+from flock_desk.runs.record import compared, judged
 from flock_desk.runs.summary import (
     consistency,
     hold_figures,
@@ -31,7 +31,7 @@ from flock_desk.runs.summary import (
     spread,
 )
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import OdometryState
+from flock_follower.messages import OdometryState, RELATIVE
 from flock_follower.perception.neighbor_filter import Estimate
 
 SECOND = 10**9
@@ -63,6 +63,13 @@ def table(estimates: dict[int, dict[str, Estimate]], leader: list[float],
     return compared(estimates, straight([0.0, 0.0, 0.0], yaw), straight([5.0, 0.0, 1.0]),
                     straight(np.add(leader, [5.0, 0.0, 1.0]).tolist()), STAMPS,
                     np.ones(len(STAMPS)) if visible is None else visible, 0)
+
+
+def test_images_of_flight_without_odometry_are_not_judged() -> None:
+    states = straight([2.0, 0.0, 0.0])
+    states[1] = states[1]._replace(frame=RELATIVE)
+    np.testing.assert_array_equal(
+        judged(np.array([True, True, False]), STAMPS[:3], states), [1.0, np.nan, 0.0])
 
 
 def test_an_offset_of_the_neighbour_is_the_error() -> None:
