@@ -269,8 +269,9 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
-        climb = HEIGHT_FREQUENCY * (
-            HEIGHT_FREQUENCY * (held.height - place.height) - 2.0 * place.climb_rate)
+        # A late rate would make the height swing: the time constant grows as that of braking.
+        frequency = HEIGHT_FREQUENCY / (1.0 + 2.0 * HEIGHT_FREQUENCY * estimated.margin)
+        climb = frequency * (frequency * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
             nominal[2] = climb
             against = against + np.array([0.0, 0.0, _bounded(offset)])

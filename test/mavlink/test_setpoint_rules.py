@@ -162,6 +162,23 @@ def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
          'velocity from odom stale', (-0.4 / (0.3 + more), 0.0, 0.0))
 
 
+@pytest.mark.parametrize('delay', [0.05, 0.15, 0.29])
+def test_a_height_that_is_held_does_not_swing_however_late_the_velocity(delay):
+    step, response = 0.01, 0.25  # s: thrust follows late, too
+    heights, rates, acceleration, commanded = [2.4] * 50, [0.0] * 50, 0.0, 0.0
+    for k in range(3000):
+        if k % 5 == 0:
+            late = Motion((0.0, 0.0, rates[-1 - round(delay / step)]), delay, 0.3, delay)
+            place = Location(height=heights[-6], climb_rate=late.velocity[2])
+            commanded = judge(command=None, odom=late, autopilot=UNKNOWN, held=Held(0.3, 2.0),
+                              place=place).acceleration[2]
+        acceleration += step / response * (commanded - acceleration)
+        rates.append(rates[-1] + step * acceleration)
+        heights.append(heights[-1] + step * rates[-1])
+    assert min(heights) > 1.9
+    np.testing.assert_allclose(heights[-500:], 2.0, atol=0.01)
+
+
 @pytest.mark.parametrize(('ages', 'kind', 'reason'), [
     ((0.31, 0.31), LEVEL, 'velocity from odom stale'),
     ((2.31, 2.29), LEVEL, 'velocity from odom stale'),
