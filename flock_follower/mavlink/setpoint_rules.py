@@ -49,7 +49,14 @@ from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ne
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location
 from flock_follower.mavlink.relative_flight import Relative
-from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
+from flock_follower.mavlink.velocity_check import (
+    finite_vector,
+    fresh,
+    KnownMotion,
+    LATE_FACTOR,
+    USUAL_AGE,
+    Velocity,
+)
 from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
@@ -269,8 +276,8 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
-        # A late rate would make the height swing: the time constant grows as that of braking.
-        frequency = HEIGHT_FREQUENCY / (1.0 + 2.0 * HEIGHT_FREQUENCY * estimated.margin)
+        # A late rate makes the height swing, unless 1 / (2 w) is at least e times its age.
+        frequency = min(HEIGHT_FREQUENCY, 0.5 / (estimated.margin + LATE_FACTOR * USUAL_AGE))
         climb = frequency * (frequency * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
             nominal[2] = climb
