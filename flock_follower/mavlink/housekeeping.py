@@ -252,7 +252,7 @@ class Housekeeping:
         """Return that the estimate comes too seldom, or that the link stalls, or ''."""
         if now - self._alive_since < RECENT + PERIOD:
             return ''  # the requested messages have not come for so long
-        problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} asked for'
+        problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} requested'
                     for name, rate in self.rates(now).items()
                     if 0.0 < rate < FEW * self._estimate_rate]
         pause = self._link.telemetry.arrivals.longest_pause(now)

@@ -141,6 +141,6 @@ def test_an_engage_from_another_machine_arrives_only_where_ros_is_left_open(
     for log, code in ended.items():
         assert code == 1 and 'no such service' in machines.reported(log), machines.reported(log)
     assert ENGAGED not in machines.reported('closed')
-    # It could have been engaged all the time, by whoever is on the drone.
+    # A caller on the drone could have engaged it all the time.
     assert machines.engage('drone', 'closed', CLOSED, 'on the drone').wait(20.0) == 0
     wait_until(lambda: ENGAGED in machines.reported('closed'), 5.0, 'the engagement')

@@ -109,7 +109,7 @@ def test_requests_that_are_lost_are_repeated():
 @pytest.mark.parametrize(('fault', 'reported'), [
     # Below half of what was asked for; none at all has other causes than the link.
     ({'message': 'LOCAL_POSITION_NED', 'share': 0.7},
-     r'LOCAL_POSITION_NED comes at 1[2-8] Hz of 50 asked for'),
+     r'LOCAL_POSITION_NED comes at 1[2-8] Hz of 50 requested'),
     ({'at': 6.5, 'duration': 0.6},
      r'nothing came from the autopilot for 0.6[0-3] s in the last 5 s')])
 def test_a_slow_or_stalling_link_is_reported(fault, reported):

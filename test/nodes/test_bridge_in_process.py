@@ -337,7 +337,7 @@ def test_a_slow_link_heights_that_differ_and_a_landing_by_the_bridge_are_reporte
         bench.bridge.housekeeping._alive_since = 0.0
         found = bench.problems(ahead=0.6)
         return all(part in found for part in (
-            'LOCAL_POSITION_NED comes at 0 Hz of 50 asked for',
+            'LOCAL_POSITION_NED comes at 0 Hz of 50 requested',
             'nothing came from the autopilot for 0.',
             'height above home as 5.0 m, the barometer says 2.0 m',
             'the bridge requests land: no valid velocity'))
