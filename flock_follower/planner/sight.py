@@ -39,7 +39,7 @@ from flock_follower.geometry import (
 from flock_follower.planner.inputs import at, Neighbor, OwnState
 
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
-WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
+WIDEST = 1.4  # rad off the axis of a fisheye lens, and off the direction ahead: usable up to here
 
 
 class FieldOfView(NamedTuple):
@@ -72,10 +72,14 @@ class FieldOfView(NamedTuple):
         # The middles of the four sides of the image: forward, left, up of the camera.
         sides = np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
                           [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
-        if several and info.distortion_model == 'equidistant':
+        fisheye = info.distortion_model == 'equidistant'
+        if fisheye:
             sides[:, 1:] = np.tan(np.clip(sides[:, 1:], -WIDEST, WIDEST))
         ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
         sides = sides @ ahead.T
+        if fisheye and ahead[0, 0] > math.cos(WIDEST):
+            off = np.hypot(sides[:, 1], sides[:, 2])
+            sides[:, 0] = np.maximum(sides[:, 0], off / math.tan(WIDEST))
         if np.any(sides[:, 0] <= 0.0):
             raise ValueError(
                 f'rpy = {angles}: a camera that looks up or down: the neighbor is not kept in its '

@@ -32,10 +32,10 @@ from flock_follower.planner.bounds import (
     sight_bounds,
 )
 from flock_follower.planner.guard import ordered
-from flock_follower.planner.inputs import Expected
+from flock_follower.planner.inputs import Expected, Neighbor, OwnState
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import FieldOfView, occlusion, WIDEST
 
 PARAMS = PlannerParams(v_max=20.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -65,8 +65,21 @@ def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
 def test_the_angles_are_those_of_the_image() -> None:
     aside, up = math.atan(320.0 / 610.0), math.atan(240.0 / 610.0)
     assert (VIEW.left, VIEW.right, VIEW.up, VIEW.down) == pytest.approx((aside, aside, up, up))
-    fisheye = FieldOfView.of_camera(info(model='equidistant'), [0.0, 0.0, math.pi], True)
-    assert (fisheye.left, fisheye.up) == pytest.approx((320.0 / 610.0, 240.0 / 610.0))
+
+
+@pytest.mark.parametrize('several', [False, True])
+def test_a_fisheye_sees_as_far_as_its_model_says(several: bool) -> None:
+    narrow = FieldOfView.of_camera(
+        info(model='equidistant'), [0.0, 0.0, math.pi if several else 0.0], several)
+    assert (narrow.left, narrow.up) == pytest.approx((320.0 / 610.0, 240.0 / 610.0))
+    wide = [190.0, 0.0, 320.0, 0.0, 190.0, 240.0, 0.0, 0.0, 1.0]  # 96 and 72 degrees to the sides
+    lowered = FieldOfView.of_camera(info(wide, 'equidistant'), [0.0, 0.2, 0.0], several)
+    assert (lowered.left, lowered.right) == pytest.approx((WIDEST, WIDEST))
+    assert (lowered.up, lowered.down) == pytest.approx((240.0 / 190.0 - 0.2, WIDEST))
+    # A leader at 60 degrees that is not found is occluded: it has not left the image.
+    leader = Neighbor('leader', 0.0, np.array([1.0, 1.7, 0.0]), np.zeros(3))
+    me = OwnState(0.1, np.zeros(3), np.zeros(3), 0.0)
+    assert occlusion(None, leader, me, [0.03, 0.06, 0.09], (lowered,), 0.0)
 
 
 def test_a_camera_that_looks_down_sees_more_below() -> None:
@@ -155,5 +168,6 @@ def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:
 
 
 def test_a_camera_that_looks_down_keeps_nobody_in_sight() -> None:
-    with pytest.raises(ValueError, match='a camera that looks up or down'):
-        FieldOfView.of_camera(info(), [0.0, 1.5, 0.0], True)
+    for model in ('plumb_bob', 'equidistant'):
+        with pytest.raises(ValueError, match='a camera that looks up or down'):
+            FieldOfView.of_camera(info(model=model), [0.0, 1.5, 0.0], True)
