@@ -48,6 +48,9 @@ IDENTITY_QUATERNION: Array = np.array([0.0, 0.0, 0.0, 1.0])
 #: Standard acceleration of gravity, m/s^2.
 GRAVITY = 9.80665
 
+#: m, or m/s: a shorter vector has no direction.
+SHORTEST = 1e-6
+
 
 def enu_to_ned(vector: ArrayLike) -> Array:
     """Return the NED coordinates, shape ``(..., 3)``, of vectors given in ENU; self-inverse."""

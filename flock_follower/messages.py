@@ -79,6 +79,11 @@ POSITION_JUMP = 0.3
 FUTURE_TOLERANCE = 0.1
 #: s: a stamp farther back is a new start (a bag played again), not disorder.
 MAX_JUMP = 0.5
+#: m: odometry farther from its prediction has another frame than before: places in the old frame
+#: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source.
+ODOMETRY_JUMP = 0.25
+#: m: a neighbour's position with a larger standard deviation, sqrt(trace), is not used.
+POSITION_STD_MAX = 0.5
 
 Make = Callable[[str], Any]
 

@@ -165,7 +165,7 @@ def _jacobian(lever: Array) -> Array:
 
 
 #: Pairs of a fit at least and at most, and how old they may be, ns: drift makes them worthless.
-FEWEST, MOST, LONGEST = 5, 100, 20 * NANOSECONDS
+FEWEST, MOST, PAIR_AGE_MAX = 5, 100, 20 * NANOSECONDS
 #: Errors of sightings are correlated in time: factor on the variances of a fit.
 WARINESS = 4.0
 #: Pairs with a larger chi^2 (3 degrees of freedom) are excluded; share of the pairs that must fit.

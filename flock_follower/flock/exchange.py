@@ -34,7 +34,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 import math
 
-from flock_follower.flock.alignment import FEWEST, first_fit, in_own_frame, LONGEST
+from flock_follower.flock.alignment import FEWEST, first_fit, in_own_frame, PAIR_AGE_MAX
 from flock_follower.flock.peers import (
     ACCELERATION_STD,
     aged,
@@ -52,14 +52,21 @@ from flock_follower.flock.peers import (
     track_point,
     TrackPoint,
 )
-from flock_follower.flock.sender import BAN, POSITION_STD_MAX, Sender, WRONG
-from flock_follower.messages import DUPLICATE, NANOSECONDS, OdometryState, to_nanoseconds
+from flock_follower.flock.sender import BAN, Sender, WRONG
+from flock_follower.messages import (
+    DUPLICATE,
+    MAX_JUMP,
+    NANOSECONDS,
+    OdometryState,
+    POSITION_STD_MAX,
+    to_nanoseconds,
+)
 
 #: Between two rounds of messages, ns; a little less than 0.1 s, as timers jitter.
 PERIOD = 90_000_000
-#: Own states and sightings older than this, ns, or as far in the future, are not sent; nor are
-#: older ones used after newer ones.
+#: Own states and sightings older than this, ns, or as far in the future, are not sent.
 STALE = 500_000_000
+DISORDER = to_nanoseconds(MAX_JUMP)  # ns by which an older state comes after a newer one
 OWN_FUTURE = 'own odometry from the future'
 START_YAW = 0.35  # rad: a yaw less certain than this is no start for a linear filter
 SEEN_TIMEOUT = 500_000_000  # ns after an own sighting in which received states are not used
@@ -104,7 +111,7 @@ class Sharing:
             return
         if before is not None:
             back = before.stamp - state.stamp
-            if 0 <= back <= STALE:
+            if 0 <= back <= DISORDER:
                 return  # repeated, or out of order
             leap = 'in time' if back > 0 else leapt(before, state)
             if before.frame != state.frame:
@@ -127,7 +134,7 @@ class Sharing:
                 (fast, 'unusable sighting', fast),
                 (name == self.name or state.frame != frame, 'unusable sighting',
                  f'{name!r} in frame {state.frame!r}, own odometry in {frame!r}')) or (
-                     before is not None and 0 <= before.stamp - state.stamp <= STALE):
+                     before is not None and 0 <= before.stamp - state.stamp <= DISORDER):
             return
         if self._refused(
                 (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
@@ -180,7 +187,7 @@ class Sharing:
             sender.sent_at(state.stamp, received)
             if sender.frame is not None:
                 sender.frame.move_anchor(state.position)
-        if sender.vague and state.stamp - max(sender.related.values(), default=0) > LONGEST:
+        if sender.vague and state.stamp - max(sender.related.values(), default=0) > PAIR_AGE_MAX:
             sender.hops = math.inf  # not related by its best relation any more: by any
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         point = track_point(state, of_itself)
@@ -244,7 +251,7 @@ class Sharing:
     def _begin(self, sender: Sender, theirs: TrackPoint, ours: TrackPoint, hops: float) -> None:
         """Collect a relation, and start the estimate of the frame if that is possible."""
         pairs = sender.pairs
-        while pairs and theirs.stamp - pairs[0][0].stamp > LONGEST:
+        while pairs and theirs.stamp - pairs[0][0].stamp > PAIR_AGE_MAX:
             pairs.popleft()
         pairs.append((theirs, ours))
         if len(pairs) < FEWEST:

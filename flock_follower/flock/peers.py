@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
-from flock_follower.messages import FASTEST, NANOSECONDS, OdometryState
+from flock_follower.messages import FASTEST, NANOSECONDS, ODOMETRY_JUMP, OdometryState
 
 #: A vehicle's name: it goes into frame ids, and comes from a namespace. Its frame is NAME/odom.
 NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
@@ -99,23 +99,23 @@ def refusal(state: OdometryState, received: int) -> tuple[str, str] | None:
         (not known, 'message without a covariance', state.child)) if holds), None)
 
 
-#: Odometry that is further from its prediction than this, m or rad, has leapt ...
-LEAP, TURN = 0.25, 0.4
-#: ... plus the motion of these, m/s^2 and rad/s, since its last message. After LONGEST, s, no
+#: Odometry that is further from its prediction than ``ODOMETRY_JUMP``, or this, rad, has leapt ...
+TURN = 0.4
+#: ... plus the motion of these, m/s^2 and rad/s, since its last message. After PREDICTABLE, s, no
 #: prediction is possible.
-PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
+PUSH, SPIN, PREDICTABLE = 3.0, 2.0, 3.0
 
 
 def leapt(before: OdometryState, now: OdometryState) -> str:
     """Return by how much an odometry leapt between two of its states, in words, or ''."""
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
-    if not 0.0 <= elapsed <= LONGEST:
+    if not 0.0 <= elapsed <= PREDICTABLE:
         return ''
     expected = before.position + 0.5 * elapsed * (before.velocity + now.velocity)
     off = math.dist(expected, now.position)
     turn = abs(wrap_angle(yaw_from_quaternion(now.quaternion)
                           - yaw_from_quaternion(before.quaternion)))
-    if off > LEAP + 0.5 * PUSH * elapsed ** 2:
+    if off > ODOMETRY_JUMP + 0.5 * PUSH * elapsed ** 2:
         return f'by {off:.2f} m'
     return f'by {turn:.2f} rad' if turn > TURN + SPIN * elapsed else ''
 
@@ -162,7 +162,7 @@ def track_point(state: OdometryState, of_itself: bool) -> TrackPoint:
 #: Track points are kept for this time, ns.
 HORIZON = 3 * NANOSECONDS
 #: Track points further apart than this, ns, are not interpolated: at 10 Hz three may be lost.
-LONGEST_GAP = 450_000_000
+INTERPOLATED = 450_000_000
 #: Extrapolation of the newest track point, ns, at most.
 REACH = 50_000_000
 #: A track point within this time, ns, after another replaces it.
@@ -199,7 +199,7 @@ class Track:
         after = self._points[k]
         if after.stamp == stamp:
             return after
-        if k == 0 or after.stamp - self._points[k - 1].stamp > LONGEST_GAP:
+        if k == 0 or after.stamp - self._points[k - 1].stamp > INTERPOLATED:
             return None
         return _between(self._points[k - 1], after, stamp)
 

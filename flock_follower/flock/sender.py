@@ -22,9 +22,8 @@ import math
 
 from flock_follower.flock.alignment import Frame, MOST, Pair
 from flock_follower.flock.peers import Track
-from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.messages import NANOSECONDS, OdometryState, POSITION_STD_MAX
 
-POSITION_STD_MAX = 0.5  # m: a frame or a position known worse is not used; as in the planner
 YAW_STD_MAX = 0.1  # rad: likewise the yaw of a frame
 #: Relations refused in a row: from DOUBTED on nothing is taken from the sender, from WRONG on its
 #: frame is aligned anew.

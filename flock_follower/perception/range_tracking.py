@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import RangeState
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.markers import MarkedNeighbor
@@ -209,14 +209,14 @@ class RangeSeries:
             return
         sight = then.position + then.rotation.dot(self._tag) - measured.antenna
         distance = math.hypot(*sight.tolist())
-        along = sight / max(distance, 1e-6)
+        along = sight / max(distance, SHORTEST)
         spread = float(along.dot(then.covariance[POSITION, POSITION]).dot(along))
         self.bias.learn(measured.stamp, measured.distance - distance, measured.variance + spread)
 
     def _reported(self, now: Estimate, own: OdometrySample) -> Estimate:
         """Return a state in odom; the variance of the bias adds to that of the distance."""
         sight = now.position - own.travel
-        along = sight / max(math.hypot(*sight.tolist()), 1e-6)
+        along = sight / max(math.hypot(*sight.tolist()), SHORTEST)
         covariance = now.covariance.copy()
         covariance[POSITION, POSITION] += self.bias.variance(now.stamp) * np.outer(along, along)
         return now._replace(stamp=own.stamp, position=now.position + own.correction,

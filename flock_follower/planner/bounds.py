@@ -53,7 +53,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array, GRAVITY, wrap_angle
+from flock_follower.geometry import Array, GRAVITY, SHORTEST, wrap_angle
 from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
     Expected,
@@ -123,7 +123,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     w = np.asarray(relative_velocity, dtype=float).tolist()
     a = np.asarray(neighbor_acceleration, dtype=float).tolist()
     distance = math.hypot(*p.tolist())
-    if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
+    if not (SHORTEST < distance < SANE and math.hypot(*w, *a) < SANE):
         return []  # as for NaN, which fails every comparison
     n = p / distance
     unit = n.tolist()
@@ -187,14 +187,14 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     it = expected(n, acceleration, me.stamp - n.stamp, params)
     sight = it.position - me.position
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
-    if not level > 1e-6:
+    if not level > SHORTEST:
         return []
     along = sight / distance
     towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
     if known is not None:
         x, y, _ = (known.position - me.position).tolist()
         apart = math.hypot(x, y)
-        if apart > 1e-6:
+        if apart > SHORTEST:
             towards = np.array([x, y, 0.0]) / apart
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(apart, distance)
     variance = float(along @ n.position_covariance @ along)

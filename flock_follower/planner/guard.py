@@ -30,7 +30,7 @@ import math
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.bounds import (
     clear_of_sphere,
     DOWNWASH,
@@ -74,7 +74,7 @@ YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
 CLIMB_TIME = 2.5  # s: if an approaching neighbor arrives earlier after the retreat, it is left ...
-CLIMB_MAX = 1.0  # m: ... upwards, by this height
+OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
 
 
@@ -117,7 +117,7 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, leaving = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+        approach, leaving = (-(x * float(v[0]) + y * float(v[1])) / max(level, SHORTEST)
                           for v in (n.velocity, me.velocity))
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
@@ -137,7 +137,7 @@ def fences(lost: Loss | None, position: Array, velocity: Array,
     onward = stop(lost.towards, left, velocity, params)
     offset = LEVEL * (position - lost.origin)
     distance = math.hypot(*offset.tolist())
-    if distance <= 1e-6:
+    if distance <= SHORTEST:
         return [onward]
     left = retreat(lost, params) - distance
     return [stop(offset / distance, left, velocity, params), onward]
@@ -157,7 +157,7 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
     if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
         direction = LEVEL * direction + (
             SIDEWAYS * min(lost.retreated(position) / far, 1.0) * lost.side)
-        direction = direction / max(math.hypot(*direction.tolist()), 1e-6)
+        direction = direction / max(math.hypot(*direction.tolist()), SHORTEST)
     along = float(direction @ offset)
     left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
     most = -stop(direction, left, velocity, params).least
@@ -191,7 +191,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
             or not overtaken or lost.height > float(lost.origin[2]) + HIGHER):
         return -math.inf
-    return held + CLIMB_MAX
+    return held + OVERFLIGHT_CLIMB
 
 
 def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, scene: Scene,

@@ -36,7 +36,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import FARTHEST, FASTEST, FUTURE_TOLERANCE
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.params import Member, PlannerParams, SEEN_DEFAULT
@@ -143,7 +143,7 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
         return False
     sight = n.position - own.position - (n.stamp - own.stamp) * own.velocity
     distance, most = math.hypot(*sight.tolist()), max_position_std ** 2
-    if not (distance > 1e-6 and float(n.position_covariance.trace()) > most):
+    if not (distance > SHORTEST and float(n.position_covariance.trace()) > most):
         return False
     along = sight / distance
     return 0.0 <= float(along @ n.position_covariance @ along) <= most / 3.0

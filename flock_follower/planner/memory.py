@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.messages import FUTURE_TOLERANCE
+from flock_follower.messages import FUTURE_TOLERANCE, ODOMETRY_JUMP
 from flock_follower.planner.inputs import (
     at,
     distance_known,
@@ -43,8 +43,8 @@ from flock_follower.planner.params import member, PlannerParams
 from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
-SETTLING = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
-LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
+SMOOTHING_TIME = 0.3  # s in which an estimated acceleration is followed: most of its noise goes
+SMOOTHING_GAP = 1.0  # s without an estimate after which the smoothing begins anew
 
 
 class Motion(NamedTuple):
@@ -64,7 +64,7 @@ def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> di
     updated = {}
     for n in neighbors:
         last, acceleration = motions.get(n.name), n.acceleration
-        if last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
+        if last is None or not 0.0 <= n.stamp - last.stamp <= SMOOTHING_GAP:
             last = Motion(n.stamp, n.velocity,
                           np.zeros(3) if acceleration is None else acceleration)
         elif last.stamp != n.stamp:
@@ -72,13 +72,12 @@ def observed(motions: Mapping[str, Motion], neighbors: Iterable[Neighbor]) -> di
             if acceleration is None:
                 acceleration = (n.velocity - last.velocity) / elapsed
             last = Motion(n.stamp, n.velocity, last.acceleration - math.expm1(
-                -elapsed / SETTLING) * (acceleration - last.acceleration))
+                -elapsed / SMOOTHING_TIME) * (acceleration - last.acceleration))
         updated[n.name] = last
     return updated
 
 
 DRAG_TIME = 1.0  # s over which drag is observed
-ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbors
 NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of another vehicle
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import math
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.messages import DUPLICATE
+from flock_follower.messages import DUPLICATE, FASTEST, POSITION_STD_MAX
 from flock_follower.ranges import Checked, parameter, Range
 
 ROLES = LEADER, FOLLOWER, AVOID = 'leader', 'follower', 'avoid'
@@ -60,7 +60,7 @@ def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
     return Member(AVOID, known.radius) if duplicate else known
 
 
-RETURN_SPEED = 0.4  # m/s: beyond the margin of an edge the distance returns no faster than this
+EDGE_RETURN_SPEED = 0.4  # m/s: beyond the margin of an edge the distance returns no faster
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class GuardParams(Checked):
         :param b: deceleration, m/s^2, if it is not that of the parameters.
         """
         if gap < 0.0:
-            returning = gap > -RETURN_SPEED * self.tau
-            return max(gap / self.tau, -RETURN_SPEED), 1.0 / self.tau if returning else 0.0
+            returning = gap > -EDGE_RETURN_SPEED * self.tau
+            return max(gap / self.tau, -EDGE_RETURN_SPEED), 1.0 / self.tau if returning else 0.0
         b = self.b if b is None else b
         root = math.sqrt(self.tau ** 2 + 2.0 * gap / b)
         return b * (root - self.tau), 1.0 / root
@@ -152,7 +152,7 @@ class PlannerParams(Checked):
         'time without an image processed by relative_pose after which the planner brakes; at '
         'least 2 periods of the camera', live=True)
     max_position_std: float = parameter(
-        0.5, Range(0.01, 10.0, 'm'),
+        POSITION_STD_MAX, Range(0.01, 10.0, 'm'),
         'Largest standard deviation of a usable position, sqrt(trace), m.')
     max_velocity_std: float = parameter(
         1.0, Range(0.01, 10.0, 'm/s'),
@@ -190,7 +190,7 @@ class PlannerParams(Checked):
         1.5, Range(0.1, 10.0, 'm/s^2'),
         'largest acceleration of the control of altitude')
     leader_speed_max: float = parameter(
-        2.0, Range(0.0, 50.0, 'm/s'),
+        2.0, Range(0.0, FASTEST, 'm/s'),
         'largest assumed speed of a neighbor out of sight', live=True)
     leader_acceleration_max: float = parameter(
         1.0, Range(0.0, 20.0, 'm/s^2'),

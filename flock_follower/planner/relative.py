@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
 from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, untimely
 from flock_follower.planner.limits import limit_norm
@@ -46,7 +46,7 @@ from flock_follower.planner.vertical_yaw import Altitude, facing, THRUST_BIAS_MA
 
 #: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
 #: leaves the rest of ``RELATIVE_MAX`` to the distance.
-CLIMB_MAX = 0.6
+VERTICAL_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
 STEP_MAX = 0.25
 #: For this long after the odometry has returned, s, changes of the command stay as small.
@@ -61,7 +61,7 @@ TIME = 0.6
 BANDWIDTH, OFFSET_MAX = 0.8, 0.8
 #: So far beyond the band, m, an error of the tilt is larger than the acceleration that may offset
 #: it: the follower runs away, and commands nothing more.
-FARTHEST = 1.0
+RUNAWAY = 1.0
 #: Deviation of the gap to another neighbor that closes it no faster than this, s.
 CLOSING = 2.0
 
@@ -104,7 +104,7 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
             f'the motion by attitude is {old.detail} old'))
     me, there = at(own, now), at(leader, now)
     gap, _ = _gap(there.position, me, leader, params)
-    if gap > math.sqrt(params.law.d1) + FARTHEST:
+    if gap > math.sqrt(params.law.d1) + RUNAWAY:
         return _held(memory, f'{leader.name} is {gap:.1f} m away')
     altitude = (memory.altitude or Altitude.begun(me, None, params))._replace(
         lowest=-math.inf, highest=math.inf)
@@ -122,7 +122,7 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
         me._replace(velocity=rising), params, elapsed)
     others = [n for n in seen.values() if n is not leader]
     command = limited(level(me, memory.pending, leader, others, params) + bias[:2],
-                      min(max(vertical - up, -CLIMB_MAX), CLIMB_MAX), up, memory.command)
+                      min(max(vertical - up, -VERTICAL_MAX), VERTICAL_MAX), up, memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
@@ -170,7 +170,7 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     """Return the horizontal distance between hulls, m, and the direction (2,) to a place."""
     x, y, _ = (place - me.position).tolist()
     distance = math.hypot(x, y)
-    towards = np.array([x, y]) / distance if distance > 1e-6 else np.zeros(2)
+    towards = np.array([x, y]) / distance if distance > SHORTEST else np.zeros(2)
     return distance - params.radius - n.member.radius, towards
 
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, SHORTEST
 from flock_follower.planner.inputs import (
     at,
     expected,
@@ -169,7 +169,7 @@ def beside(velocity: Array, offset: Array) -> Array:
     """
     x, y, _ = velocity.tolist()
     length = math.hypot(x, y)
-    if length < 1e-6:
+    if length < SHORTEST:
         return np.zeros(3)
     across = np.array([-y, x, 0.0]) / length
     return math.copysign(1.0, float(across @ offset)) * across

@@ -131,7 +131,7 @@ def vertical(view: View, bearing: float) -> tuple[float, float]:
 #: Consecutive processed images without the marker that make it occluded, and with it that end it.
 IMAGES = 3
 #: Distance of the predicted marker to the image's edge, m: two markers of 0.2 m.
-INSIDE = 0.4
+OCCLUSION_MARGIN = 0.4
 _SAME = 1e-6  # s: stamps that differ by less are of one image
 
 
@@ -160,7 +160,8 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:
         offset = at(n, me.stamp).position - me.position
-        lost = missed >= IMAGES and visible(view, offset, me.yaw, forward, INSIDE)
+        lost = missed >= IMAGES and visible(view, offset, me.yaw, forward,
+                                           OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:
         return Occlusion(n.stamp)

@@ -50,9 +50,9 @@ CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly n
 CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
 HEIGHT_GAIN = 0.5  # likewise of a change in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
-INSIDE = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
+ALTITUDE_MARGIN = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
 BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
-RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
+ALTITUDE_RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
 CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
 
 
@@ -82,8 +82,8 @@ class Altitude(NamedTuple):
         z = float(me.position[2])
         if ground is None:
             return cls(z, z, z + params.altitude_max)
-        return cls(z, min(ground + params.altitude_min + INSIDE, z),
-                   max(ground + params.altitude_max - INSIDE, z))
+        return cls(z, min(ground + params.altitude_min + ALTITUDE_MARGIN, z),
+                   max(ground + params.altitude_max - ALTITUDE_MARGIN, z))
 
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
@@ -169,7 +169,7 @@ def _stopped_within(gap: float, gain: float) -> float:
     near = BRAKING / gain ** 2
     if gap > near:
         return math.sqrt(2.0 * BRAKING * (gap - 0.5 * near))
-    return max(gain * gap, -RETURN_SPEED)
+    return max(gain * gap, -ALTITUDE_RETURN_SPEED)
 
 
 YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75

@@ -30,8 +30,8 @@ from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.vertical_yaw import (
     Altitude,
+    ALTITUDE_MARGIN,
     CLIMB_ACCELERATION,
-    INSIDE,
     THRUST_BIAS_MAX,
 )
 
@@ -149,7 +149,7 @@ def test_without_a_leader_it_is_held() -> None:
 def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
     low, high = (followed(Altitude.begun(me(3.0), 0.4, replace(PARAMS, altitude_max=6.0)),
                           leader(z), 30.0) for z in (-5.0, 50.0))
-    assert (low.held, high.held) == (pytest.approx(1.4 + INSIDE), pytest.approx(6.4 - INSIDE))
+    assert (low.held, high.held) == pytest.approx((1.4 + ALTITUDE_MARGIN, 6.4 - ALTITUDE_MARGIN))
     assert (low.climb, high.climb) == pytest.approx((0.0, 0.0))
 
 
@@ -160,7 +160,7 @@ def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
         altitude = altitude.following(leader(2.5 + 0.02 * tick, 0.2), params, PERIOD)
         assert altitude.held <= 3.0
     assert (altitude.held, altitude.climb) == (
-        pytest.approx(3.0 - INSIDE), pytest.approx(0.0, abs=1e-3))
+        pytest.approx(3.0 - ALTITUDE_MARGIN), pytest.approx(0.0, abs=1e-3))
 
 
 def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:

@@ -30,7 +30,7 @@ from flock_follower.planner.bounds import Edges, radial_bounds
 from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import Bound, COHESION, limit_command, SEPARATION
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.params import GuardParams, RETURN_SPEED
+from flock_follower.planner.params import EDGE_RETURN_SPEED, GuardParams
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()
@@ -154,7 +154,7 @@ def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: 
 
 def test_beyond_the_margin_the_distance_returns_slowly() -> None:
     assert PARAMS.closing(-0.1)[0] == pytest.approx(-0.2)
-    assert PARAMS.closing(-1.0)[0] == -RETURN_SPEED
+    assert PARAMS.closing(-1.0)[0] == -EDGE_RETURN_SPEED
 
 
 def test_bounds_are_those_of_the_formula() -> None:

@@ -26,7 +26,7 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.planner.bounds import Edges, radial_bounds
 from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.params import GuardParams, RETURN_SPEED
+from flock_follower.planner.params import EDGE_RETURN_SPEED, GuardParams
 
 PARAMS = GuardParams()
 BAND = Edges.of(FlockingParams(beta=0.25, d1=8.0), PARAMS)
@@ -39,7 +39,7 @@ def bound(unknown: float, delay: float, velocity_error: float, range_error: floa
     rate = velocity_error + unknown * delay
     gap = range_error + 0.5 * unknown * delay ** 2
     beyond = (unknown * PARAMS.T_g + rate * (1.0 + PARAMS.T_g / PARAMS.tau) + gap / PARAMS.tau)
-    return PARAMS.tau * beyond if beyond <= RETURN_SPEED else math.inf
+    return PARAMS.tau * beyond if beyond <= EDGE_RETURN_SPEED else math.inf
 
 
 def least_gap(unknown: float, delay: float, velocity_error: float, range_error: float,

@@ -26,7 +26,7 @@ from flock_follower.flocking import acceleration
 from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import Member, PlannerParams, RETURN_SPEED
+from flock_follower.planner.params import EDGE_RETURN_SPEED, Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 STRANGER = {'stranger': Member('avoid')}
@@ -111,7 +111,7 @@ def test_hulls_that_overlap_are_driven_apart() -> None:
     params = PlannerParams(radius=1.0, vehicles={'leader': Member('leader', 1.0)})
     decision = decide(seen('leader', 0.0, 1.5), params=params)[1]
     assert commanded(decision)[0] == pytest.approx(
-        -RETURN_SPEED / params.guarding.T_g, rel=1e-3)
+        -EDGE_RETURN_SPEED / params.guarding.T_g, rel=1e-3)
 
 
 def test_each_vehicle_of_the_file_that_is_neither_seen_nor_received_is_reported() -> None:
