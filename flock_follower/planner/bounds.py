@@ -20,20 +20,20 @@ the neighbor to the own vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w
 rate of the distance so that the change can still be stopped before the edge, less a margin m:
 
     h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
-    h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -0.3 m/s)            for g < 0
+    h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -EDGE_RETURN_SPEED)  for g < 0
 
 S(g) is the highest speed that can be stopped within g: a reaction time tau, then a deceleration b.
-Both are barrier functions: where dh/dt >= -h / T_g each stays positive once it is, and returns
-with the time constant T_g where it is not (Ames et al., "Control Barrier Functions: Theory and
-Applications", ECC 2019). As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, that asks
+Both are barrier functions: if dh/dt >= -h / T_g, each stays positive, or returns to zero with the
+time constant T_g (Ames et al., "Control Barrier Functions: Theory and Applications", ECC 2019).
+As ds/dt = n . (a - a_L) + |w_t|^2 / r, with w_t the part of w across n, this requires
 
     n . a >= n . a_L - |w_t|^2 / r - (s + S(g_near)) / T_g - S'(g_near) s
     n . a <= n . a_L - |w_t|^2 / r - (s - S(g_far)) / T_g - S'(g_far) s
 
-of the acceleration a. The unknown part of a_L costs margin: see ``docs/guard.md``.
+of the acceleration a. The unknown part of a_L uses up margin: see ``docs/guard.md``.
 
-The air below and above another vehicle is disturbed, so the horizontal distance is bounded by
-itself. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
+The air below and above another vehicle is disturbed, so the horizontal distance has a bound of
+its own. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
 
 If only the distance to a neighbor is known (ranges go on after sight is lost), it may be anywhere
 on a sphere around the own vehicle. The follower then backs away from the last known place. That
@@ -69,12 +69,11 @@ from flock_follower.planner.limits import (
     SEPARATION,
     SIGHT,
 )
-from flock_follower.planner.params import GuardParams, PlannerParams
+from flock_follower.planner.params import GuardParams, PlannerParams, WIDEST_MARGIN
 from flock_follower.planner.sight import MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
 # The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
-WIDEST_MARGIN = 0.24  # largest margin to an edge, as a share of the band's width
 DOWNWASH = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
 ALIKE = 0.35  # share of the horizontal distance: with less height between, the distance suffices
 DEVIATIONS = 2.0  # standard deviations of a measured distance, if only that is known ...
@@ -89,7 +88,7 @@ LEVEL = np.array([1.0, 1.0, 0.0])
 
 
 class Edges(NamedTuple):
-    """Between which distances, m, from a neighbour to stay, and how sure its place is."""
+    """The distances, m, from a neighbour to stay between, and the uncertainty of its position."""
 
     near: float
     far: float = math.inf
@@ -117,7 +116,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
-    :param its_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
+    :param neighbor_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
     """
     p = np.asarray(offset, dtype=float)
     w = np.asarray(relative_velocity, dtype=float).tolist()
@@ -129,7 +128,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     unit = n.tolist()
     rate = scalar_product(unit, w)
     common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
-    # The growing sphere of possible places comes nearer at its growth rate.
+    # The growing sphere of possible places approaches at its growth rate.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)
@@ -148,7 +147,7 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     Return the bounds for one neighbor.
 
     :param position: own (3,), m; :param velocity: own when the command acts (3,), m/s.
-    :param seen: it is in sight; else its last height says little.
+    :param seen: it is in sight; else its last height is unreliable.
     :param followed: it is followed; else the vehicle only keeps clear of it.
     :param radii: sum of its radius and the own one, m.
     """
@@ -168,7 +167,7 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
 def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
     """Return the bound that stops the vehicle along a unit vector within ``left`` m."""
     guarding, rate = params.guarding, float(along @ velocity)
-    # Until the command acts it goes on as it does.
+    # Until the command acts the vehicle keeps its velocity.
     speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,
                                     max(guarding.b, STOP_SHARE * params.strongest))
     return Bound(
@@ -178,7 +177,7 @@ def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> B
 def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
                     velocity: Array, params: PlannerParams) -> list[Bound]:
     """
-    Return the bound, if any, that keeps at the distance that is known.
+    Return the bound, if any, for a neighbor of which only the distance is known.
 
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
@@ -198,7 +197,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
             towards = np.array([x, y, 0.0]) / apart
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(apart, distance)
     variance = float(along @ n.position_covariance @ along)
-    # As measured; until the command acts only the own motion on the line backwards changes.
+    # The measured rate; until the command acts only the own motion on that line changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)
     band = inner._replace(
@@ -245,10 +244,10 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view:
 def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
                   faces: Sequence[float], params: PlannerParams) -> list[Bound]:
     """
-    Return what keeps a neighbour's marker from being seen too obliquely.
+    Return the bounds on the viewing angle of a neighbour's marker.
 
-    The angle between the line of sight and the marker's normal is kept below MARKER_ANGLE, by
-    moving round the neighbour; the arguments are those of ``sight_bounds``.
+    It is the angle between the line of sight and the marker's normal: at most MARKER_ANGLE. The
+    vehicle moves round the neighbour; the arguments are those of ``sight_bounds``.
 
     :param yaw: the neighbour's, rad; :param faces: see ``Member``.
     """

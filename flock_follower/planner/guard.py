@@ -65,15 +65,15 @@ from flock_follower.planner.scene import Scene
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
-CLOSE = 1.75  # m: nearer than this the climb gets what backing off leaves
-DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is made up for
+CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backing off
+DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
 YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
-CLIMB_TIME = 2.5  # s: if an approaching neighbor arrives earlier after the retreat, it is left ...
+CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is left ...
 OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
 
@@ -99,9 +99,9 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     """
     Return the least and the greatest vertical speed, m/s, beside those in sight.
 
-    Above and below one that is nearer horizontally than it should be no horizontal command helps:
-    the height between does not shrink. One that is near and comes nearer is backed away from
-    first: the climb gets the rest of ``v_max``.
+    Above or below a neighbor that is too near horizontally no horizontal command helps: the height
+    between does not shrink. From one that is near and approaches the vehicle backs away first: the
+    climb gets the rest of ``v_max``.
     """
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     rest = math.inf
@@ -130,9 +130,10 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
 
 def fences(lost: Loss | None, position: Array, velocity: Array,
            params: PlannerParams) -> list[Bound]:
-    """Return the bounds that, out of sight, keep it from moving on unseeing."""
+    """Return the bounds on motion without sight of the lost neighbor."""
     if lost is None:
         return []
+    # The full m in a narrow band, too: nothing beyond the last line of sight was seen free.
     left = lost.free - params.guarding.m - float(lost.towards @ position)
     onward = stop(lost.towards, left, velocity, params)
     offset = LEVEL * (position - lost.origin)
@@ -148,11 +149,11 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
     """
     Return the bound of one out of sight, limited to the retreat.
 
-    :param sideways: whether it is the lost neighbor itself, whose path is left.
+    :param sideways: whether it is the lost neighbor itself: the vehicle leaves its path.
     """
     far, offset = retreat(lost, params), LEVEL * (position - lost.origin)
     direction = bound.normal
-    # Not towards one that has come to that side.
+    # Not towards a neighbor that has moved to that side.
     sideways = sideways and float(direction @ lost.side) > -BESIDE
     if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
         direction = LEVEL * direction + (
@@ -166,9 +167,9 @@ def retreating(bound: Bound, lost: Loss, position: Array, velocity: Array,
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
     """
-    Return how far it may move out of the way of one that it no longer sees, m.
+    Return the largest retreat from a neighbor out of sight, m.
 
-    One lost beyond the band has a longer way: the retreat is as much shorter.
+    The retreat is shorter by the distance beyond the band at the loss.
     """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     distance = lost.free - float(lost.towards @ lost.origin)
@@ -179,7 +180,7 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
     """
-    Return the least height, m, at which to let a closing neighbor pass that is out of sight.
+    Return the least height, m, at which an approaching neighbor out of sight may pass below.
 
     Without an explicit ceiling, or with a ``retreat_max`` of 0, the result is -inf. The default
     of ``altitude_max`` is no ceiling.
@@ -233,7 +234,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
 
 
 def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> float:
-    """Return the speed, m/s, by which the one predicted is too high, because of drag."""
+    """Return the speed, m/s, by which drag makes the predicted speed too high."""
     speed = math.hypot(*velocity.tolist())
     slower = params.response_time * float(memory.drag @ velocity) / speed if speed > 0.0 else 0.0
     return min(max(slower, 0.0), DRAG_SHARE * params.v_max)
@@ -244,7 +245,7 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
     """
     Return all bounds in their order.
 
-    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
+    Without a camera a lost neighbor may be anywhere: the follower does not back away.
     """
     near, me = list[Bound](), scene.me
     for name, n in memory.ranged.items():
@@ -296,7 +297,7 @@ def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
 
 def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
-    """Return what to expect of a neighbor; if received, with the spread of its covariance."""
+    """Return the prediction of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
     it = expected(n, memory.acceleration(n), age, params)
     offset = it.position - me.position

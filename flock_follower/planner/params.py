@@ -62,6 +62,8 @@ def member(members: Mapping[str, Member], name: str, received: bool) -> Member:
 
 EDGE_RETURN_SPEED = 0.4  # m/s: beyond the margin of an edge the distance returns no faster
 
+WIDEST_MARGIN = 0.24  # TODO
+
 
 @dataclass(frozen=True)
 class GuardParams(Checked):
@@ -80,7 +82,8 @@ class GuardParams(Checked):
         "Time in which the distance's rate is brought to its bound, s.")
     m: float = parameter(
         0.38, Range(0.0, 5.0, 'm'),
-        'guard: margin to each edge, at most 0.24 of the width of the band', live=True)
+        f'guard: margin to each edge, at most {WIDEST_MARGIN:g} of the width of the band',
+        live=True)
 
     def closing(self, gap: float, b: float | None = None) -> tuple[float, float]:
         """

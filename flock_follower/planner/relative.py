@@ -17,12 +17,12 @@ Control without odometry: the distance to the leader, and the relative velocity,
 
 Own motion is then the autopilot's attitude and the accelerations flown, integrated; its velocity
 drifts. That drift is the same in the leader's estimate, so that distance and relative velocity do
-not have it. Only they are used. The speed over the ground is not known and not bounded.
+not have it. Only these two are used. The speed over the ground is neither known nor bounded.
 
 The follower is led to the middle of the law's band by a relative velocity, which is bounded, and
-reached with the time constant TIME. So all relative motion is damped; the motion that both have in
-common is the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer
-offsets the relative acceleration that nobody commanded: the error of the tilt, which accelerates
+reached with the time constant TIME. So all relative motion is damped; the common motion of both is
+the leader's (SWA, arXiv 2508.16460, shows that relative data damp no more). An observer offsets
+the relative acceleration that was not commanded: the error of the tilt, which accelerates
 the follower, and the leader's own. Other neighbors in sight bound the approach.
 """
 
@@ -57,12 +57,12 @@ SPEED = 0.4
 #: Time constant with which the relative velocity is reached, s.
 TIME = 0.6
 #: Of the observer of the disturbance, 1/s, and the most that is offset, m/s^2: without odometry
-#: PX4's tilt was seen to err by 1 m/s^2 for 10 s.
+#: the tilt of PX4 was wrong by 1 m/s^2 for 10 s.
 BANDWIDTH, OFFSET_MAX = 0.8, 0.8
-#: So far beyond the band, m, an error of the tilt is larger than the acceleration that may offset
-#: it: the follower runs away, and commands nothing more.
+#: m beyond the band: an error of the tilt is then larger than the acceleration that may offset it,
+#: the follower runs away, and commands nothing more.
 RUNAWAY = 1.0
-#: Deviation of the gap to another neighbor that closes it no faster than this, s.
+#: The gap to another neighbor is closed with a time constant not below this, s.
 CLOSING = 2.0
 
 
@@ -78,7 +78,7 @@ class Disturbance(NamedTuple):
 
     def observed(self, velocity: Array, command: Array | None, elapsed: float,
                  response_time: float) -> Disturbance:
-        """Return it after a relative velocity (3,), m/s, was measured: a Luenberger observer."""
+        """Return the estimate after a relative velocity (3,), m/s: a Luenberger observer."""
         if self.velocity is None or command is None:
             return self._replace(velocity=velocity)
         response = self.response + (command - self.response) * -math.expm1(
@@ -154,13 +154,14 @@ def level(me: OwnState, coming: Array, leader: Neighbor, others: Sequence[Neighb
     velocity = me.velocity + coming
     gap, towards = _gap(there.position, me, leader, params)
     middle = math.sqrt(0.5 * (law.d0 + law.d1))
-    wanted = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
-    relative = wanted + there.velocity[:2] - velocity[:2]
+    approach = limit_norm(GAIN * (gap - middle) * towards, min(SPEED, params.v_max))
+    relative = approach + there.velocity[:2] - velocity[:2]
     result: Array = relative / TIME
     for n in others:
         other = n.position + (me.stamp - n.stamp) * n.velocity
         gap, towards = _gap(other, me, n, params)
         closing = float(towards @ (velocity - n.velocity)[:2])
+        # The full m in a narrow band, too: without odometry no far edge to others is kept.
         most = ((gap - math.sqrt(law.d0) - params.guarding.m) / CLOSING - closing) / TIME
         result = result - max(float(towards @ result) - most, 0.0) * towards
     return result
