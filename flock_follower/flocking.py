@@ -27,11 +27,11 @@ An agent i at x_i with velocity v_i accelerates with (eqs. 4 and 5 of the paper)
 
 which keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints
 f1 = 1 / (r^2 - d1)^theta, the same for even theta only: for odd theta that repels, and for a
-theta that is no integer it is not a real number. Its alpha appears in no formula.
+theta that is not an integer it is not real. The paper's alpha appears in no formula.
 
 The law has no value outside the band. Here the gaps r^2 - d0 and d1 - r^2 are taken as at least
 1e-6 m^2, so that too close always repels and too far always attracts, strongly but finitely.
-Neither does anything while L = 0, that is while all velocities are equal.
+Both are zero while L = 0, that is while all velocities are equal.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ class FlockingParams(Checked):
         """
         Return the acceleration (n,), m/s^2, of an agent that observes m neighbours.
 
-        A subclass may return that of another controller, to compare the law with.
+        A subclass may return that of another controller, for comparisons with the law.
 
         :param offsets: neighbours' positions minus the own one, (m, n), m.
         :param differences: neighbours' velocities minus the own one, (m, n), m/s.
         """
         own = np.zeros((1, differences.shape[1]))
         return sum_over_neighbors(offsets, differences,
-                                   disagreement(np.vstack([own, differences])), self, 'flocking')
+                                  disagreement(np.vstack([own, differences])), self, 'flocking')
 
 
 def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
@@ -110,7 +110,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     """
     x, v = checked(positions, velocities)
     return sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
-                               disagreement(v), params, model)
+                              disagreement(v), params, model)
 
 
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
@@ -164,7 +164,7 @@ def separation(r2: Array, params: FlockingParams) -> Array:
 
 
 def cohesion(r2: Array, params: FlockingParams) -> Array:
-    """Return f1 at squared distances r2, m^2 (eq. 5 mended), finite at and beyond d1."""
+    """Return f1 at squared distances r2, m^2 (eq. 5 corrected), finite at and beyond d1."""
     return np.maximum(params.d1 - r2, SMALLEST_GAP) ** -params.theta
 
 
@@ -174,7 +174,7 @@ def disagreement(velocities: Array) -> float:
 
 
 def sum_over_neighbors(offsets: Array, differences: Array, scale: float,
-                        params: FlockingParams, model: Model) -> Array:
+                       params: FlockingParams, model: Model) -> Array:
     """
     Return u, (..., n), of agents from x_j - x_i and v_j - v_i, both (..., m, n), summed over j.
 

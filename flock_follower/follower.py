@@ -15,16 +15,16 @@
 """
 One follower as one object: events in, each with its time; estimates, commands and setpoints out.
 
-Perception, planner and setpoint control are the same three objects that the nodes drive, each in
-a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated
-one in ``flights``. Computing takes no time, neither does passing messages on: an estimate reaches
-the planner at the moment its image, or the odometry that image waited for, came; a command
-reaches the control at the tick.
+Perception, planner and setpoint control are the objects of the three nodes, each of which is a
+process. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated one in
+``flights``, which has no images and no perception: there the neighbor filter gives the estimates.
+Computing and passing messages take no time: an estimate reaches the planner with its image, or
+with the odometry for which the image waited; a command reaches the control at the tick.
 
 The planner ticks every ``period``, and when images cease; the control sends every
 1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
 reach the planner just before its tick, and own messages are sent then. Events of the
-same nanosecond happen in this order: an image that has waited in vain for odometry, the planner's
+same nanosecond happen in this order: an image that waited for odometry too long, the planner's
 tick, the control's cycle, the event.
 """
 
@@ -106,7 +106,7 @@ class ControlCycle:
 
 
 class Listener:
-    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
+    """Receives the outcomes of ``Follower``, in the order of the events; each method is empty."""
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
         """Take a message that a node would publish, at a time in ns."""
@@ -130,7 +130,7 @@ class Listener:
         """Take the reason why something was dropped."""
 
 
-#: In a silence longer than this everything has long come to rest, ns: it is skipped.
+#: After a silence of this, ns, nothing changes any more: the rest of the silence is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
 
 
@@ -138,15 +138,15 @@ class Follower:
     """
     Perception, planner and setpoint control on one clock; every time is in ns.
 
-    :param planner: gathers inputs and takes one step per tick, with ``params``.
+    :param planner: collects inputs and takes one step per tick, with ``params``.
     :param control: the setpoint gate.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None if neighbors come from elsewhere.
     :param stream_rate: of setpoints, Hz.
-    :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
-    :param camera_rpy: how the camera is mounted, rad, as the planner knows it; of several, each
-        by its name.
+    :param cycle_phase: time from the planner's tick to the next cycle, s.
+    :param camera_rpy: roll, pitch and yaw of the camera on the body, rad, for the planner; of
+        several cameras, each by its name.
     :param sharing: messages to and from other followers; None without them.
     :param autopilot_velocity: whether odometry replaces the autopilot's own estimate, too.
     :param cpu_time: a clock of CPU time, s; only the reported times depend on it.
@@ -187,7 +187,7 @@ class Follower:
         self.planner.engage(requested)
 
     def permit(self, time: int, since: float) -> None:
-        """Take a request for offboard, which HEARTBEATs after the time ``since``, s, answer."""
+        """Take a request for offboard; HEARTBEATs after the time ``since``, s, answer it."""
         self.advance(time)
         self._control.permit(self._control.permission.requested(since))
         self._announce_bridge_state()
@@ -232,7 +232,7 @@ class Follower:
         self._bridge_ended = self._now
 
     def bridge_started(self, time: int, control: Gate) -> None:
-        """Let a new bridge start, which knows nothing of the one before."""
+        """Let a new bridge start, without the state of the one before."""
         self.advance(time)
         self._control, self._bridge_ended = control, None
         self._announce_bridge_state()
@@ -319,7 +319,7 @@ class Follower:
         self._now = max(self._now, time)
 
     def finish(self) -> None:
-        """Process the images that still wait, without odometry: no more will come."""
+        """Process the images that still wait, without odometry: the inputs have ended."""
         while (waited := self._waited()) is not None:
             self._now = max(self._now, waited)
             self._process_due()
@@ -331,7 +331,7 @@ class Follower:
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
     def _waited(self) -> int | None:
-        """Return when the oldest image has waited in vain for odometry, None without one."""
+        """Return the time, ns, at which the oldest image stops waiting for odometry, or None."""
         overdue = None if self.perceiver is None else self.perceiver.overdue
         # Rounded up: by then the image has waited long enough in seconds, too.
         return None if overdue is None else (

@@ -16,5 +16,5 @@
 Several followers: their neighbour graph and their messages.
 
 Every vehicle's odometry has its own frame. The transform between two frames is estimated from
-vehicles that both saw at one time, or that report their own position. Nothing here reads a clock.
+vehicles seen by both at one time, or that report their own position. Nothing here reads a clock.
 """

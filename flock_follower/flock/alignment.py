@@ -22,7 +22,7 @@ the frame about the vehicle. So yaw and place are nearly independent, and the le
 
 The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
 best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
-so that no first guess is needed; attitudes of a vehicle known in both frames add to the same sum.
+so that no initial value is needed; attitudes of a vehicle known in both frames add to that sum.
 The length of this sum of vectors is the information about the yaw; zero if all points coincide.
 """
 
@@ -131,7 +131,7 @@ class Frame:
         """
         Update with the track points of one vehicle in its frame and in the own one, at one stamp.
 
-        Return the squared Mahalanobis distance of the two over the gate's: above 1 it was refused.
+        Return the squared Mahalanobis distance of the two over the gate's: above 1 it is refused.
         """
         rotation, lever = turned(self.yaw), self.lever(theirs.position)
         H, noise = _jacobian(lever), np.zeros((4, 4))
@@ -144,7 +144,7 @@ class Frame:
         doubt = float(gap[:3].dot(np.linalg.solve(S[:3, :3], gap[:3]))) / GATE
         if not doubt <= 1.0:  # NaN is refused
             return doubt
-        # Attitudes err by how markers are mounted, always alike: no average is better than that.
+        # The error of attitudes is that of a marker's mounting: constant, no average reduces it.
         by_attitude = (math.isfinite(S[3, 3]) and self.covariance[0, 0] > ATTITUDE_NOISE ** 2
                        and gap[3] ** 2 <= YAW_GATE * S[3, 3])
         rows = slice(4 if by_attitude else 3)
@@ -164,7 +164,7 @@ def _jacobian(lever: Array) -> Array:
     return H
 
 
-#: Pairs of a fit at least and at most, and how old they may be, ns: drift makes them worthless.
+#: Pairs of a fit at least and at most, and their largest age, ns: older ones are useless by drift.
 FEWEST, MOST, PAIR_AGE_MAX = 5, 100, 20 * NANOSECONDS
 #: Errors of sightings are correlated in time: factor on the variances of a fit.
 WARINESS = 4.0
@@ -199,7 +199,7 @@ def _fit(rows: Array, stamp: int) -> Frame:
     total = float(weights.sum())
     anchor, place = weights @ theirs / total, weights @ ours / total
     x, y = (theirs - anchor)[:, :2], (ours - place)[:, :2]
-    # A marker is always mounted alike: no number of attitudes is worth more than one.
+    # The mounting of a marker is constant: many attitudes are no better than one.
     sure *= min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / max(float(sure.sum()), 1e-9))
     along = weights @ (x * y).sum(axis=1) + sure @ np.cos(turns)
     across = weights @ (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]) + sure @ np.sin(turns)

@@ -68,16 +68,16 @@ PERIOD = 90_000_000
 STALE = 500_000_000
 DISORDER = to_nanoseconds(MAX_JUMP)  # ns by which an older state comes after a newer one
 OWN_FUTURE = 'own odometry from the future'
-START_YAW = 0.35  # rad: a yaw less certain than this is no start for a linear filter
+START_YAW = 0.35  # rad: a linear filter needs a first yaw with at most this deviation
 SEEN_TIMEOUT = 500_000_000  # ns after an own sighting in which received states are not used
 FORGOTTEN = 30 * NANOSECONDS  # ns: a sender silent for so long is forgotten
-#: Senders, and vehicles that one vehicle may see, or report.
+#: Most senders, and most vehicles that one vehicle sees, or reports.
 SENDERS_MAX, SEEN_MAX = 32, 40
 #: A state that a vehicle sent of itself is replaced only by one with this share of its variance.
 OWN_STATE_SHARE = 0.5
 #: Own messages that may come back, and events that wait to be read.
 REMEMBERED, EVENTS = 100, 500
-#: One vehicle relates two frames once in this time, ns: errors of sightings last.
+#: One vehicle relates two frames once in this time, ns: errors of sightings are correlated.
 RELATING = 200_000_000
 
 
@@ -128,7 +128,7 @@ class Sharing:
         name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
         frame = None if self._own is None else self._own.frame
         doubt = float(position_covariance(state, False).trace())
-        # A second print of a marker is no vehicle.
+        # A duplicate of a marker is not a vehicle.
         if DUPLICATE in name or self._refused(
                 (frame is None, 'sighting before own odometry', name),
                 (fast, 'unusable sighting', fast),
@@ -140,9 +140,9 @@ class Sharing:
                 (before is None and len(self._seen) >= SEEN_MAX, 'too many vehicles', name),
                 (not is_covariance(state.pose_covariance[:3, :3]), 'sighting without a covariance',
                  name),
-                # It is known by its ranges alone, for a while.
-                (doubt > POSITION_STD_MAX ** 2, 'known too vaguely',
-                 f'{name}: to {math.sqrt(max(doubt, 0.0)):.2f} m')):
+                # For a while only ranges to it are measured.
+                (doubt > POSITION_STD_MAX ** 2, 'sighting too uncertain',
+                 f'{name}: {math.sqrt(max(doubt, 0.0)):.2f} m')):
             return
         self._seen[name], point = state, track_point(state, False)
         self._tracks[name].add(point)
@@ -188,7 +188,7 @@ class Sharing:
             if sender.frame is not None:
                 sender.frame.move_anchor(state.position)
         if sender.vague and state.stamp - max(sender.related.values(), default=0) > PAIR_AGE_MAX:
-            sender.hops = math.inf  # not related by its best relation any more: by any
+            sender.hops = math.inf  # the best relation has ended: any other may follow
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         point = track_point(state, of_itself)
         sender.tracks[vehicle].add(point)
@@ -197,7 +197,7 @@ class Sharing:
             self._relate_seen(vehicle, sender.frame.point(point), sender.hops + 1)
         sender.states[vehicle] = state
         if not fits or (leap and not of_itself):
-            del sender.states[vehicle]  # the next state will decide
+            del sender.states[vehicle]  # the next state decides
         why = sender.unusable(received)
         self._refused((why, f'not aligned with {sender.name}', why))
 
@@ -326,8 +326,8 @@ class Sharing:
                 of_itself = name == sender.name
                 placed = in_own_frame(state, of_itself, frame, own.frame)
                 doubt = float(placed.pose_covariance[:3, :3].trace())
-                if self._refused((doubt > POSITION_STD_MAX ** 2, 'heard of too vaguely',
-                                  f'{name} by {sender.name}: to {math.sqrt(doubt):.2f} m')):
+                if self._refused((doubt > POSITION_STD_MAX ** 2, 'received position too uncertain',
+                                  f'{name} by {sender.name}: {math.sqrt(doubt):.2f} m')):
                     continue
                 doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
                     OWN_STATE_SHARE if of_itself else 1.0)

@@ -43,7 +43,7 @@ OWN_YAW_NOISE = 0.02  # rad: likewise of its yaw
 SIGHTING_NOISE = 0.02  # m: slowly varying error of a sighting beyond its covariance
 ATTITUDE_NOISE = 0.06  # rad: likewise of the yaw of a vehicle seen, as markers are mounted askew
 ACCELERATION_STD = 0.5  # m/s^2: unknown acceleration of a received vehicle since its stamp
-VAGUE = 25.0  # m^2 or (m/s)^2: a variance beyond this says nothing
+VAGUE = 25.0  # m^2 or (m/s)^2: a larger variance is no information
 
 
 def checked_name(name: str) -> str:
@@ -107,7 +107,7 @@ PUSH, SPIN, PREDICTABLE = 3.0, 2.0, 3.0
 
 
 def leapt(before: OdometryState, now: OdometryState) -> str:
-    """Return by how much an odometry leapt between two of its states, in words, or ''."""
+    """Return the leap of an odometry between two of its states, as text, or ''."""
     elapsed = (now.stamp - before.stamp) / NANOSECONDS
     if not 0.0 <= elapsed <= PREDICTABLE:
         return ''
@@ -141,7 +141,7 @@ def position_covariance(state: OdometryState, of_itself: bool) -> Array:
     Return the covariance (3, 3) of a position within the frame of its sender.
 
     The drift of the sender's odometry belongs to its frame: its own position (``of_itself``) has
-    a small covariance, whatever its odometry claims. A sighting has the covariance it came with.
+    a small covariance, whatever its odometry reports. A sighting keeps its covariance.
     """
     noise = ODOMETRY_NOISE if of_itself else SIGHTING_NOISE
     covariance: Array = np.zeros((3, 3)) if of_itself else state.pose_covariance[:3, :3]
@@ -152,7 +152,7 @@ def track_point(state: OdometryState, of_itself: bool) -> TrackPoint:
     """Return the track point of a state, within the frame of its sender."""
     seen = float(state.pose_covariance[5, 5])
     variance = OWN_YAW_NOISE ** 2 if of_itself else (
-        # Beyond a radian, or without covariance, it says nothing.
+        # Beyond a radian, or without covariance, it is no information.
         seen + ATTITUDE_NOISE ** 2 if 0.0 < seen < 1.0 else math.inf)
     return TrackPoint(state.stamp, state.position, state.velocity,
                       position_covariance(state, of_itself),
@@ -179,7 +179,7 @@ class Track:
         """Add the newest point; one too soon after another replaces it."""
         points = self._points
         if points and point.stamp <= points[-1].stamp:
-            points.clear()  # time has jumped back: the caller has made sure of that
+            points.clear()  # time has jumped back: the caller has checked that
         if len(points) > 1 and point.stamp - points[-2].stamp < SPACING:
             points.pop()
         points.append(point)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A vehicle that sends messages: what it sent, and the relation of its frame to the own one."""
+"""A vehicle that sends messages: its messages, and the relation of its frame to the own one."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from flock_follower.flock.alignment import Frame, MOST, Pair
 from flock_follower.flock.peers import Track
 from flock_follower.messages import NANOSECONDS, OdometryState, POSITION_STD_MAX
 
-YAW_STD_MAX = 0.1  # rad: likewise the yaw of a frame
-#: Relations refused in a row: from DOUBTED on nothing is taken from the sender, from WRONG on its
-#: frame is aligned anew.
+YAW_STD_MAX = 0.1  # rad: a frame with a larger standard deviation of the yaw is not used
+#: Relations refused in a row: from DOUBTED on the sender is not used, from WRONG on its frame is
+#: aligned anew.
 DOUBTED, WRONG = 2, 5
 #: A sender whose stamps are wrong is ignored for this time, ns.
 BAN = 5 * NANOSECONDS
@@ -74,7 +74,7 @@ class Sender:
 
     @property
     def vague(self) -> bool:
-        """Return whether its frame is unknown, or known too vaguely."""
+        """Return whether its frame is unknown or too uncertain."""
         if self.frame is None:
             return True
         place, yaw = self.frame.stds
@@ -86,7 +86,7 @@ class Sender:
             return self.ban[1]
         if self.frame is None:
             return ('neither sees the other, nor do both see one vehicle' if not self.pairs else
-                    f'its yaw is known to {self.yaw_std:.1f} rad: somebody has to move')
+                    f'its yaw is known to {self.yaw_std:.1f} rad: a vehicle must move')
         if self.refused >= DOUBTED:
             return f'{self.refused} times in a row it did not fit'
         return 'its frame is known to {:.2f} m and {:.2f} rad, limits {:g} m and {:g} rad'.format(

@@ -40,10 +40,10 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
 
-# Of all vehicles: outside their namespaces.
+# Shared by all vehicles: outside their namespaces.
 SHARED_TOPIC = '/neighbors/shared'
 RECEIVED_TOPIC = 'neighbors/heard'
-# A lost message is replaced in 0.1 s: over radio nothing is repeated.
+# Best effort: the next message follows in 0.1 s, so that radio links repeat none.
 SHARED_QOS = best_effort(50)
 PERIOD = 0.1  # s
 
@@ -105,7 +105,7 @@ class SharingNode(FlockNode):
         return (WARN, f'nothing received from others: {why}') if why else None
 
     def _sender_problem(self, now: float) -> Problem | None:
-        """Return which clocks of senders are implausible."""
+        """Return a problem if clocks of senders are implausible."""
         odd = [f'{name}: {each.slow}' for name, each in self._sharing.senders.items()
                if each.slow]
         return (WARN, '; '.join(odd)) if odd else None

@@ -20,8 +20,8 @@ Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if published ``
 and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
 steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
 the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
-engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
-them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
+engaged (service ``planner/engage``) and the bridge reports on ``mavlink_bridge/state`` that it
+flies them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
 disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
 ``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
@@ -72,7 +72,7 @@ from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 
-TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
+TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node reports it
 
 
 class Planner(FlockNode):
@@ -95,15 +95,15 @@ class Planner(FlockNode):
         self._even_clock = EvenClock(self)
         self._own = OwnOdometry(self, values, self._take_odom, self._even_clock)
 
-        # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
-        # accelerations before the states that they belong to.
+        # All inputs wait for the tick: odometry first, because nothing is taken without it, and
+        # accelerations before their states.
         self._polls = [
             self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
                       required=False),
             self._own.poll,
             self._poll_states(AccelWithCovarianceStamped, 'neighbors/acceleration',
                               from_acceleration, self._loop.take_acceleration, 100),
-            # Images without a leader in them: a silent publisher is no fault.
+            # Images may have no leader in them: a silent publisher is no fault.
             self._poll_states(Odometry, 'neighbors', from_odometry, self._loop.take_neighbor, 100,
                               required=True, sporadic=True),
             self._poll_states(Odometry, 'neighbors/heard', from_odometry,
@@ -130,7 +130,7 @@ class Planner(FlockNode):
         self._silence.cancel()
 
     def _build(self, values: dict[str, Any]) -> PlannerParams:
-        """Return the parameters of the core; braking and separation have limits of the start."""
+        """Return the parameters of the core; braking and separation keep the initial limits."""
         # A vehicle is known to others by the name of its namespace.
         params = build(values, name=self.get_namespace().strip('/'))
         self._start = start = self._start or params
@@ -213,7 +213,7 @@ class Planner(FlockNode):
         return response
 
     def _missing(self) -> list[str]:
-        """Return what must come before it follows."""
+        """Return the conditions for following that are not met yet."""
         fault = self._loop.odometry_fault(self._even_clock.now(), self._settings.current)
         return [*filter(None, [
             f'{fault} on {self.resolve_topic_name("odom")}' if fault else '',
@@ -221,7 +221,7 @@ class Planner(FlockNode):
             '' if self._loop.memory.neighbors else 'no neighbor seen yet'])]
 
     def _tick(self) -> None:
-        self._even_clock.now()  # a clock that was set is found before what waits is judged by it
+        self._even_clock.now()  # a clock that was set is found before the inputs are dated
         self._poll_frames()
         for poll in self._polls:
             poll()
@@ -294,7 +294,7 @@ class Planner(FlockNode):
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:
             return None
-        return rivals(self, BRIDGE_TOPIC, 'say on {} whether it flies')
+        return rivals(self, BRIDGE_TOPIC, 'publish the bridge state on {}')
 
 
 def main(args: list[str] | None = None) -> int:

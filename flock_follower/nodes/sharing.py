@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The node ``flock`` by the name that it had before, for one release; see ``nodes.flock``."""
+"""The node ``flock`` by its former name, for one release; see ``nodes.flock``."""
 
 from __future__ import annotations
 

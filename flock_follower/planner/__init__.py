@@ -13,8 +13,8 @@
 # limitations under the License.
 
 """
-Decides how to fly: one step from the newest estimates to one safe acceleration.
+The planner: one step from the newest estimates to one safe acceleration.
 
-The state machine, the guard of the band, the limits, altitude and yaw. Calls the law, which is
-``flocking.py`` beside the rooms.
+It holds the state machine, the guard of the band, the limits, altitude and yaw control. The law is
+in ``flocking.py``.
 """

@@ -84,14 +84,14 @@ Moving = TypeVar('Moving', OwnState, Neighbor)
 
 
 class Rejection(NamedTuple):
-    """An input that was not used: a short reason to count under, and the detail to log."""
+    """The rejection of an input: a short reason, which is counted, and the detail for the log."""
 
     reason: str
     detail: str
 
 
 def implausible(moving: OwnState | Neighbor) -> Rejection | None:
-    """Return whether a state is not finite or too fast, or None."""
+    """Return the rejection of a state that is not finite or too fast, or None."""
     more = [moving.yaw] if isinstance(moving, OwnState) else (
         [] if moving.acceleration is None else moving.acceleration.tolist())
     numbers = [moving.stamp, *moving.position.tolist(), *moving.velocity.tolist(), *more]
@@ -102,7 +102,7 @@ def implausible(moving: OwnState | Neighbor) -> Rejection | None:
 
 
 def untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
-    """Return whether a stamp is ahead of ``now`` or older than ``oldest``, s, or None."""
+    """Return the rejection of a stamp ahead of ``now`` or older than ``oldest``, s, or None."""
     age = now - stamp
     if age < -FUTURE_TOLERANCE:
         return Rejection('ahead of the clock', f'by {-age:.2f} s')
@@ -110,18 +110,18 @@ def untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
 
 
 def uncertain(n: Neighbor, params: PlannerParams) -> Rejection | None:
-    """Return which standard deviation, sqrt(trace), is too large or not known, or None."""
+    """Return the rejection of a standard deviation, sqrt(trace), too large or unknown, or None."""
     for name, covariance, most in (
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
         variance = float(covariance.trace())
-        if not 0.0 <= variance <= most ** 2:  # NaN is uncertain, and -1 means unknown to some
+        if not 0.0 <= variance <= most ** 2:  # NaN is uncertain; some sources send -1 for unknown
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
     return None
 
 
 def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
-    """Return whether a neighbor is farther away than any can be seen, or None."""
+    """Return the rejection of a neighbor farther away than any can be seen, or None."""
     distance = 0.0 if own is None else math.dist(n.position, own.position)
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
 
@@ -134,7 +134,7 @@ def at(moving: Moving, now: float) -> Moving:
 
 def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -> bool:
     """
-    Return whether the distance is known of a neighbor whose position is too uncertain.
+    Return whether the distance of a neighbor with a too uncertain position is known.
 
     The distance is known if its variance is at most a third of the variance admitted for a whole
     position. A position that is equally uncertain along all axes gives no distance.
@@ -151,9 +151,9 @@ def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: a larger one counts as a jump of the estimate
 ACCELERATION_NOISE = 0.2  # m/s^2: an acceleration of a neighbor below this is mostly noise
-TRUSTED_TIME = 1.0  # s for which a neighbor is expected to go on accelerating as it did
+TRUSTED_TIME = 1.0  # s for which a neighbor is expected to keep its acceleration
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
-FRESH = 0.12  # s up to which the guard's margin covers what else a neighbor may do
+FRESH = 0.12  # s up to which the guard's margin covers deviations of a neighbor's motion
 
 
 class Expected(NamedTuple):
@@ -166,7 +166,7 @@ class Expected(NamedTuple):
     acceleration: Array
     """(3,), m/s^2."""
     spread: float
-    """Largest distance from there, m ..."""
+    """Largest distance from that position, m ..."""
     spreading: float
     """... and its growth rate, m/s."""
 

@@ -17,7 +17,7 @@ Limits of acceleration and speed, and braking.
 
 Every function here returns a finite vector inside its limit for any float input, and its input
 bit for bit if no limit binds. Limits act on the length of the vector, never
-on its axes one by one, so a limited command still points where it was meant to.
+on its axes one by one, so a limited command keeps its direction.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class LimitedCommand(NamedTuple):
     acceleration: Array
     """Acceleration (3,), m/s^2, in the frame of the inputs."""
     reason: str
-    """Why it differs from the nominal one, '' if it does not; 'a_max', 'v_max', 'a_max, v_max',
-    reasons of bounds, or which input is not finite."""
+    """Reason why it differs from the nominal one, or '': 'a_max', 'v_max', 'a_max, v_max',
+    reasons of bounds, or the input that is not finite."""
     separation_axis: Array | None = None
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
@@ -94,21 +94,21 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 
     The acceleration is shortened to ``a_max``, the velocity ``v + a T`` it predicts is projected
     onto the ball of radius ``v_max``, and the acceleration leading there is shortened to ``a_max``
-    again, each time by a hair more (``SENT_INSIDE``). So ``|a| <= a_max`` always, in single
+    again, each time a little more (``SENT_INSIDE``). So ``|a| <= a_max`` always, in single
     precision too; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
     vehicle faster than that never speeds up. Flight controllers apply no speed limit of their own
     to acceleration setpoints.
 
-    A non-finite acceleration becomes braking, ``-v / T`` within ``a_max``; a non-finite velocity,
-    against which no acceleration can be judged, gives zeros.
+    A non-finite acceleration becomes braking with the time constant T, within ``a_max``. With a
+    non-finite velocity no acceleration can be judged: the result is zero.
 
     :param acceleration: nominal acceleration (3,), m/s^2.
     :param velocity: present velocity (3,), m/s, in the same frame.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
-    :param v_max: largest speed, m/s, in [0, 100].
-    :param period: time T the acceleration will be held for, s, in (0, 10].
+    :param a_max: largest acceleration, m/s^2, above 0.
+    :param v_max: largest speed, m/s, at least 0.
+    :param period: time T for which the acceleration is held, s, above 0.
     :param axis: unit vector (3,) along which the acceleration is cut last, because it keeps clear
-        of a neighbour: within the limits, as much of it is left as there can be.
+        of a neighbour: as much of it is left as the limits allow.
     """
     nominal, v = np.asarray(acceleration, dtype=float), np.asarray(velocity, dtype=float)
     requested, flown, strongest = nominal.tolist(), v.tolist(), a_max * SENT_INSIDE
@@ -141,14 +141,14 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
                      v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
     """
-    Limit an acceleration whose vertical part goes before the horizontal one.
+    Limit an acceleration whose vertical part has priority over the horizontal one.
 
-    As :func:`limit_command`, but the horizontal part gets what the vertical one leaves of
-    ``a_max`` and ``v_max``: the law's pull may be far beyond both and would leave no climb.
+    As :func:`limit_command`, but the horizontal part gets the rest of ``a_max`` and ``v_max``: the
+    law's pull may be far beyond both and would leave no climb.
 
-    :param nominal: acceleration (3,), m/s^2; its vertical part is not looked at.
+    :param nominal: acceleration (3,), m/s^2; its vertical part is not used.
     :param vertical: acceleration, m/s^2, at most ``a_max``.
-    :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
+    :param climb: vertical velocity, m/s, to which it finally leads: room is left for that.
     """
     v, nominal = np.asarray(velocity, dtype=float), np.asarray(nominal, dtype=float)
     if not math.hypot(*v.tolist()) < SANE:  # NaN fails
@@ -170,7 +170,7 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
 
 
 def _separation_first(a: Array, v: Array, axis: Array, a_max: float, v_max: float,
-                period: float) -> Array:
+                      period: float) -> Array:
     """
     Return the acceleration within the limits that loses least along ``axis``, and then across.
 
@@ -217,7 +217,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
 
 
 def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,
-          v_max: float, period: float) -> LimitedCommand:
+                v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.
 
@@ -227,10 +227,10 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
     the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
 
-    Where the bounds leave no room they are met one after the other in their order, each as
-    nearly as those before it allow. Cohesion beyond ``v_max`` is met less: as nearly as the
-    velocity is that is nearest to ``INSISTENCE`` times the correction. To the last bit it would
-    give up all speed across for very little, and switch between the two from tick to tick.
+    If the bounds leave no room they are met one after the other in their order, each as nearly as
+    those before it allow. Cohesion beyond ``v_max`` is met less: only as nearly as by the velocity
+    nearest to ``INSISTENCE`` times the correction. Met to the last bit, it would take all speed
+    across for very little, and the command would switch from tick to tick.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
@@ -245,7 +245,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     if not flyable or not all(map(math.isfinite, requested)) or all(
             scalar_product(each.normal.tolist(), requested) >= each.least for each in required):
         return limit_command(a, v, a_max, fastest, period)
-    # Those on the horizontal part that it can do anything for.
+    # The bounds on which the horizontal part has an influence.
     sides = [(complex(x, y), each.least - z * requested[2], each.reason)
              for each in required for x, y, z in [each.normal.tolist()]
              if math.hypot(x, y) > STEEP]
@@ -266,7 +266,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
     point = lexicographic(goal, bounds, Discs(
         0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within))
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
-    # Those that the command did not keep, and those that hold it where it is now.
+    # The bounds that the command did not keep, and those that are active at the result.
     acting = [k for k, (normal, least) in enumerate(bounds)
               if missed[k] or product(normal, point) <= least + TOLERANCE]
     axis = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
@@ -283,10 +283,10 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     in a direction that may be wrong is worse than none.
 
     :param velocity: present velocity (3,), m/s.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
-    :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
+    :param a_max: largest acceleration, m/s^2, above 0.
+    :param time_constant: time in which the speed falls to 37 %, s, above 0.
     """
-    # Shortened before the division, which could overflow, and after it, which rounds.
+    # Shortened before the division, because it could overflow, and after it, because it rounds.
     strongest = a_max * SENT_INSIDE
     step = limit_norm(0.0 - np.asarray(velocity, dtype=float), strongest * time_constant)
     return limit_norm(step / time_constant, strongest)

@@ -52,19 +52,18 @@ MAX_YAW_STD = 0.5
 ACCELERATION_AGE = 100_000_000
 #: Processed images of which the stamps are kept.
 FRAMES = 20
-#: Messages of odometry: 2 s at 10 Hz, but a hiccup at 60 Hz is forgotten in 0.3 s.
+#: Messages of odometry: 2 s at 10 Hz; a late one at 60 Hz counts for 0.3 s.
 REMEMBERED = 20
 
 
 class PlannerLoop:
     """
-    Gathers inputs, and passes them to one step of the core per tick.
+    Collects inputs, and passes them to one step of the core per tick.
 
     The planner is active while it is engaged and the bridge reports that it flies the commands.
-    ``memory`` is the state that the last step left; ``missed`` counts the ticks that did not come
-    in time.
+    ``memory`` is the state after the last step; ``missed`` counts the ticks that were not in time.
 
-    :param require_bridge: whether the bridge has to report that; else engaging is enough.
+    :param require_bridge: whether the bridge must report that; else engaging is enough.
     """
 
     def __init__(self, require_bridge: bool = True) -> None:
@@ -110,7 +109,7 @@ class PlannerLoop:
 
         :param silence: time since the message before, s.
         """
-        # If it does not fly now, the next tick or the next message finds it waiting.
+        # If the vehicle does not fly now, the next tick or the next message finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
         if self._require_bridge and self.engaged and self._bridge.name == TAKEN_OVER and (
@@ -122,7 +121,7 @@ class PlannerLoop:
 
     def waiting(self, bridge_age: float = math.inf) -> str:
         """
-        Return why it cannot become active, if engaged, or ''.
+        Return the reason why it is not active although engaged, or ''.
 
         :param bridge_age: time since the last message of the bridge, s, by a steady clock.
         """
@@ -143,7 +142,7 @@ class PlannerLoop:
         self._newest, self._own, self._frame = state.stamp, state, state.frame
 
     def take_acceleration(self, state: AccelerationState) -> None:
-        """Take the acceleration of a neighbour, which comes before the neighbour's state."""
+        """Take the acceleration of a neighbour; it is sent before the neighbour's state."""
         self._accelerations[state.child] = state
 
     def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
@@ -202,7 +201,7 @@ class PlannerLoop:
                    key=lambda known: (known[0] != faced, known[1]))
 
     def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
-        """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""
+        """Return the fault of the newest odometry of a tick at a time, ns, or ''."""
         return odometry_fault(self.memory.own, self.seconds(nanoseconds), params)
 
     def tick(self, nanoseconds: int, params: PlannerParams, bridge_age: float = math.inf
@@ -239,7 +238,7 @@ class PlannerLoop:
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
-        # The stamp of the estimate that the command rests on, or that of the tick.
+        # The stamp of the estimate on which the command rests, or that of the tick.
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(

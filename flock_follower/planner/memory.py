@@ -145,25 +145,24 @@ class Memory(NamedTuple):
     command: Array | None = None
     """Acceleration last commanded, m/s^2; None if the last step commanded nothing."""
     pending: Array = np.zeros(3)
-    """Velocity that has been commanded and not yet been flown (3,), m/s."""
+    """Velocity that was commanded and is not flown yet (3,), m/s."""
     drag: Array = np.zeros(3)
     """Acceleration flown that does not show in the velocity, by drag or wind (3,), m/s^2."""
     params: PlannerParams | None = None
     """Parameters with which the law was followed in the last step; None if it was not."""
     fading: tuple[Array, float] | None = None
-    """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
+    """The command (3,), m/s^2, from which the law's is faded in, and since when, s."""
     occlusion: Occlusion | None = None
     """Whether the faced neighbor is occluded."""
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
-
     disturbance: Any = None
     """See ``relative.Disturbance``."""
     switched: float = -math.inf
     """When odometry was lost or returned last, s: the frame before is another one."""
 
     def acceleration(self, n: Neighbor) -> Array:
-        """Return a neighbor's acceleration (3,), m/s^2; of a received one it is outdated: zero."""
+        """Return a neighbor's acceleration (3,), m/s^2; zero for a received one, as outdated."""
         motion = self.motions.get(n.name)
         return np.zeros(3) if n.received or motion is None else motion.acceleration
 
@@ -178,14 +177,14 @@ class Memory(NamedTuple):
             pending=self.pending, jumped=own.stamp, switched=now)
 
     def begun_afresh(self) -> Memory:
-        """Return it without anything of a flight that is over."""
+        """Return the memory without anything of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
                       jumped=self.jumped, given_up=self.given_up)
 
 
 def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
-    """Return the memory with the valid new inputs and without those too old, and the rest."""
+    """Return the memory with the valid new inputs, without old ones, and the rejections."""
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
@@ -237,7 +236,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
 
 
 def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams) -> Array:
-    """Return what the velocity lacks of the acceleration flown (3,), m/s^2, smoothed."""
+    """Return the acceleration flown minus the change of velocity (3,), m/s^2, smoothed."""
     elapsed = own.stamp - before.stamp
     lacking = memory.pending / params.response_time - (own.velocity - before.velocity) / elapsed
     return memory.drag + min(elapsed / DRAG_TIME, 1.0) * (lacking - memory.drag)

@@ -81,7 +81,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param fault: fault of the own odometry or of perception, or ''.
     :param youngest: age of the youngest estimate of a neighbour in sight, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
-    :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
+    :param waiting: reason why it may not command yet, or why it was disengaged, or ''.
     :param given_up: whether it had no neighbour for too long, and must be engaged again.
     :param received: age of the youngest estimate reported by another vehicle, s, or None.
     :param occluded: whether the faced neighbour is occluded.
@@ -93,8 +93,8 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     rules = (  # the first that applies counts
         (not engaged, State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'),
         (given_up, State.IDLE if waiting else lost,
-         f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
-         f'call planner/engage to follow again{f" ({fault})" if fault else ""}'),
+         f'no neighbor followed for more than {params.resume_timeout:g} s: sends no more '
+         f'commands, call planner/engage to follow again{f" ({fault})" if fault else ""}'),
         (bool(waiting), State.IDLE, f'engaged, waiting for {waiting}'),
         (bool(fault), lost, fault),
         (in_sight, State.TRACK, ''),
@@ -107,7 +107,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
 
 
 def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> str:
-    """Return why odometry taken in earlier cannot be flown on at the time ``now``, or ''."""
+    """Return the fault of the newest odometry at the time ``now``, or ''."""
     if own is None:
         return 'no odometry'
     fault = untimely(own.stamp, now, params.odom_timeout)
@@ -115,15 +115,15 @@ def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> s
 
 
 LATE = 0.5  # share of odom_timeout: younger odometry is never late
-LATEST = 0.8  # share of odom_timeout: older odometry always is, to brake before commands end
+LATEST = 0.8  # share of odom_timeout: older odometry always is late, to brake before commands end
 OVERDUE = 1.2  # times the greatest age that the last messages reached
 
 
 def late(own: OwnState | None, now: float, params: PlannerParams) -> str:
     """
-    Return that odometry is late, or that its source is too slow to fly on, or ''.
+    Return that odometry is late, or that its source is too slow, or ''.
 
-    Between two messages odometry grows old by nature: at 10 Hz and 60 ms of latency it is 0.16 s
+    Between two messages the age of odometry grows: at 10 Hz and 60 ms of latency it is 0.16 s
     old just before the next message arrives. A fast source is late at ``LATE`` of the timeout, a
     slow one if its message becomes older than the last ones did.
     """
@@ -155,7 +155,7 @@ _LONGEST_REASON = 200  # characters
 
 
 class BridgeState(NamedTuple):
-    """One of ``BRIDGE_STATES``, and why it is that one."""
+    """One of ``BRIDGE_STATES``, and the reason for it."""
 
     name: str
     reason: str = ''
@@ -175,14 +175,14 @@ def parse(text: str) -> BridgeState:
 
 def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     """
-    Return the state of the bridge, which counts as absent after a silence.
+    Return the state of the bridge; after a silence it counts as absent.
 
-    :param reported: its last message, None without one.
-    :param age: how long ago that was, s, by a clock that neither stops nor jumps.
+    :param reported: the state in its last message; None without one.
+    :param age: of that message, s, by a clock that neither stops nor jumps.
     """
     if reported is None or math.isinf(age):
-        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (where somebody else flies '
-                           'the commands, require_bridge:=false)')
+        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (if another program flies '
+                           'the commands, set require_bridge:=false)')
     if not age <= SILENCE:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
     return reported

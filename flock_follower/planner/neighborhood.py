@@ -46,7 +46,7 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, LEADER, PlannerParams
 
-GAP_MIN = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
+GAP_MIN = 1e-3  # m: least distance of hulls for the law, if they touch or overlap
 
 
 class Neighborhood(NamedTuple):
@@ -103,7 +103,7 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
     """
     Return the names at the other ends of the own edges.
 
-    :param held: those of before.
+    :param held: those of the step before.
     """
     follow = [n for n in flock if n.member.role != AVOID]
     if len(follow) < 2:
@@ -195,7 +195,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
         law = graph_law(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
     if any(apart(n, me, params) ** 2 <= params.law.d0 for n in flock):
-        return law, None  # too near already: at once
+        return law, None  # too near already: no fade-in
     if memory.params is not params and memory.params != params:
         fading = np.zeros(3) if memory.command is None else memory.command, me.stamp
     if fading is None:

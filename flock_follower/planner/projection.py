@@ -19,10 +19,10 @@ The bounds are taken one after the other (Seidel, "Small-dimensional linear prog
 hulls made easy", Discrete & Computational Geometry 6, 1991, here with discs and distances): while
 the best point for those before keeps a bound, it stays the best. Otherwise the best point lies on
 the bound's line, since the set is convex: it is the best of an interval of that line. If the line
-holds no such point, this is the first bound that those before leave no room for. m bounds cost at
+holds no such point, this is the first bound for which those before leave no room. m bounds cost at
 most m^2 steps, and as a rule a few m.
 
-Points are complex numbers: small arrays would cost ten times as much as the numbers in them.
+Points are complex numbers: small arrays would take ten times as long.
 """
 
 from __future__ import annotations
@@ -94,13 +94,13 @@ class Discs(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """The points ``foot + y * along`` of a line, and from where to where two discs cover it."""
+    """The points ``foot + y * along`` of a line, and the range of y within two discs."""
 
     foot: complex
     along: complex
     low: float
     high: float
-    """At most ``low`` where the line misses what the discs share."""
+    """At most ``low`` if the line misses the common part of the discs."""
     gap: float
     """Distance by which the line misses the discs; at most 0 if it meets them."""
 
@@ -119,12 +119,12 @@ class _Line(NamedTuple):
         low, high = max(-cut, between - other_cut), min(cut, between + other_cut)
         gap = max(abs(height) - radius, abs(other_height) - other_radius,
                   abs(between) - cut - other_cut)
-        if low > high:  # by rounding, or where it misses
+        if low > high:  # by rounding, or because the line misses them
             low = high = (low + high) / 2.0
         return cls(centre + height * unit, along, low, high, gap if size else math.inf)
 
     def at(self, goal: complex, far: bool, low: float, high: float) -> complex:
-        """Return the best point from ``low`` to ``high``: see ``_optimum``."""
+        """Return the best point from ``low`` to ``high``: see ``optimum``."""
         if far:
             best = math.copysign(math.inf, self.slope(goal))
         else:
@@ -137,7 +137,7 @@ class _Line(NamedTuple):
         return 0.0 if abs(slope) < PARALLEL else slope
 
     def room(self, sides: Sequence[Side]) -> tuple[float, float] | None:
-        """Return from where to where all bounds are kept, or None."""
+        """Return the range of y in which all bounds are kept, or None."""
         low, high = self.low, self.high
         for normal, least in sides:
             slope, value = self.slope(normal), least - product(normal, self.foot) - ROUNDING
@@ -172,8 +172,8 @@ def lexicographic(goal: complex, sides: Sequence[Side], discs: Discs) -> complex
     """
     Return the point of the discs nearest to ``goal`` that meets the bounds, the first first.
 
-    A bound that the ones before it leave no room for is met as nearly as they allow, so none
-    costs one before it anything. A bound whose normal is zero bounds nothing.
+    A bound for which those before it leave no room is met as nearly as they allow, so that no
+    bound relaxes one before it. A bound whose normal is zero bounds nothing.
     """
     sides = [(normal, min(max(least, -_HUGE), _HUGE)) for normal, least in sides if normal]
     point, k = optimum(goal, False, sides, discs)

@@ -51,7 +51,7 @@ class Decision(NamedTuple):
 
     state: State
     reason: str = ''
-    """Why this state, unless it is TRACK of a neighbor in sight."""
+    """The reason for the state, unless it is TRACK of a neighbor in sight."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
@@ -61,14 +61,14 @@ class Decision(NamedTuple):
     separation_axis: Array | None = None
     """Unit vector (3,) away from the neighbor that the command keeps clear of; None: of none."""
     stamp: float | None = None
-    """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
+    """Stamp of the newest estimate on which the command rests, s; None without one."""
     limits: str = ''
-    """The limits that bound: those of 'a_max', 'v_max', and of the guard's reasons, that did."""
+    """The active limits: of 'a_max', 'v_max' and the reasons of the guard's bounds."""
     rejected: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
-    """Motions of the neighbors that are beyond the follower's means."""
+    """Neighbors that it cannot follow, and its reaction to lost ones."""
     thrust_bias: float = 0.0
-    """The part of the vertical acceleration that only makes up for a wrong hover thrust, m/s^2."""
+    """The part of the vertical acceleration that only offsets a wrong hover thrust, m/s^2."""
     edges: tuple[str, ...] = ()
     """The neighbors at the ends of its edges; others are only kept clear of."""
 

@@ -16,8 +16,8 @@
 Field of view of the cameras, and occlusion of the faced neighbor: its marker should be visible.
 
 A marker that leaves the image is expected to come back, and the follower coasts. A marker that is
-predicted well inside the image and is not found is covered by something that stands on the
-follower's way, so the follower brakes. Nothing here reads a clock.
+predicted well inside the image and is not found is covered by an obstacle in the follower's way,
+so the follower brakes. Nothing here reads a clock.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class FieldOfView(NamedTuple):
         :param info: its CameraInfo.
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
         :param several: it is one of several, which may look to any side.
-        :raises ValueError: if it does not look ahead, or to a side, or K is invalid.
+        :raises ValueError: if it looks neither ahead nor to a side, or K is invalid.
         """
         angles, width, height = np.asarray(rpy, dtype=float).tolist(), info.width, info.height
         mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
@@ -128,7 +128,7 @@ def vertical(view: View, bearing: float) -> tuple[float, float]:
     return max(f.up for f in seeing), max(f.down for f in seeing)
 
 
-#: Consecutive processed images without the marker that make it occluded, and with it that end it.
+#: Consecutive processed images without the marker that begin an occlusion, and with it to end it.
 IMAGES = 3
 #: Distance of the predicted marker to the image's edge, m: two markers of 0.2 m.
 OCCLUSION_MARGIN = 0.4
@@ -147,9 +147,9 @@ class Occlusion(NamedTuple):
 def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
               frames: Sequence[float], view: View, forward: float) -> Occlusion | None:
     """
-    Return whether a neighbor is occluded, or None.
+    Return the occlusion of a neighbor, or None.
 
-    :param before: the same in the last step.
+    :param before: the occlusion in the last step.
     :param n: its newest estimate; None if there is none.
     :param me: own state now.
     :param frames: stamps of the newest processed images, s, in their order.

@@ -20,8 +20,8 @@ the present altitude and yaw: nothing of an earlier flight remains. When followi
 again, or continues with other parameters, the command of the law is faded in; the guard acts on
 the result at once. Nothing here reads a clock: equal inputs give equal outputs.
 
-The order of what a command keeps is that of :mod:`flock_follower.planner.guard`, within ``a_max``
-and ``v_max``. Altitude has priority over all horizontal motion.
+The order of the bounds on a command is that of :mod:`flock_follower.planner.guard`, within
+``a_max`` and ``v_max``. Altitude has priority over all horizontal motion.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     Return the memory for the next step, and the decision for the time ``now``, s.
 
     :param now: a step back by more than 0.1 s forgets everything.
-    :param engaged: whether commands are wanted; :param own: the newest odometry, or None.
+    :param engaged: whether commands are requested; :param own: the newest odometry, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
-    :param looked: when the last image was processed, s; None if none was, which is no fault.
-    :param waiting: why it may not command although engaged, or what disengaged it, or ''.
+    :param looked: when the last image was processed, s; None if none was: that is no fault.
+    :param waiting: reason why it may not command, or why it was disengaged, or ''.
     :param view: of the cameras; () if unknown; :param ground: height at arming, m, in odom.
     :param frames: stamps of the newest processed images, s, in their order.
     """
@@ -78,15 +78,15 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         memory = memory._replace(command=None, params=None, fading=None, pending=np.zeros(3))
         return memory, Decision(state, reason, rejected=rejected)
     me, tracking = at(memory.own, now), state is State.TRACK
-    # Commands that are not flown yet count as velocity; part was flown since the measurement.
+    # Commands that are not flown yet count as velocity; a part was flown since the measurement.
     coming = memory.pending * (1.0 + max(now - memory.own.stamp, 0.0) / params.response_time)
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
     neighbors = scene.neighbors
     altitude, vertical = _altitude(memory, scene, ground, float(coming[2]), params, elapsed)
     bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
     velocity = me.velocity + coming - bias * params.period * UP
-    wanted, fading = nominal(memory, state, me, velocity, neighbors, params)
-    command = constrain(wanted, vertical, altitude.climb, memory, scene, velocity, view, params)
+    unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
+    command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
     if me.stamp - memory.switched < relative.SETTLING:
         command = command._replace(
             acceleration=relative.without_step(command.acceleration, memory.command))
@@ -208,7 +208,7 @@ def _warnings(memory: Memory, scene: Scene, reason: str,
     me, leader = scene.me, scene.leader
     if scene.state is State.TRACK:
         search = '' if leader is None else (
-            f'looks for {leader.name}, not known of for {me.stamp - leader.stamp:.1f} s')
+            f'looks for {leader.name}, last known {me.stamp - leader.stamp:.1f} s ago')
         return (*filter(None, [reason, search]), *reports(memory, scene.neighbors, me, params))
     retreated = 0.0 if memory.lost is None else memory.lost.retreated(me.position)
     if memory.lost is None or retreated < retreat(memory.lost, params) - 0.05:

@@ -41,28 +41,28 @@ from flock_follower.geometry import wrap_angle
 from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams
 
-THRUST_BIAS_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
+THRUST_BIAS_MAX = 1.2  # m/s^2: the measured error of PX4's hover thrust estimate was 1
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
-INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
-INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
+INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, as the thrust errs for 10 s
+INTEGRAL_SHARE_BEYOND = 0.6  # likewise if an error of the thrust presses it beyond a bound:
 BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
 CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
 CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
 HEIGHT_GAIN = 0.5  # likewise of a change in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
-ALTITUDE_MARGIN = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
+ALTITUDE_MARGIN = 0.1  # m: margin to both bounds, for thrust errors and noise
 BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
-ALTITUDE_RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
+ALTITUDE_RETURN_SPEED = 0.3  # m/s with which it returns from beyond a bound
 CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
 
 
 class Altitude(NamedTuple):
-    """The altitude to hold, m, and what holds it, between one step and the next."""
+    """The altitude to hold, m, and the state of its control, between one step and the next."""
 
     held: float
     """m."""
     lowest: float
-    """m: below it only where the flight began there."""
+    """m; the vehicle is below it only if the flight began there."""
     highest: float
     """m."""
     climb: float = 0.0
@@ -75,9 +75,9 @@ class Altitude(NamedTuple):
     @classmethod
     def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
         """
-        Return the altitude of becoming active, to hold.
+        Return the altitude at which the planner becomes active, to hold.
 
-        :param ground: height at which the vehicle was armed, m, None if unknown.
+        :param ground: height at which the vehicle was armed, m; None if unknown.
         """
         z = float(me.position[2])
         if ground is None:
@@ -119,7 +119,7 @@ class Altitude(NamedTuple):
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
         :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
-            lowest and the highest altitude go before.
+            lowest and the highest altitude have priority.
         :param coming: vertical velocity, m/s, that is commanded and not yet flown.
         """
         w = params.altitude_frequency
@@ -127,12 +127,12 @@ class Altitude(NamedTuple):
         z, rate = float(me.position[2]), float(me.velocity[2])
         error = self.held - z
         speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
-        # Until a command acts it goes on as it does.
+        # Until a command acts the vehicle keeps its velocity.
         reached = z + rate * params.response_time
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
-        if clear != speed:  # then only the speed can show that the thrust is wrong
+        if clear != speed:  # then only the speed can show an error of the thrust
             error = 2.0 * (min(max(clear, -down), up) - rate) / w
         nominal, within = (2.0 * w * (each - rate)
                           for each in (clear, min(max(clear, -down), up)))
@@ -144,7 +144,7 @@ class Altitude(NamedTuple):
         if least > -math.inf:
             low = max(min(least, up), -down) - rate - coming
             vertical = max(vertical, min(low / params.guarding.T_g, strongest))
-        # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
+        # Somewhat beyond a bound, and not returning: the thrust is wrong.
         below, above = self.lowest - z, z - self.highest
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
             BEYOND < above < FAR_BEYOND and rate > -RETURNING)
@@ -161,10 +161,10 @@ class Altitude(NamedTuple):
 
 def _stopped_within(gap: float, gain: float) -> float:
     """
-    Return the speed, m/s, from which it stops within a gap, m; beyond a bound what returns it.
+    Return the speed, m/s, from which it stops within a gap, m; beyond a bound, the return speed.
 
-    :param gain: speed for each metre, 1/s, as far as that brakes by at most BRAKING; from there on
-        it brakes with that.
+    :param gain: speed for each metre, 1/s, while the deceleration is at most BRAKING; farther away
+        the deceleration is BRAKING.
     """
     near = BRAKING / gain ** 2
     if gap > near:
@@ -175,14 +175,14 @@ def _stopped_within(gap: float, gain: float) -> float:
 YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75
 YAW_LEAD = 0.4  # s: in which a vehicle turns to 63 % of a commanded yaw
 OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
-LOOK_ASIDE = 0.8  # rad to either side of where it was lost, before looking all round
-WIDER = 1.4  # times as far to the other side, until it has looked all round
-LOOK_THERE = 0.5  # s for which it is awaited there first
+LOOK_ASIDE = 0.8  # rad to either side of the place of the loss, before looking all round
+WIDER = 1.4  # times as far to the other side, until the turn is complete
+LOOK_THERE = 0.5  # s for which the vehicle faces that place first
 
 
 def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
            elapsed: float) -> float:
-    """Return the yaw that turns from the last one to where a neighbour is about to be."""
+    """Return the yaw that turns from the last one to the place where a neighbour will soon be."""
     x, y, _ = neighbor.position - me.position
     distance = math.hypot(x, y)
     if distance < OVERHEAD:
@@ -196,11 +196,11 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
 def searching(last: float, me: OwnState, there: Neighbor, since: float, params: PlannerParams,
               elapsed: float) -> float:
     """
-    Return the yaw that looks where a neighbour is expected, to both sides, then all round.
+    Return the yaw towards the place where a neighbour is expected, to both sides, then all round.
 
     The first side is the one to which the neighbour moved.
 
-    :param there: the neighbour where it is expected; :param since: how long it is searched, s.
+    :param there: the neighbour where it is expected; :param since: time of the search, s.
     """
     x, y, _ = there.position - me.position
     left = params.scan_rate * max(since - LOOK_THERE, 0.0)
@@ -218,7 +218,7 @@ def turning(before: float, commanded: float, me: OwnState, params: PlannerParams
     Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
 
     That is the rate of the commanded yaw, plus a correction towards that yaw: an autopilot that
-    is given a rate does not control the yaw itself.
+    receives a rate does not control the yaw itself.
 
     :param before: the yaw commanded ``elapsed`` seconds ago, rad; ``commanded`` now.
     """

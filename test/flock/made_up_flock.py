@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-A flock made up to test words: leader and followers that fly, drift, see and talk, in numpy.
+A simulated flock for tests of messages: leader and followers that fly, drift, see and send.
 
-Nobody obeys anybody: places are formulas of time. Every follower's odometry begins at a place and
-yaw of its own and walks at random; it sees whom it is said to see, with noise.
+No vehicle follows another: places are formulas of time. Every follower's odometry begins at a
+place and yaw of its own and walks at random; it sees the vehicles that SHAPES names, with noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LOOKS, LATE = 2, 2
 EPOCH = 1_700_000_000 * NANOSECONDS
 LEADER = 'leader'
 
-#: Whom each sees with a camera to the front, and where it flies behind the leader, m.
+#: Place of each follower behind the leader, m, and the vehicles that its camera sees.
 SHAPES: dict[str, tuple[list[tuple[float, float]], list[list[int]]]] = {
     # In line: each sees the one before it.
     'line': ([(-1.6, 0.0), (-3.2, 0.0), (-4.8, 0.0), (-6.4, 0.0)], [[0], [1], [2], [3]]),
@@ -61,7 +61,7 @@ class Conditions:
     seed: int = 0
     loss: float = 0.0
     delay: float = 0.02
-    """Of words, s."""
+    """Of messages, s."""
     sight_std: float = 0.02
     """Of a place seen, per axis, m ..."""
     sight_memory: float = 0.0
@@ -69,7 +69,7 @@ class Conditions:
     outliers: float = 0.0
     """Share of sightings of something else, up to 2 m off."""
     attitude_std: float = 0.0
-    """Of the yaw of whom one sees, rad; 0: no attitude is told."""
+    """Of the yaw of a vehicle seen, rad; 0: no attitude is sent."""
     askew: float = 0.0
     """By how much markers hang askew, rad."""
     still: bool = False
@@ -80,14 +80,14 @@ class Conditions:
 
 @dataclass
 class Report:
-    """How a flight was for one who was told of another."""
+    """The states of one vehicle that another received in a flight."""
 
     errors: list[float] = field(default_factory=list)
-    """Of the place told at the stamp, relative to oneself, m."""
+    """Of the received place at the stamp, relative to the own one, m."""
     chi2: list[float] = field(default_factory=list)
-    """Of what becomes of it by the time it is used."""
+    """Of its prediction to the time of use."""
     since: float | None = None
-    """When it was told first, s."""
+    """When it was received first, s."""
     ticks: int = 0
 
 
@@ -117,10 +117,10 @@ class MadeUpFlock:
         self.silent: set[str] = set()
         self.lasting: dict[tuple[int, int], Array] = {}
         self.spoil: Callable[[str, OdometryState], list[OdometryState]] | None = None
-        """What becomes of a word on its way."""
+        """Replaces a message on its way."""
 
     def place(self, k: int, time: float) -> Array:
-        """Return where a vehicle truly is, (3,), m."""
+        """Return the true place of a vehicle, (3,), m."""
         if self.conditions.still:
             return np.array([*self.places[k], 1.5 + 0.2 * k])
         speed, swing, rate = 0.4, 0.8, 0.35
@@ -136,7 +136,7 @@ class MadeUpFlock:
         return (self.place(k, time + 1e-3) - self.place(k, time - 1e-3)) / 2e-3
 
     def yaw(self, k: int, time: float) -> float:
-        """Return its true yaw, rad: it looks at whom it sees first, else ahead."""
+        """Return its true yaw, rad: it looks at the first vehicle in its view, else ahead."""
         target = self.true[self.sees[k][0]] if self.sees[k] else self.true[k] + [1.0, 0.0, 0.0]
         towards = target - self.true[k]
         return math.atan2(towards[1], towards[0])
@@ -147,7 +147,7 @@ class MadeUpFlock:
             self._advance()
 
     def stamp(self, time: float, name: str) -> int:
-        """Return a time on somebody's clock, ns."""
+        """Return a time on the clock of a vehicle, ns."""
         return EPOCH + to_nanoseconds(time + self.conditions.clocks.get(name, 0.0))
 
     def _advance(self) -> None:
@@ -169,12 +169,12 @@ class MadeUpFlock:
                 self._look(k, name)
         if step % 3 == 0:
             for k, name in enumerate(self.names[1:], 1):
-                self._talk(k, name)
+                self._send(k, name)
 
     def state(self, k: int, child: str, of: int, place: Array, time: float,
               position_variance: float = 0.0, yaw_variance: float = 0.0,
               yaw_error: float = 0.0) -> OdometryState:
-        """Return a vehicle's state in the odometry of k, where its place in that is known."""
+        """Return a vehicle's state in the odometry of k, from its place in that."""
         pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
         pose[:3, :3] = position_variance * np.eye(3)
         pose[3:, 3:] = yaw_variance * np.eye(3)
@@ -208,19 +208,19 @@ class MadeUpFlock:
         self.lasting[k, of] = error
         return error
 
-    def _talk(self, k: int, name: str) -> None:
+    def _send(self, k: int, name: str) -> None:
         how, sharing = self.conditions, self.sharing[name]
-        due = [word for word in self.wire if word[0] <= self.time + 1e-9 and word[1] == name]
-        self.wire = [word for word in self.wire if word[1] != name or word[0] > self.time + 1e-9]
+        due = [each for each in self.wire if each[0] <= self.time + 1e-9 and each[1] == name]
+        self.wire = [each for each in self.wire if each[1] != name or each[0] > self.time + 1e-9]
         for _, _, state in due:
             sharing.take_message(state, self.stamp(self.time, name))
         now = self.stamp(self.time, name)
         reported = sharing.neighbors(now)
-        words = [] if name in self.silent else sharing.messages(now)
-        for word in words:
+        messages = [] if name in self.silent else sharing.messages(now)
+        for message in messages:
             for other in self.names[1:]:
                 if other != name and self.rng.random() >= how.loss:
-                    spoiled = [word] if self.spoil is None else self.spoil(name, word)
+                    spoiled = [message] if self.spoil is None else self.spoil(name, message)
                     self.wire += [(self.time + how.delay, other, w) for w in spoiled]
         for reason, _ in sharing.new_events():
             self.events[reason] = self.events.get(reason, 0) + 1

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Frames are aligned from any yaw and geometry, as well as is claimed, through loss and delay."""
+"""Frames are aligned from any yaw and geometry, as exactly as reported, with loss and delay."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def test_every_geometry_is_aligned_from_any_yaw(shape: str, attitude_std: float)
     Conditions('side by side', 3, attitude_std=0.02, askew=0.06),
     Conditions('line', 1, loss=0.5, delay=0.3)], ids=lambda c: c.shape)
 def test_what_is_claimed_of_frames_and_places_is_true(conditions: Conditions) -> None:
-    """Errors of sightings that last, a marker askew, half of the words lost and the rest late."""
+    """Errors of sightings that last, a marker askew, half of the messages lost, the rest late."""
     flock = flown(conditions, 14.0)
     assert 0.2 < np.mean(flock.nees) / 4.0 < 2.0
     chi2 = [c for r in flock.received.values() for c in r.chi2]
     assert 0.2 < np.mean(chi2) / 3.0 < 2.0
 
 
-def test_sightings_of_something_else_are_neither_believed_nor_told() -> None:
+def test_sightings_of_something_else_are_neither_used_nor_sent() -> None:
     flock = flown(Conditions('line', 1, outliers=0.05, attitude_std=0.03), 15.0)
     assert flock.events['does not fit the alignment'] > 10
     errors = np.concatenate([r.errors for r in flock.received.values()])
@@ -73,7 +73,7 @@ def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
     flock = flown(Conditions('side by side', still=True), 20.0)
     assert flock.received == {}
     sender = flock.sharing['follower_1'].senders['follower_2']
-    assert 'somebody has to move' in sender.unusable(flock.stamp(flock.time, ''))
+    assert 'a vehicle must move' in sender.unusable(flock.stamp(flock.time, ''))
     assert flock.events['not aligned with follower_2'] > 150
     seeing = flown(Conditions('side by side', still=True, attitude_std=0.03), 5.0)
     assert set(seeing.received) == {('follower_1', 'follower_2'), ('follower_2', 'follower_1')}
@@ -97,15 +97,15 @@ def test_a_teller_whose_odometry_steps_is_aligned_anew(step: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_liar_is_refused_and_harms_nobody_else() -> None:
+def test_a_sender_of_false_states_is_refused_and_harms_no_other() -> None:
     flock = flown(Conditions('wedge', 4, attitude_std=0.03), 8.0)
     rng = np.random.default_rng(0)
 
-    def lie(name: str, word: OdometryState) -> list[OdometryState]:
+    def lie(name: str, message: OdometryState) -> list[OdometryState]:
         if name != 'follower_4':
-            return [word]
-        away = word.position + rng.uniform(-30.0, 30.0, 3)
-        return [word._replace(position=away), word]
+            return [message]
+        away = message.position + rng.uniform(-30.0, 30.0, 3)
+        return [message._replace(position=away), message]
     flock.spoil = lie
     flock.received.clear()
     flock.run(10.0)

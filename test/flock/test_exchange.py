@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is told, what is refused and why, and that nothing told can break whoever listens."""
+"""The messages sent, the refusals and their reasons; no message can break a receiver."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def test_a_vehicle_without_a_proper_name_is_refused(name: str) -> None:
         Sharing(name)
 
 
-def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> None:
+def test_own_state_and_sightings_are_sent_once_in_a_frame_of_the_own_name() -> None:
     sharing = listening()
     sharing.take_seen(state('odom', LEADER))
-    words = sharing.messages(EPOCH + 10 * MS)
-    assert [(w.frame, w.child) for w in words] == [('f1/odom', 'f1'), ('f1/odom', LEADER)]
+    messages = sharing.messages(EPOCH + 10 * MS)
+    assert [(w.frame, w.child) for w in messages] == [('f1/odom', 'f1'), ('f1/odom', LEADER)]
     assert sharing.messages(EPOCH + 20 * MS) == []  # 10 Hz
     assert sharing.messages(EPOCH + 120 * MS) == []  # nothing new
     sharing.take_own(own(EPOCH + 100 * MS))
@@ -95,15 +95,15 @@ def test_what_is_stamped_in_the_future_is_not_told() -> None:
         now += 100 * MS
         sharing.take_own(own(now))
         sharing.take_seen(state('odom', LEADER, stamp))
-        assert [word.child for word in sharing.messages(now)] == ['f1']
+        assert [message.child for message in sharing.messages(now)] == ['f1']
 
 
 LATER = EPOCH + 10 * MS
 NOT_ALIGNED, OUT_OF_ORDER = 'not aligned with f2', 'message out of order'
 #: Messages with the times of their reception, and the reasons of their refusal.
 REFUSED: dict[str, tuple[list[tuple[OdometryState, int]], list[str]]] = {
-    **{f'{reason} {k}': ([(word, received), (state(), LATER)], [reason, NOT_ALIGNED])
-       for k, (word, received, reason) in enumerate([
+    **{f'{reason} {k}': ([(message, received), (state(), LATER)], [reason, NOT_ALIGNED])
+       for k, (message, received, reason) in enumerate([
            (state(frame='odom'), EPOCH, 'frame of a message is not unique'),
            (state(frame='/odom'), EPOCH, 'frame of a message is not unique'),
            (state(frame='a/b/odom'), EPOCH, 'frame of a message is not unique'),
@@ -115,7 +115,7 @@ REFUSED: dict[str, tuple[list[tuple[OdometryState, int]], list[str]]] = {
            (state(child=LEADER, variance=math.nan), EPOCH, 'message without a covariance'),
            (state(), EPOCH - 25 * MS, 'message from the future'),
            (state(), EPOCH + 1100 * MS, 'message too old')])},
-    'own words that come back are no impostors': (
+    'own messages that come back are no impostors': (
         [(state('f1/odom', 'f1', EPOCH), EPOCH), (state('f1/odom', 'f1', EPOCH + MS), LATER)],
         ['another vehicle uses this name']),
     'repeated or late': ([(state(stamp=stamp), EPOCH) for stamp in (EPOCH, EPOCH, EPOCH - MS)],
@@ -129,17 +129,17 @@ REFUSED: dict[str, tuple[list[tuple[OdometryState, int]], list[str]]] = {
 }
 
 
-@pytest.mark.parametrize(('words', 'expected'), REFUSED.values(), ids=REFUSED)
-def test_a_word_that_cannot_be_is_refused_by_its_reason(
-        words: list[tuple[OdometryState, int]], expected: list[str]) -> None:
+@pytest.mark.parametrize(('messages', 'expected'), REFUSED.values(), ids=REFUSED)
+def test_an_impossible_message_is_refused_by_its_reason(
+        messages: list[tuple[OdometryState, int]], expected: list[str]) -> None:
     sharing = listening()
     sharing.messages(EPOCH)
-    for word, received in words:
-        sharing.take_message(word, received)
+    for message, received in messages:
+        sharing.take_message(message, received)
     assert reasons(sharing) == expected
 
 
-def test_tellers_and_whom_they_tell_of_are_counted() -> None:
+def test_senders_and_the_vehicles_that_they_report_are_counted() -> None:
     sharing = listening()
     for k in range(40):
         sharing.take_message(state(f'v{k}/odom', f'v{k}'), EPOCH)
@@ -183,9 +183,9 @@ def test_an_aligned_teller_is_heard_and_what_is_heard_is_not_told_on() -> None:
     flock = MadeUpFlock(Conditions('line', attitude_std=0.03))
     sent: dict[str, set[str]] = {}
 
-    def listen(name: str, word: OdometryState) -> list[OdometryState]:
-        sent.setdefault(name, set()).add(word.child)
-        return [word]
+    def listen(name: str, message: OdometryState) -> list[OdometryState]:
+        sent.setdefault(name, set()).add(message.child)
+        return [message]
     flock.spoil = listen
     flock.run(8.0)
     assert sent == {f'follower_{k}': {f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER}
@@ -217,7 +217,7 @@ def garbage(draw: Any) -> OdometryState | None:
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 @settings(max_examples=150)
-@given(st.lists(st.tuples(st.sampled_from(['own', 'seen', 'word']), garbage(), STAMPS),
+@given(st.lists(st.tuples(st.sampled_from(['own', 'seen', 'message']), garbage(), STAMPS),
                 max_size=12))
 def test_no_nonsense_breaks_it_or_comes_out_of_it(events: list[Any]) -> None:
     sharing = listening()

@@ -44,8 +44,8 @@ class Rig(Driven):
 
     def __init__(self) -> None:
         super().__init__(Planner(parameter_overrides=overrides(
-            use_sim_time=True, odom_twist_frame='child')))  # it stands still and says it moves
-        self.word = 'INACTIVE'  # what the bridge repeats
+            use_sim_time=True, odom_twist_frame='child')))  # it stands still and reports a motion
+        self.bridge_state = 'INACTIVE'  # repeated by the bridge
         self.commands = self.sent['command/trajectory']
         self.give('camera_info', CameraInfo(width=640, height=480, k=CAMERA))
         self.run(0.2, None)
@@ -66,7 +66,7 @@ class Rig(Driven):
                 self.give(topic, to_odometry(
                     stamp, frame, 'leader' if topic == 'neighbors' else 'follower_2', leader,
                     IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
-            self.give('mavlink_bridge/state', String(data=self.word))
+            self.give('mavlink_bridge/state', String(data=self.bridge_state))
             if looking:
                 self.give('neighbors/frames', Header(stamp=stamp, frame_id=frame))
             self.pass_time(self.now + STEP)
@@ -76,7 +76,7 @@ class Rig(Driven):
 
     def fly(self, **options: Any) -> None:
         """Engage with odometry and a leader in view, and forget how it came to that."""
-        self.word = 'ACTIVE'
+        self.bridge_state = 'ACTIVE'
         self.run(0.5, **options)
         self.engage()
         self.run(0.5, **options)
@@ -98,18 +98,18 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(ri
     message = rig.engage()
     assert message.startswith('engaged; waiting for: the bridge: INACTIVE')
     assert message.endswith('; no neighbor seen yet')
-    rig.word = 'READY: waiting for OFFBOARD'
+    rig.bridge_state = 'READY: waiting for OFFBOARD'
     rig.run(0.3)
     assert rig.engage().startswith('already engaged; waiting for: the bridge: READY')
     assert 'IDLE: engaged, waiting for the bridge' in rig.problems()
     assert (rig.state, rig.commands) == ('IDLE', [])
-    rig.word = 'ACTIVE'
+    rig.bridge_state = 'ACTIVE'
     rig.run(0.2)
     assert rig.commands and rig.state == 'TRACK'
-    rig.word = 'TAKEN_OVER: the pilot switched to Position'
+    rig.bridge_state = 'TAKEN_OVER: the pilot switched to Position'
     rig.run(0.2)
     assert rig.state == 'IDLE' and 'not engaged: the pilot took over' in rig.values['reason']
-    rig.word = 'ACTIVE'
+    rig.bridge_state = 'ACTIVE'
     rig.commands.clear()
     rig.run(0.3)
     assert (rig.state, rig.commands) == ('IDLE', [])
@@ -207,7 +207,7 @@ def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig
         u = rig.acceleration()
         # Too far, it is bounded by the lowered limit; separation keeps the a_max of the start.
         assert np.linalg.norm(u) <= 0.1 if distance > 2.0 else u[0] < -0.5
-    rig.word = 'READY'
+    rig.bridge_state = 'READY'
     rig.run(0.1)
     assert rig.set(v_max=0.5, a_max=2.5, guard=False) == ''
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Projection by trying all candidates: slow, but plainly right. The planner's is held to it.
+Projection by trying all candidates: slow, but plainly right: the reference for the planner's.
 
 The best point within some bounds is a corner, or the best point of one boundary alone, or the
 goal itself. All of them are tried, for every search anew.

@@ -150,7 +150,7 @@ class Flight:
 
 
 def taken_off() -> Flight:
-    """Return a flight engaged on the ground, flown to 2.5 m by somebody else."""
+    """Return a flight engaged on the ground, flown to 2.5 m by the pilot."""
     flight = Flight()
     flight.bridge('INACTIVE: offboard not requested')
     flight.tick()

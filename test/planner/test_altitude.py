@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The altitude follows the neighbour's within its bounds, and takes up what the thrust errs by."""
+"""The altitude follows the neighbour's within its bounds, and offsets errors of the thrust."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
     assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
 
 
-def test_where_nobody_knows_the_ground_it_does_not_go_below_where_it_began() -> None:
+def test_without_a_known_ground_it_does_not_go_below_where_it_began() -> None:
     altitude = Altitude.begun(me(3.0), None, PARAMS)
     assert followed(altitude, leader(1.0), 10.0).held == 3.0
 

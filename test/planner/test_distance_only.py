@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Of whom only the distance is known: kept clear of along the line of the loss, never followed."""
+"""A neighbour of which only the distance is known: kept clear of, never followed."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_distance_is_known_where_the_line_is_and_the_rest_is_not(
     assert not distance_known(n, None, PARAMS.max_position_std)
 
 
-def test_nobody_is_on_a_sphere_around_whoever_touches_him() -> None:
+def test_a_neighbor_at_the_own_place_is_on_no_sphere() -> None:
     n = seen(0.0, (0.0, 0.0, 2.0), position_covariance=np.eye(3))
     assert not distance_known(n, own(), PARAMS.max_position_std)
     assert clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS) == []
@@ -120,7 +120,7 @@ class Ranging(Follower):
         return decision
 
 
-def test_of_whom_only_the_distance_is_known_is_not_followed() -> None:
+def test_a_neighbor_of_which_only_the_distance_is_known_is_not_followed() -> None:
     follower = Ranging()
     decisions = [follower.unseen(0.4) for _ in range(40)]
     assert decisions[-1].state is State.HOLD

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The guard's command is the nearest one that its bounds and the limits allow, whatever comes."""
+"""The guard's command is the nearest one that its bounds and the limits allow, for any input."""
 
 from __future__ import annotations
 

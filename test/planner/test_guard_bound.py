@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How far the guard lets a leader come that does what nobody knows: the bound of docs/guard.md."""
+"""How near a leader with an unknown acceleration can come: the bound of docs/guard.md."""
 
 from __future__ import annotations
 
@@ -87,4 +87,4 @@ def test_no_leader_comes_nearer_than_the_bound_says(
     gap = least_gap(unknown, delay, velocity_error, range_error, side)
     assert gap >= -allowed - 0.01  # the motion is stepped
     if unknown >= 0.2 and delay == 0.0:
-        assert gap < -0.3 * allowed  # and the bound says something
+        assert gap < -0.3 * allowed  # and the bound is not far off

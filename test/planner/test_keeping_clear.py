@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Downwash, fences, and whom one no longer sees: what bounds them ask for, flown by a point."""
+"""Downwash, fences and neighbours out of sight: their bounds, flown by a point."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def pushed(bounds: Callable[[Array, Array], list[Bound]], pull: float = 2.0,
 
 
 @pytest.mark.parametrize('height', [-3.0, -0.5, 0.0, 1.2])
-def test_nobody_flies_above_or_below_another(height: float) -> None:
+def test_no_vehicle_flies_above_or_below_another(height: float) -> None:
     """Drawn towards it as hard as it can, it stays beside it, whatever the height."""
     leader = np.array([3.0, 0.1, height])
     for position, _ in pushed(lambda p, v: ordered(
@@ -119,7 +119,7 @@ def test_leaving_the_path_of_one_is_no_way_into_another_out_of_sight(y: float) -
 
 @pytest.mark.parametrize('y', [-0.05, -0.2])
 def test_the_path_that_it_leaves_is_the_one_to_come(y: float) -> None:
-    """The leader turns for a second: its path passes on the other side than its velocity says."""
+    """The leader turns for a second: its path passes on the other side than its velocity shows."""
     follower, v, a = Follower(PARAMS, PARAMS.response_time), np.array([-1.0, -1.0, 0.0]), np.array(
         [0.0, 1.0, 0.0])
 

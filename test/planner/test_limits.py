@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The limits hold for every input there is, and change nothing that is within them."""
+"""The limits hold for every input, and change nothing within them."""
 
 from __future__ import annotations
 

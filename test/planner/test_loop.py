@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the planner's loop makes of stamps, clocks and frames; test_activation has who flies."""
+"""The planner's loop: stamps, clocks and frames; its activation is in test_activation."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(
         age: int, start: int) -> None:
     loop = engaged()
     for now in (start, start + TICK, start + TICK + 1, start + HOUR, start + HOUR + TICK):
-        if now == start + HOUR:  # nobody was seen for so long that it follows again only if asked
+        if now == start + HOUR:  # no neighbor for so long that it follows again only on request
             loop.engage(False)
             loop.engage(True)
         command = fly(loop, now, seen=now - age)[1]

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Out of sight: it gets out of the way a little, looks round, and follows again in time only."""
+"""A leader out of sight: retreat, search, and following again within a time."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def lost(distance: float = 1.6, closing: float = 0.4, params: PlannerParams = PA
     return follower
 
 
-def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
+def test_out_of_sight_it_retreats_so_far_then_hovers_and_warns() -> None:
     follower = lost()
-    begin, said, heights = follower.position, [], []
+    begin, warned, heights = follower.position, [], []
     for _ in range(250):
         decision = follower.tick()
-        said.append(decision.warnings)
+        warned.append(decision.warnings)
         heights.append(follower.position[2])
     assert decision.state is State.HOLD
     # What it moved while the leader was still predicted comes on top.
@@ -56,8 +56,8 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     assert most - 0.2 < math.dist(begin, follower.position) < most + 0.2
     assert abs(follower.position[1]) > 0.5  # beside the path of the leader
     assert np.linalg.norm(follower.velocity) < 0.02
-    assert 'out of the way of a neighbor out of sight' in said[-1][0]
-    assert not said[0]
+    assert 'out of the way of a neighbor out of sight' in warned[-1][0]
+    assert not warned[0]
     assert min(heights) > 2.0 - 0.01  # never descending
 
 
@@ -86,7 +86,7 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
 
 @pytest.mark.parametrize(('reported', 'least', 'most'), [(0.05, 0.0, 0.001), (0.2, 0.09, 0.11),
                                                      (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
-def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(reported: float, least: float,
+def test_an_acceleration_counts_as_far_as_it_is_more_than_noise(reported: float, least: float,
                                                                      most: float) -> None:
     estimated = expected(seen(), np.array([0.0, -reported, 0.0]), 0.1, PARAMS).acceleration
     assert least <= -estimated[1] <= most
@@ -147,7 +147,7 @@ def test_without_a_known_place_after_a_jump_of_the_odometry_it_soon_stops(speed:
 
 
 @pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])
-@pytest.mark.parametrize('fault', ['nobody seen', 'no odometry', 'no image'])
+@pytest.mark.parametrize('fault', ['no neighbor', 'no odometry', 'no image'])
 def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str) -> None:
     """Whatever keeps it from following: a planner that hovers for ever ends no flight."""
     memory, now, end = Memory(), 0.0, PARAMS.resume_timeout
@@ -165,7 +165,8 @@ def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str)
             assert decision.state is (State.HOLD if seen_before else State.SEARCH)
             assert decision.acceleration is None and decision.yaw is None
             assert decision.reason.startswith(
-                'nobody followed for more than 30 s: sends no more commands, call planner/engage')
+                'no neighbor followed for more than 30 s: sends no more commands, '
+                'call planner/engage')
         elif now < end - 0.15 and fault != 'no odometry':
             assert decision.acceleration is not None
     assert memory.pending == pytest.approx(np.zeros(3))

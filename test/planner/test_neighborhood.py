@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whom a vehicle attends to: the edges that it chooses of the graph, and whom it faces."""
+"""Neighbor selection: the own edges of the graph, and the neighbor that the vehicle faces."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ def test_the_graph_is_connected_and_mutual_where_all_is_known(seed: int, count: 
 
 @pytest.mark.parametrize(('nearer', 'kept'), [(1.0, True), (HELD - 0.01, True),
                                               (HELD + 0.01, False)])
-def test_an_edge_goes_when_somebody_is_clearly_nearer_to_both(nearer: float, kept: bool) -> None:
+def test_an_edge_goes_when_another_is_clearly_nearer_to_both(nearer: float, kept: bool) -> None:
     far = at('far', 3.0, 0.0, 0.0)
     between = at('between', 1.5, ((3.0 / nearer) ** 2 - 2.25) ** 0.5, 0.0)
     assert ('far' in edges({'far'}, own(), [far, between], PARAMS)) == kept
     assert ('far' in edges(set(), own(), [far, between], PARAMS)) == (nearer == 1.0)
 
 
-def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> None:
+def test_the_only_leader_in_sight_keeps_its_edge_whatever_is_received() -> None:
     leader = at('leader', 3.0, 0.0, 0.0)
     between = at('follower_2', 1.5, 0.0, 0.0, received=True)
     assert edges(set(), own(), [leader, between], PARAMS) == {'leader', 'follower_2'}
@@ -95,7 +95,7 @@ def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> Non
     assert edges(set(), own(), [leader, between, other], PARAMS) == {'follower_2', 'follower_3'}
 
 
-def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
+def test_one_to_avoid_has_no_edge_and_removes_none() -> None:
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0, role=AVOID)]
     assert edges(set(), own(), flock, PARAMS) == {'leader'}
     neighbors = gathered(Memory(), own(), flock, PARAMS, 0.1)
@@ -103,7 +103,7 @@ def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
 
 
 @pytest.mark.parametrize(('before', 'expected'), [('', 'b'), ('a', 'a'), ('b', 'b')])
-def test_whom_it_faces_changes_only_for_one_clearly_nearer(before: str, expected: str) -> None:
+def test_the_faced_neighbor_changes_for_one_clearly_nearer(before: str, expected: str) -> None:
     a, b, near = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0), at('c', -1.5, 0.0, 0.0)
     for flock, found in (([a, b], expected), ([a, b, near], 'c')):
         faced = gathered(Memory(faced=before), own(), flock, PARAMS, 0.1).faced

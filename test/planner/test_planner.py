@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The planner's state machine, and what one step commands in each of its states."""
+"""The planner's state machine, and the command of one step in each state."""
 
 from __future__ import annotations
 
@@ -379,14 +379,14 @@ def test_drag_does_not_keep_it_below_its_largest_speed() -> None:
     assert v[0] > 0.485
 
 
-@pytest.mark.parametrize(('it', 'said'), [
+@pytest.mark.parametrize(('it', 'warning'), [
     (leader(0.0, (2.0, 0.0, 2.0), (0.9, 0.0, 0.0)),
      'leader at 0.9 m/s, v_max 0.5 m/s: cannot keep up'),
     (leader(0.0, (0.8, 0.0, 2.0)), 'leader 0.80 m away, the band begins at 1.00 m: too close'),
     (leader(0.0, (3.2, 0.0, 2.0)), 'leader 3.20 m away, the band ends at 2.83 m: too far'),
 ])
-def test_what_the_follower_cannot_help_is_said(it: Neighbor, said: str) -> None:
-    assert decide(0.0, it).warnings == (said,)
+def test_a_motion_beyond_its_means_is_a_warning(it: Neighbor, warning: str) -> None:
+    assert decide(0.0, it).warnings == (warning,)
     assert decide(0.0, leader()).warnings == ()
 
 
@@ -462,7 +462,7 @@ def test_default_law_is_that_of_the_papers_flights() -> None:
     assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
 
 
-def test_a_leader_suddenly_elsewhere_is_not_believed_until_the_old_one_is_too_old() -> None:
+def test_a_leader_suddenly_elsewhere_is_not_used_until_the_old_one_is_too_old() -> None:
     memory = tracking()
     for tick in range(1, 4):
         memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Roles and hulls: who is followed, who only kept clear of, and how large everybody is."""
+"""Roles and hulls: vehicles to follow, vehicles to keep clear of, and their sizes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_second_print_of_the_leaders_marker_is_avoided_and_never_followed() ->
 
 
 @pytest.mark.parametrize('following', [False, True])
-def test_one_to_avoid_is_kept_clear_of_whether_or_not_somebody_is_followed(
+def test_one_to_avoid_is_kept_clear_of_whether_or_not_another_is_followed(
         following: bool) -> None:
     near = seen('stranger', 0.0, 1.1, 0.0, (-0.3, 0.0, 0.0))
     leader = [seen('leader', 0.0, 0.0, 2.1)] if following else []
@@ -118,8 +118,8 @@ def test_each_vehicle_of_the_file_that_is_neither_seen_nor_received_is_reported(
     params = PlannerParams(vehicles={
         'leader': Member(), 'a': Member('follower'), 'b': Member('follower'), **STRANGER})
     leader, beside = seen('leader', 0.0, 2.0), seen('a', 0.0, 1.0, 1.8)
-    heard = beside._replace(received=True)
-    for around, missing in (([leader, beside], 'b'), ([leader, heard], 'b'),
+    received = beside._replace(received=True)
+    for around, missing in (([leader, beside], 'b'), ([leader, received], 'b'),
                             ([leader], 'ab')):
         assert decide(*around, params=params)[1].warnings == tuple(
             f'{name} neither seen nor received, not kept clear of' for name in missing)

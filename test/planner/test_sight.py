@@ -12,13 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What keeps the neighbour in the camera's view is what geometry says, and no more."""
+"""The field of view: bounds that keep the neighbour in it, and occlusion; then it brakes."""
 
 from __future__ import annotations
 
 import math
 from types import SimpleNamespace
 
+from flown import Follower, own, seen
 from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
@@ -32,10 +33,11 @@ from flock_follower.planner.bounds import (
     sight_bounds,
 )
 from flock_follower.planner.guard import ordered
-from flock_follower.planner.inputs import Expected, Neighbor, OwnState
+from flock_follower.planner.inputs import Expected, Neighbor
 from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, occlusion, WIDEST
+from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
 
 PARAMS = PlannerParams(v_max=20.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -77,9 +79,7 @@ def test_a_fisheye_sees_as_far_as_its_model_says(several: bool) -> None:
     assert (lowered.left, lowered.right) == pytest.approx((WIDEST, WIDEST))
     assert (lowered.up, lowered.down) == pytest.approx((240.0 / 190.0 - 0.2, WIDEST))
     # A leader at 60 degrees that is not found is occluded: it has not left the image.
-    leader = Neighbor('leader', 0.0, np.array([1.0, 1.7, 0.0]), np.zeros(3))
-    me = OwnState(0.1, np.zeros(3), np.zeros(3), 0.0)
-    assert occlusion(None, leader, me, [0.03, 0.06, 0.09], (lowered,), 0.0)
+    assert occlusion(None, leader(0.7, 1.0, 1.7), ME, frames(0.8, 0.9, 1.0), (lowered,), 0.0)
 
 
 def test_a_camera_that_looks_down_sees_more_below() -> None:
@@ -167,7 +167,79 @@ def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:
         assert -faster.least == pytest.approx(GRAVITY * math.tan(up - 0.05))
 
 
-def test_a_camera_that_looks_down_keeps_nobody_in_sight() -> None:
+def test_a_camera_that_looks_down_keeps_no_neighbor_in_sight() -> None:
     for model in ('plumb_bob', 'equidistant'):
         with pytest.raises(ValueError, match='a camera that looks up or down'):
             FieldOfView.of_camera(info(model=model), [0.0, 1.5, 0.0], True)
+
+
+AHEAD = (FieldOfView(0.5, 0.5, 0.35, 0.35),)
+ME = own(1.0)
+
+
+def leader(stamp: float, x: float = 2.0, y: float = 0.0, z: float = 2.0) -> Neighbor:
+    return seen(stamp, (x, y, z))
+
+
+def frames(*stamps: float) -> list[float]:
+    return [0.6, 0.7, *stamps]
+
+
+def test_three_images_in_a_row_without_it_make_it_occluded() -> None:
+    assert occlusion(None, leader(0.7), ME, frames(0.8, 0.9), AHEAD, 0.0) is None
+    assert occlusion(None, leader(0.7), ME, frames(0.8, 0.9, 1.0), AHEAD, 0.0) == Occlusion(0.7)
+    # What is not ahead of the camera, or too near to the edge, has left the image.
+    for beside in (leader(0.7, y=1.0), leader(0.7, y=-1.0), leader(0.7, z=2.8),
+                   leader(0.7, z=1.2), leader(0.7, x=-2.0), leader(0.7, x=0.3)):
+        assert occlusion(None, beside, ME, frames(0.8, 0.9, 1.0), AHEAD, 0.0) is None
+
+
+def test_a_camera_that_is_tilted_by_an_acceleration_looks_elsewhere() -> None:
+    high, images = leader(0.7, z=2.25), frames(0.8, 0.9, 1.0)
+    assert occlusion(None, high, ME, images, AHEAD, 0.0)
+    assert occlusion(None, high, ME, images, AHEAD, 2.5) is None
+    assert occlusion(None, high, ME, images, AHEAD, -2.5)
+
+
+def test_without_a_calibration_or_an_own_sighting_nothing_is_occluded() -> None:
+    images = frames(0.8, 0.9, 1.0)
+    assert occlusion(None, leader(0.7), ME, images, (), 0.0) is None
+    assert occlusion(None, None, ME, images, AHEAD, 0.0) is None
+    reported = seen(0.7, received=True)
+    assert occlusion(None, reported, ME, images, AHEAD, 0.0) is None
+
+
+def test_three_detections_in_a_row_end_it() -> None:
+    before = occlusion(Occlusion(0.2), leader(0.8), ME, frames(0.8), AHEAD, 0.0)
+    assert before == Occlusion(0.2, 0.8)
+    before = occlusion(before, leader(0.9), ME, frames(0.8, 0.9), AHEAD, 0.0)
+    assert before == Occlusion(0.2, 0.8)
+    assert occlusion(before, leader(1.0), ME, frames(0.8, 0.9, 1.0), AHEAD, 0.0) is None
+    assert occlusion(before, leader(0.9), ME, frames(0.8, 0.9, 1.0, 1.1, 1.2), AHEAD, 0.0) == (
+        Occlusion(0.9))
+    assert occlusion(Occlusion(0.7), leader(0.7), ME, frames(0.8), AHEAD, 0.0) == Occlusion(0.7)
+
+
+@pytest.mark.parametrize('heading', [0.0, math.pi / 2.0, math.pi, -math.pi / 2.0])
+def test_of_several_cameras_the_one_that_should_show_it_counts(heading: float) -> None:
+    sides = tuple(FieldOfView(0.6, 0.6, 0.4, 0.4, at) for at in (0.0, math.pi / 2.0, math.pi))
+    there = leader(0.7, 2.0 * math.cos(heading), 2.0 * math.sin(heading))
+    found = occlusion(None, there, ME, frames(0.8, 0.9, 1.0), sides, 0.0)
+    assert (found is not None) == (heading >= 0.0)
+
+
+def test_it_brakes_at_once_and_follows_again() -> None:
+    """Behind a leader that is hidden from 1 to 2 s."""
+    follower, speed, stamps = Follower(PlannerParams(v_max=2.0)), np.array([0.5, 0.0, 0.0]), []
+    follower.velocity, follower.now, states = speed, 0.1, []
+    for tick in range(1, 40):
+        now = follower.now
+        stamps += [now - 0.1 + 0.033 * k for k in range(1, 4)]
+        decision = follower.tick(*[
+            seen(s, np.array([2.1, 0.0, 2.0]) + s * speed, speed) for s in stamps[-3:]
+            if s < 1.0 or s > 2.0], looked=now, view=AHEAD, frames=stamps[-20:])
+        states.append(decision.state)
+        if tick == 19:
+            assert abs(follower.velocity[0]) < 0.15
+    assert states[:10] == [State.TRACK] * 10 and states[10:20] == [State.HOLD] * 10
+    assert State.TRACK in states[20:23] and states[-1] is State.TRACK

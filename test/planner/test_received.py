@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What others tell of a neighbour: used where the eyes know nothing, and told as what it is."""
+"""Received states of neighbours, used without a sighting, and the search for a lost leader."""
 
 from __future__ import annotations
 
-from flown import own, PARAMS, seen
+from flown import Follower, own, PARAMS, seen
 import numpy as np
 import pytest
 
@@ -24,12 +24,12 @@ from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 
 def reported(stamp: float, x: float = 2.0, received: bool = True, name: str = 'leader',
-         variance: float = 0.0, speed: float = 0.0) -> Neighbor:
+             variance: float = 0.0, speed: float = 0.0) -> Neighbor:
     return seen(stamp, (x, 0.0, 2.0), (speed, 0.0, 0.0), name,
                 position_covariance=variance * np.eye(3), received=received)
 
@@ -43,7 +43,7 @@ def place(memory: Memory, name: str = 'leader') -> float:
     return float(memory.neighbors[name].position[0])
 
 
-def test_who_is_seen_freshly_is_never_replaced_by_what_is_heard() -> None:
+def test_a_fresh_sighting_is_never_replaced_by_a_received_state() -> None:
     memory, _ = decide(Memory(), 0.0, reported(0.0, 2.0, received=False))
     memory, decision = decide(memory, 0.3, reported(0.3, 2.4))
     assert place(memory) == 2.0 and decision.rejected == ()
@@ -52,14 +52,14 @@ def test_who_is_seen_freshly_is_never_replaced_by_what_is_heard() -> None:
 
 
 @pytest.mark.parametrize('x', [2.1, 4.0])  # a little, and a jump
-def test_eyes_beat_words_at_once_even_newer_ones(x: float) -> None:
+def test_a_sighting_replaces_a_received_state_at_once_even_a_newer_one(x: float) -> None:
     memory, _ = decide(Memory(), 0.1, reported(0.1, 2.0))
     memory, decision = decide(memory, 0.2, reported(0.05, x, received=False))
     assert place(memory) == x and decision.rejected == ()
-    assert set(memory.flock) == {'leader'}  # nobody at the place that was only told
+    assert set(memory.flock) == {'leader'}  # none at the place that was only received
 
 
-def test_words_are_used_up_to_their_own_age() -> None:
+def test_received_states_are_used_up_to_an_age_of_their_own() -> None:
     memory, states = Memory(), []
     for tick in range(14):
         memory, decision = decide(memory, 0.1 * tick, *([reported(0.0)] if tick == 0 else []))
@@ -76,9 +76,53 @@ def command(variance: float) -> Array:
     return decision.acceleration
 
 
-def test_the_less_sure_a_word_the_farther_away_it_stays() -> None:
+def test_the_less_certain_a_received_state_the_farther_away_it_stays() -> None:
     pushed = [command(variance)[0] for variance in (0.0, 0.02, 0.04, 0.08)]
     assert pushed[0] > -0.3
     assert np.all(np.diff(pushed[:3]) < 0.0) and max(pushed[2:]) < -1.0
     refused = decide(Memory(), 0.0, reported(0.0, variance=0.09))[1]
     assert [r.reason for r in refused.rejected] == ['received estimate too uncertain']
+
+
+FLOCK = PlannerParams(resume_timeout=12.0, vehicles={
+    'leader': Member(), 'behind': Member('follower'), 'ahead': Member('follower')})
+PLACES = {'leader': (2.0, 0.0, 2.0), 'behind': (-1.9, 0.0, 2.0), 'ahead': (2.0, 0.0, 2.0)}
+
+
+def fly(seconds: float, in_sight: str, received: str, follower: Follower | None = None
+        ) -> tuple[Follower, list[Decision]]:
+    """Hover with those seen and received around, the nose where it is commanded to be."""
+    follower, decisions = follower or Follower(FLOCK), []
+    for _ in range(round(seconds / 0.1)):
+        follower.position, follower.velocity = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+        decisions.append(follower.tick(*(
+            seen(follower.now, PLACES[name], name=name, received=name in received.split())
+            for name in (*in_sight.split(), *received.split()))))
+    return follower, decisions
+
+
+def test_after_resume_timeout_it_turns_to_the_one_received() -> None:
+    follower, _ = fly(1.0, 'leader', 'behind')
+    follower, decisions = fly(FLOCK.resume_timeout + 8.0, '', 'behind', follower)
+    assert abs(decisions[-1].yaw or 0.0) == pytest.approx(np.pi, abs=0.05)
+    assert not any('looks for' in warning for warning in decisions[-1].warnings)
+
+
+def test_it_looks_for_a_leader_that_it_only_received_if_no_neighbor_is_in_view() -> None:
+    follower, _ = fly(1.0, 'ahead', 'leader behind')
+    follower, _ = fly(3.0, 'ahead', 'behind', follower)
+    assert not follower.memory.looking  # it stays with the one ahead
+    follower, decisions = fly(3.0, '', 'behind', follower)
+    assert follower.memory.looking and abs(decisions[-1].yaw or 0.0) < 2.0
+
+
+@pytest.mark.parametrize(('in_sight', 'received', 'then_seen', 'then_received'), [
+    ('leader behind', '', 'behind', ''),  # another one is in view: it stays with that
+    ('leader', 'behind', '', 'leader behind'),  # it is received
+    ('ahead', 'behind', '', 'behind')])  # no leader was known
+def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
+                              then_received: str) -> None:
+    follower, _ = fly(1.0, in_sight, received)
+    follower, decisions = fly(3.0, then_seen, then_received, follower)
+    assert not follower.memory.looking
+    assert not any('looks for' in warning for d in decisions for warning in d.warnings)
