@@ -107,8 +107,8 @@ class Edges(NamedTuple):
 
 
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
-                  params: GuardParams,
-                  neighbor_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
+                  params: GuardParams, neighbor_acceleration: ArrayLike = (0.0, 0.0, 0.0),
+                  seen: bool = True) -> list[Bound]:
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
@@ -117,6 +117,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
     :param neighbor_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
+    :param seen: the neighbor is in sight.
     """
     p = np.asarray(offset, dtype=float)
     w = np.asarray(relative_velocity, dtype=float).tolist()
@@ -133,11 +134,11 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
-    bounds = [Bound(n, lowest, SEPARATION, distance)]
+    bounds = [Bound(n, lowest, SEPARATION, distance, seen)]
     if math.isfinite(edges.far):
         speed, slope = params.closing(edges.far - edges.margin - distance)
         highest = common - (rate - speed) / params.T_g - slope * rate
-        bounds.append(Bound(-n, -highest, COHESION, distance))
+        bounds.append(Bound(-n, -highest, COHESION, distance, seen))
     return bounds
 
 
@@ -152,16 +153,16 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     :param radii: sum of its radius and the own one, m.
     """
     inner = Edges.of(params.law, params.guarding)
-    band = inner._replace(near=inner.near + radii, far=inner.far + radii if followed else math.inf,
-                          spread=it.spread, spreading=it.spreading)
-    ways: list[tuple[Array, Edges]] = [(np.ones(3), band)] if seen else []
-    x, y, z = (it.position - position).tolist()
+    band = Edges(inner.near + radii, inner.far + radii if followed else math.inf, inner.margin,
+                 it.spread, it.spreading)
+    offset, rate = position - it.position, velocity - it.velocity
+    bounds = radial_bounds(offset, rate, band, params.guarding, it.acceleration) if seen else []
+    x, y, z = offset.tolist()
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
-        near = (DOWNWASH if seen else 1.0) * inner.near + radii
-        ways.append((LEVEL, band._replace(near=near, far=math.inf)))
-    return [each._replace(seen=seen) for axes, edges in ways for each in radial_bounds(
-        axes * (position - it.position), axes * (velocity - it.velocity), edges, params.guarding,
-        axes * it.acceleration)]
+        level = band._replace(near=(DOWNWASH if seen else 1.0) * inner.near + radii, far=math.inf)
+        bounds += radial_bounds(LEVEL * offset, LEVEL * rate, level, params.guarding,
+                                LEVEL * it.acceleration, seen)
+    return bounds
 
 
 def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
@@ -203,9 +204,8 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     band = inner._replace(
         near=inner.near + params.radius + n.member.radius, far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
-    return [each._replace(seen=sure) for each in radial_bounds(
-        -distance * towards, -rate * towards, band, params.guarding,
-        float(along @ it.acceleration) * towards)]
+    return radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
+                         float(along @ it.acceleration) * towards, sure)
 
 
 def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view: View,

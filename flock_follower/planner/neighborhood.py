@@ -38,7 +38,6 @@ import numpy as np
 
 from flock_follower.flock import neighbor_graph
 from flock_follower.flock.neighbor_graph import graph_law, HELD
-from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.limits import brake, limit_norm
@@ -188,7 +187,7 @@ def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,
     offsets = np.array([_offset(n, me, params) for n in flock])
     differences = np.array([n.velocity - me.velocity for n in flock])
     if len(flock) == 1:
-        law = acceleration(offsets, differences, params.law)
+        law = params.law.command(offsets, differences)
     else:
         share = np.array([neighbors.shares[n.name] for n in flock])
         others = np.array([n.member.role == AVOID for n in flock])
