@@ -90,9 +90,8 @@ class FlockingParams(Checked):
         :param offsets: neighbours' positions minus the own one, (m, n), m.
         :param differences: neighbours' velocities minus the own one, (m, n), m/s.
         """
-        own = np.zeros((1, differences.shape[1]))
-        return sum_over_neighbors(offsets, differences,
-                                  disagreement(np.vstack([own, differences])), self, 'flocking')
+        velocities = np.concatenate([np.zeros((1, differences.shape[1])), differences])
+        return sum_over_neighbors(offsets, differences, disagreement(velocities), self, 'flocking')
 
 
 def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
@@ -183,14 +182,14 @@ def sum_over_neighbors(offsets: Array, differences: Array, scale: float,
     """
     if model not in get_args(Model):
         raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')
-    r2 = np.sum(offsets ** 2, axis=-1, keepdims=True)
+    r2 = (offsets ** 2).sum(axis=-1, keepdims=True)
     u = differences * alignment(r2, params)
     if model != 'cucker_smale':
         pull = -separation(r2, params)
         if model == 'flocking':
             pull += cohesion(r2, params)
         u += scale * pull * offsets
-    return np.sum(u, axis=-2)
+    return u.sum(axis=-2)
 
 
 def checked(positions: ArrayLike, velocities: ArrayLike,

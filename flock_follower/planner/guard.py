@@ -117,8 +117,8 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach, leaving = (-(x * float(v[0]) + y * float(v[1])) / max(level, SHORTEST)
-                          for v in (n.velocity, me.velocity))
+        approach, leaving = (-(x * vx + y * vy) / max(level, SHORTEST) for vx, vy, _ in (
+            n.velocity.tolist(), me.velocity.tolist()))
         needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         leaving = 0.0 if beneath else max(approach, needed, leaving if needed > 0.0 else 0.0)
@@ -230,7 +230,7 @@ def constrain(nominal: Array, vertical: float, climb: float, memory: Memory, sce
                           command.separation_axis)
     reason = command.reason if final.reason in command.reason else ', '.join(
         filter(None, [final.reason, command.reason]))
-    return command._replace(acceleration=final.acceleration, reason=reason)
+    return LimitedCommand(final.acceleration, reason, command.separation_axis)
 
 
 def _lost_to_drag(memory: Memory, velocity: Array, params: PlannerParams) -> float:

@@ -163,7 +163,7 @@ def limit_horizontal(nominal: ArrayLike, vertical: float, velocity: ArrayLike, a
     if target.tolist() != reached.tolist():
         horizontal = limit_norm((target - v[:2]) / period, strongest)
         reasons.append('v_max')
-    command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
+    command = limit_command([*horizontal.tolist(), vertical], v, a_max, v_max, period)
     binding = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(binding) if 'finite' not in command.reason else command.reason
     return LimitedCommand(command.acceleration, reason)

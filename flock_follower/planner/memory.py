@@ -29,10 +29,10 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.messages import FUTURE_TOLERANCE, ODOMETRY_JUMP
 from flock_follower.planner.inputs import (
-    at,
     distance_known,
     far,
     implausible,
+    Moving,
     Neighbor,
     OwnState,
     Rejection,
@@ -196,7 +196,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
         elif me is None or own.stamp >= me.stamp:
             if me is not None and own.relative is not me.relative:
                 memory, me, jumped = memory.in_frame_of(own, now, params), own, own.stamp
-            jump = 0.0 if me is None else math.dist(own.position, at(me, own.stamp).position)
+            jump = 0.0 if me is None else off(own, me)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
@@ -247,6 +247,6 @@ def longest(n: Neighbor, params: PlannerParams) -> float:
     return params.heard_timeout if n.received else params.predict_timeout
 
 
-def off(n: Neighbor, before: Neighbor) -> float:
-    """Return the distance of a neighbor from its prediction by the estimate before, m."""
-    return math.dist(n.position, at(before, n.stamp).position)
+def off(now: Moving, before: Moving) -> float:
+    """Return the distance of a state from its prediction by the state before, m."""
+    return math.dist(now.position, before.position + (now.stamp - before.stamp) * before.velocity)

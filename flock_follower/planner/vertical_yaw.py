@@ -183,12 +183,12 @@ LOOK_THERE = 0.5  # s for which the vehicle faces that place first
 def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
            elapsed: float) -> float:
     """Return the yaw that turns from the last one to the place where a neighbour will soon be."""
-    x, y, _ = neighbor.position - me.position
+    x, y, _ = (neighbor.position - me.position).tolist()
     distance = math.hypot(x, y)
     if distance < OVERHEAD:
         return last
-    w = neighbor.velocity - me.velocity
-    passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
+    vx, vy, _ = (neighbor.velocity - me.velocity).tolist()
+    passing = (x * vy - y * vx) / distance ** 2  # rad/s
     ahead = YAW_LEAD * min(max(passing, -params.yaw_rate_max), params.yaw_rate_max)
     return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
 
