@@ -169,7 +169,7 @@ def cohesion(r2: Array, params: FlockingParams) -> Array:
 
 def disagreement(velocities: Array) -> float:
     """Return L, m/s: the length of the velocities' (k, n) deviation from their mean."""
-    return float(np.linalg.norm(velocities - velocities.mean(axis=0))) if len(velocities) else 0.0
+    return float(np.linalg.norm(velocities - velocities.sum(axis=0) / max(len(velocities), 1)))
 
 
 def sum_over_neighbors(offsets: Array, differences: Array, scale: float,

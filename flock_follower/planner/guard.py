@@ -300,10 +300,9 @@ def _expected(n: Neighbor, memory: Memory, me: OwnState,
     """Return the prediction of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp
     it = expected(n, memory.acceleration(n), age, params)
-    offset = it.position - me.position
-    distance = math.hypot(*offset.tolist())
-    if not n.received or distance == 0.0:  # errors of own sightings are part of the margin
+    if not n.received:  # errors of own sightings are part of the margin
         return it
-    along = offset / distance
+    offset = it.position - me.position
+    along = offset / max(math.hypot(*offset.tolist()), SHORTEST)
     variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
     return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))

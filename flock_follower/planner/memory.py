@@ -189,13 +189,14 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
         memory = Memory(given_up=memory.given_up)
-    me, jumped = memory.own, memory.jumped
+    me, jumped, drag = memory.own, memory.jumped, memory.drag
     if own is not None:
         if problem := implausible(own) or untimely(own.stamp, now, params.odom_timeout):
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif me is None or own.stamp >= me.stamp:
             if me is not None and own.relative is not me.relative:
-                memory, me, jumped = memory.in_frame_of(own, now, params), own, own.stamp
+                memory, me = memory.in_frame_of(own, now, params), own
+                jumped, drag = own.stamp, memory.drag
             jump = 0.0 if me is None else off(own, me)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
@@ -203,7 +204,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 memory = memory._replace(neighbors={}, flock={}, ranged={}, altitude=None,
                                          lost=None, leader=None, looking=False)
             if me is not None and jump <= ODOMETRY_JUMP and own.stamp > me.stamp:
-                memory = memory._replace(drag=_drag(memory, me, own, params))
+                drag = _drag(memory, me, own, params)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
@@ -231,8 +232,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 kept[n.name] = n
     ranged = {name: n for name, n in ranged.items()
               if name not in kept or n.stamp > kept[name].stamp}
-    return memory._replace(now=now, own=me, neighbors=kept, ranged=ranged,
-                           jumped=jumped), tuple(rejected)
+    return memory._replace(now=now, own=me, neighbors=kept, ranged=ranged, jumped=jumped,
+                           drag=drag), tuple(rejected)
 
 
 def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams) -> Array:

@@ -173,14 +173,12 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, coming: float,
         return altitude.controlled(me, params, elapsed, coming=coming)
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
                                if me.stamp - n.stamp <= params.coast_timeout]
-    raised = altitude
+    raised = -math.inf
     if memory.lost is not None and not scene.blinded:
-        above = overflight(memory.lost, me.position, altitude.held, params)
-        raised = altitude._replace(held=max(altitude.held, min(above, altitude.highest)))
-    controlled, vertical = raised.controlled(
-        me, params, elapsed, *climb_range(near, me, params), coming)
-    # The climb lasts as long as the loss: the next one begins at the altitude held before.
-    return controlled._replace(held=altitude.held), vertical
+        # The climb lasts as long as the loss: the next one begins at the altitude held before.
+        raised = min(overflight(memory.lost, me.position, altitude.held, params), altitude.highest)
+    return altitude.controlled(
+        me, params, elapsed, *climb_range(near, me, params), coming, raised)
 
 
 def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,

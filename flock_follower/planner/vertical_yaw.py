@@ -113,19 +113,20 @@ class Altitude(NamedTuple):
         return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
     def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
-                   least: float = -math.inf, most: float = math.inf,
-                   coming: float = 0.0) -> tuple[Altitude, float]:
+                   least: float = -math.inf, most: float = math.inf, coming: float = 0.0,
+                   raised: float = -math.inf) -> tuple[Altitude, float]:
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
         :param least: vertical speed, m/s, that neighbors permit; :param most: largest one. The
             lowest and the highest altitude have priority.
         :param coming: vertical velocity, m/s, that is commanded and not yet flown.
+        :param raised: altitude, m, at least to hold now, without a change of ``held``.
         """
         w = params.altitude_frequency
         strongest = min(params.max_vertical_acceleration, params.a_max)
         z, rate = float(me.position[2]), float(me.velocity[2])
-        error = self.held - z
+        error = max(self.held, raised) - z
         speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
         # Until a command acts the vehicle keeps its velocity.
         reached = z + rate * params.response_time
