@@ -249,5 +249,5 @@ class PlannerLoop:
 
 def _yaw(n: OdometryState) -> float | None:
     """Return a neighbour's yaw, rad, or None if it is not known."""
-    known = 0.0 <= n.pose_covariance[5, 5] <= MAX_YAW_STD ** 2  # NaN is not
-    return yaw_from_quaternion(n.quaternion) if known else None
+    return yaw_from_quaternion(n.quaternion) if (
+        0.0 <= n.pose_covariance[5, 5] <= MAX_YAW_STD ** 2) else None  # NaN is not known

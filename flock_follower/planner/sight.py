@@ -78,8 +78,7 @@ class FieldOfView(NamedTuple):
         ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
         sides = sides @ ahead.T
         if fisheye and ahead[0, 0] > math.cos(WIDEST):
-            off = np.hypot(sides[:, 1], sides[:, 2])
-            sides[:, 0] = np.maximum(sides[:, 0], off / math.tan(WIDEST))
+            sides[:, 0] = np.maximum(sides[:, 0], np.hypot(*sides[:, 1:].T) / math.tan(WIDEST))
         if np.any(sides[:, 0] <= 0.0):
             raise ValueError(
                 f'rpy = {angles}: a camera that looks up or down: the neighbor is not kept in its '
