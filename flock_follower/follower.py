@@ -16,8 +16,8 @@
 One follower as one object: events in, each with its time; estimates, commands and setpoints out.
 
 Perception, planner and setpoint control are the same three objects that the nodes drive, each in
-a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated
-one in ``flights``. Computing takes no time, neither does passing messages on: an estimate reaches
+a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``. ``flights``
+uses planner and control, with a simulated clock. Computing takes no time, neither does passing messages on: an estimate reaches
 the planner at the moment its image, or the odometry that image waited for, came; a command
 reaches the control at the tick.
 
