@@ -195,7 +195,7 @@ class Follower:
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
         """Take the status of the vehicle."""
         self.advance(time)
-        self._control.see(status, self._seconds(), airborne)
+        self._control.take_status(status, self._seconds(), airborne)
         self._announce_bridge_state()
 
     def estimate(self, time: int, velocity: Array) -> None:

@@ -67,6 +67,12 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
+#: Values of parameters that planner and gate have in common.
+A_MAX = Range(0.1, 20.0, 'm/s^2')
+V_MAX = Range(0.05, 20.0, 'm/s')
+ODOM_TIMEOUT = Range(0.05, 1.0, 's')
+
+
 def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,
               live: bool | None = None) -> Any:
     """

@@ -40,7 +40,14 @@ from flock_follower.geometry import (
     Transform,
     unit_quaternion_to_matrix,
 )
-from flock_follower.messages import MAX_JUMP, NANOSECONDS, OdometryState, read_stamp, SANE
+from flock_follower.messages import (
+    MAX_JUMP,
+    NANOSECONDS,
+    ODOMETRY_STD,
+    OdometryState,
+    read_stamp,
+    SANE,
+)
 from flock_follower.odometry.derivation import (
     AUTO,
     CHILD,
@@ -87,7 +94,7 @@ class SourceParams(Checked):
         'frame of the velocity in odom: child as in REP-105, or odom; none: derive the velocity '
         'from the positions; auto: detect the frame', live=False)
     std: tuple[float, ...] = parameter(
-        (0.1, 0.05, 0.1, 0.05), Range(0.0, 100.0, above=True),
+        ODOMETRY_STD, Range(0.0, 100.0, above=True),
         'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
         'rad/s, if odom has no covariances', live=False)
 

@@ -104,8 +104,8 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 
     :param acceleration: nominal acceleration (3,), m/s^2.
     :param velocity: present velocity (3,), m/s, in the same frame.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
-    :param v_max: largest speed, m/s, in [0, 100].
+    :param a_max: largest acceleration, m/s^2, above 0.
+    :param v_max: largest speed, m/s.
     :param period: time T the acceleration will be held for, s, in (0, 10].
     :param axis: unit vector (3,) along which the acceleration is cut last, because it keeps clear
         of a neighbour: within the limits, as much of it is left as there can be.
@@ -283,7 +283,7 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     in a direction that may be wrong is worse than none.
 
     :param velocity: present velocity (3,), m/s.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
+    :param a_max: largest acceleration, m/s^2, above 0.
     :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
     """
     # Shortened before the division, which could overflow, and after it, which rounds.
