@@ -62,10 +62,10 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
-from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
+from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT
 from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
@@ -309,7 +309,7 @@ class Simulator(FlockNode):
         assert isinstance(self._vehicle, ExternalVehicle)
         self._vehicle.offboard = message.data.startswith('ACTIVE')
         if self._early is None and 0.0 <= self._flight.time < self._duration and (
-                not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
+                not message.data.startswith((ACTIVE, NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
     def _problem(self, now: float) -> Problem | None:

@@ -28,14 +28,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import (
-    Array,
-    frd_to_flu,
-    ned_to_enu,
-    normalize_quaternion,
-    quaternion_ned_frd_to_enu_flu,
-    slerp,
-)
+from flock_follower.geometry import Array, ned_to_enu, slerp
+from flock_follower.mavlink.telemetry import decode_attitude
 
 SIM_STATE: Final[str] = 'SIM_STATE'
 HIL_STATE: Final[str] = 'HIL_STATE_QUATERNION'
@@ -101,7 +95,7 @@ class ExternalMotion:
         elif kind == ESTIMATE and self.estimated:
             self._estimate(message, now)
         elif kind == ATTITUDE and self.estimated:
-            self._turned = _attitude(
+            self._turned = decode_attitude(
                 [message.q1, message.q2, message.q3, message.q4],
                 (message.rollspeed, message.pitchspeed, message.yawspeed))
 
@@ -162,7 +156,7 @@ class ExternalMotion:
             rates = message.rollspeed, message.pitchspeed, message.yawspeed
         if not latitude and not longitude:
             return  # not simulated yet, or an ArduPilot before 4.3, whose floats are too coarse
-        turned = _attitude(quaternion, rates)
+        turned = decode_attitude(quaternion, rates)
         if turned is not None:
             self.source = message.get_type()
             self._place(now, self._local(latitude * 1e-7, longitude * 1e-7, height),
@@ -198,13 +192,3 @@ class ExternalMotion:
                 share = 1.0 - math.exp(-elapsed / SMOOTHING)
                 position = expected + share * (reported - expected)
         self.add(Motion(now, position, velocity, *turned))
-
-
-def _attitude(wxyz: list[float],
-              rates: tuple[float, float, float]) -> tuple[Array, Array] | None:
-    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are invalid."""
-    try:
-        quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
-    except ValueError:
-        return None
-    return quaternion, np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)

@@ -29,6 +29,8 @@ import math
 import re
 from typing import Final
 
+from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT, READY
+
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.
 DISCOVERY: Final[float] = 8.0
@@ -81,19 +83,19 @@ class Reports:
     @property
     def vehicle_known(self) -> bool:
         """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
-        return not self.bridge.startswith('NO_AUTOPILOT') and all(
+        return not self.bridge.startswith(NO_AUTOPILOT) and all(
             self.value('mavlink_bridge', key) for key in ('armed', 'flying'))
 
     @property
     def streams(self) -> bool:
         """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
-        return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
+        return self.bridge.removeprefix(f'{NO_AUTOPILOT}: lost, ').startswith((READY, ACTIVE))
 
     def due(self) -> str:
         """Return the first step whose result is not reported, '' while the vehicle follows."""
         reached = {'arm': self.value('mavlink_bridge', 'armed') == 'True',
                    'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
-                   'offboard': self.bridge == 'ACTIVE',
+                   'offboard': self.bridge == ACTIVE,
                    'engage': self.value('planner', 'engaged') == 'True'}
         return next((step for step, done in reached.items() if not done), '')
 

@@ -18,7 +18,7 @@ import math
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.gcs_report import GroundStationReport
+from flock_follower.mavlink.status_texts import GroundStationReport
 
 INFO, WARNING, CRITICAL = (mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_WARNING,
                            mavlink.MAV_SEVERITY_CRITICAL)
