@@ -339,7 +339,7 @@ def test_a_slow_link_heights_that_differ_and_a_landing_by_the_bridge_are_reporte
         return all(part in found for part in (
             'LOCAL_POSITION_NED comes at 0 Hz of 50 requested',
             'nothing came from the autopilot for 0.',
-            'height above home as 5.0 m, the barometer says 2.0 m',
+            'height above home as 5.0 m, the barometer measures 2.0 m',
             'the bridge requests land: no valid velocity'))
     bench.wait(reported)
     bench.beat(armed=False)
