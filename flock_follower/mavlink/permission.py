@@ -18,7 +18,7 @@ State machine of the permission to fly: which setpoints the bridge may send.
 Only the service ``mavlink_bridge/offboard`` gives permission. The permission ends with its flight.
 
 ===========  ==================================  ================================================
-phase        what the bridge sends               announced on ``mavlink_bridge/state`` as
+phase        the bridge sends                    announced on ``mavlink_bridge/state`` as
 ===========  ==================================  ================================================
 INACTIVE     nothing                             INACTIVE
 READY        setpoints that hold it still        READY

@@ -105,7 +105,7 @@ class KnownMotion(NamedTuple):
     contradiction: str
     """The contradiction between odom and the autopilot, or ''."""
     blind: bool
-    """Whether no valid velocity has come for too long, after one had come."""
+    """Whether every velocity has been invalid for too long, after a valid one."""
     turned: float | None
     """Yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
     difference: Array | None

@@ -34,7 +34,7 @@ from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT, READY
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.
 DISCOVERY: Final[float] = 8.0
-#: Only reports received so long after an answer show what it has changed, s.
+#: Only reports received this long after an answer show its effect, s.
 SETTLING: Final[float] = 0.2
 #: The state of a node whose last report is older, s, is shown as old.
 OLD: Final[float] = 1.5
