@@ -16,10 +16,10 @@
 One follower as one object: events in, each with its time; estimates, commands and setpoints out.
 
 Perception, planner and setpoint control are the same three objects that the nodes drive, each in
-a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``. ``flights``
-uses planner and control, with a simulated clock. Computing takes no time, neither does passing messages on: an estimate reaches
-the planner at the moment its image, or the odometry that image waited for, came; a command
-reaches the control at the tick.
+a process of its own. Here they share the clock of the caller: that of a bag in ``evaluate``, a
+simulated one in ``flights``, which needs no perception. Computing and passing messages on take no
+time: an estimate reaches the planner when its image comes, or the odometry that the image waits
+for; a command reaches the control at the tick.
 
 The planner ticks every ``period``, and when images cease; the control sends every
 1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
