@@ -85,7 +85,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} say nothing: {motion.last_error}',
+                     f'{motion.lost} of {count} are invalid: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialised; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
@@ -123,7 +123,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
 
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
-    """Report parameters of odometry and cameras that our nodes do not have alike."""
+    """Report parameters of odometry and cameras that differ between our nodes."""
     shared = (*COMMON, 'camera_rpy')
     for name in sorted({name for own in seen.parameters.values() for name in own
                         if name in shared or name.startswith('camera.')}):
@@ -171,7 +171,7 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
          'if it was not started higher up, z points down: set up its source to send ENU '
          '(REP-103)'),
         (still, UNMEASURED, f'{still} moved too little: carry it, and lift it', ''),
-        (True, OK, 'as the velocity says', ''))
+        (True, OK, 'agree with the velocity', ''))
 
 
 def _twist(motion: OwnMotion) -> Finding:
@@ -180,7 +180,7 @@ def _twist(motion: OwnMotion) -> Finding:
         'odom velocity', 'as its positions move',
         ('velocity' in motion.source.missing, WARNING, 'none (not finite)', DERIVED),
         (twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted), ERROR,
-         f'read in {twist.wanted}, the positions say {twist.found}',
+         f'read in {twist.wanted}, the positions fit {twist.found}',
          'set odom_twist_frame:=auto'),
         (twist.found == NONE, WARNING, f'off by {twist.contradiction:.2f} m/s in either frame',
          f'{DERIVED}; check the velocity of the odometry source'),
@@ -249,12 +249,12 @@ def _offset(fit: AxesFit, share: str, period: float, known: float) -> Finding:
         (rest > OFFSET, ERROR if rest > BAD_OFFSET else WARNING,
          f'images are stamped {off} {side} than odometry', 'have the driver stamp the middle of '
          f'the exposure, by one clock; else set time_offset:={-fit.offset:.3f} of relative_pose'),
-        (True, OK, f'{off} {side}, as time_offset says', ''))
+        (True, OK, f'{off} {side}, corrected by time_offset', ''))
 
 
 def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     """Check the focal length; in a fisheye image the flow changes too much within a part."""
-    what, wanted = 'focal length', 'images move as far as it says'
+    what, wanted = 'focal length', 'images move as far as it predicts'
     if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
         return Finding(UNMEASURED, what, 'a fisheye lens' if fisheye else
                        'turned too little: pitch and yaw it by hand', wanted)

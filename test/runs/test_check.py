@@ -109,7 +109,7 @@ def lost(message: Any) -> None:
 FAULTS: dict[str, tuple[Change, tuple[str, str, str, str]]] = {
     'no images': (of(IMAGES, unreadable), ('error', 'images', '', 'mono8')),
     'a lost source': (of('/odom', lost), (
-        'error', 'odom', 'say nothing: quaternion = 0', 'initialised'))}
+        'error', 'odom', 'are invalid: quaternion = 0', 'initialised'))}
 
 
 def assert_told(found: dict[str, Any], row: tuple[str, str, str, str]) -> None:
