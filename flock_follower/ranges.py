@@ -27,7 +27,7 @@ from typing import Any
 @dataclass(frozen=True)
 class Range:
     """
-    Finite numbers from ``low`` to ``high``, in a unit; both belong to it, if not said otherwise.
+    Finite numbers from ``low`` to ``high``, both included, in a unit.
 
     ``above`` excludes ``low`` itself; ``whole`` admits integers only. No limit is infinity.
     """

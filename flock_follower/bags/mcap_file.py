@@ -197,7 +197,7 @@ def _text(text: str) -> bytes:
 @cache
 def definition(msgtype: str) -> str:
     """
-    Return the text that says what a type holds.
+    Return the definition text of a type.
 
     :raises KeyError: for a type that ROS 2 Jazzy does not have.
     """

@@ -69,9 +69,9 @@ from flock_follower.parameters.files import FLOWN
 from flock_follower.perception.images import decode_image, encode_jpeg
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
-WRITE_PERIOD = 0.3  # s between writes: where one takes long, still less than a second
+WRITE_PERIOD = 0.3  # s between writes: still less than a second if one takes long
 ASK_PERIOD = 1.0  # s between looks for nodes whose parameters are not known
-RETRY_PERIOD = 5.0  # s until it is tried again to record where that failed
+RETRY_PERIOD = 5.0  # s until recording is tried again after a failure
 WAITING_MAX = 64_000_000  # bytes that wait for a slow disk; what comes beyond them is dropped
 NICENESS = 10
 JPEG_QUALITY = 90  # of images compressed here
@@ -113,7 +113,7 @@ class BlackBox(FlockNode):
         self._bytes_taken = self._bytes_written = 0
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
-        #: Topic, handle and class of a subscription, and what changes its messages.
+        #: Topic, handle and class of a subscription, and the conversion of its messages.
         self._inputs: list[tuple[RecordedTopic, Any, Any, Callable[[bytes], bytes]]] = []
         for name, msgtype in RECORDED.items():
             self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)

@@ -72,7 +72,7 @@ PROCESSORS = Path('/proc/stat')
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
-#: By which type of what relative_pose subscribes to our names are known.
+#: Our names of the topics that relative_pose subscribes to, by their types.
 BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
 
 
@@ -199,7 +199,7 @@ class Observer(Node):
 
 
 def processes() -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield name and environment of our nodes on this computer, but those of other users."""
+    """Yield name and environment of our nodes on this computer, except those of other users."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
             words = _words(folder / 'cmdline')

@@ -183,7 +183,7 @@ class Pilot(Node):
         """Print; an error of the terminal must not prevent the handing over."""
         with contextlib.suppress(OSError):
             for line in self._flight.lines:
-                self._line.say(line)
+                self._line.print_above(line)
             self._flight.lines.clear()
             if self._line.due(now):
                 self._line.show(self._reports.line(now))

@@ -54,14 +54,14 @@ from flock_follower.odometry.derivation import (
     CHOICES,
     DerivedRates,
     DerivedVelocity,
-    LONGEST_GAP,
     NONE,
     ODOM,
+    ODOMETRY_GAP,
     TwistFrame,
 )
 from flock_follower.ranges import Checked, parameter, Range
 
-#: Where the way to read the velocity changes, the step is faded out in this time constant, s.
+#: If the reading of the velocity changes, the step is faded out with this time constant, s.
 FADING = 0.5
 #: Messages over which latency and rate are reported.
 REMEMBERED = 50
@@ -79,7 +79,7 @@ class SourceParams(Checked):
     ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of its child frame on
     base_link (FLU); ``twist_frame`` is the frame of its velocity, or 'auto'. ``std`` (4) are the
     standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
-    where a message has no covariance.
+    if a message has no covariance.
     """
 
     child_position: tuple[float, ...] = parameter(
@@ -117,7 +117,7 @@ class OdometrySource:
         self.events: list[tuple[str, str]] = []
         self._covariances_before: dict[str, tuple[bytes, Array]] = {}  # as given, as used
         self.missing: dict[str, str] = {}
-        """What the messages lack, and what stands in for it."""
+        """What the messages lack, and its replacement."""
         self._latencies: deque[float] = deque(maxlen=REMEMBERED)
         self._gaps: deque[float] = deque(maxlen=REMEMBERED)
         self._frames: tuple[str, str] | None = None
@@ -167,8 +167,8 @@ class OdometrySource:
 
         None if it is a repetition or out of order. A zero stamp means now.
 
-        :param shift: what its stamp is ahead of the clock of ``now``, ns: see
-            ``planner.clock_watch``.
+        :param shift: by how much its stamp is ahead of the clock of ``now``, ns: see
+            ``nodes.support.clock_watch``.
 
         :raises ValueError: if position, attitude or stamp is invalid.
         """
@@ -224,7 +224,7 @@ class OdometrySource:
         else:
             gap = (stamp - self._stamp) / NANOSECONDS
             self._gaps.append(gap)
-            if gap > LONGEST_GAP:
+            if gap > ODOMETRY_GAP:
                 self.events.append(('odom gap', f'{gap:.2f} s'))
                 self.twist.restart()
         self._stamp = stamp
@@ -261,7 +261,7 @@ class OdometrySource:
         return velocity
 
     def _as_read(self, reading: str, time: float, child: Array, odom: Array) -> Array:
-        """Return the velocity (3,), m/s, in one of the ways to read it."""
+        """Return the velocity (3,), m/s, in a reading."""
         if reading == NONE:
             return self.motion.velocity_at(time)
         return child if reading == CHILD else odom
@@ -293,11 +293,11 @@ class OdometrySource:
                 twist[:3, :3] += share * (in_base[:, None] * in_base)
         return pose, twist
 
-    def _known(self, what: str, covariance: Any, variances: Array) -> Array:
-        """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
+    def _known(self, field: str, covariance: Any, variances: Array) -> Array:
+        """Return a covariance (6, 6), with ``variances`` (2,) if a part is missing."""
         numbers = np.asarray(covariance, dtype=float)
         given = numbers.tobytes()
-        before, known = self._covariances_before.get(what, (b'', numbers))
+        before, known = self._covariances_before.get(field, (b'', numbers))
         if before == given:
             return known  # it seldom changes
         matrix = numbers.reshape(6, 6).copy()
@@ -310,15 +310,15 @@ class OdometrySource:
             if lacking:
                 matrix[part] = matrix[:, part] = 0.0
                 matrix[part, part] = variance * np.eye(3)
-            self._lacks(f'{name} covariance of the {what}', lacking, 'odom_std')
-        self._covariances_before[what] = given, matrix
+            self._lacks(f'{name} covariance of the {field}', lacking, 'odom_std')
+        self._covariances_before[field] = given, matrix
         return matrix
 
-    def _lacks(self, what: str, lacking: bool, instead: str) -> None:
+    def _lacks(self, quantity: str, lacking: bool, instead: str) -> None:
         if lacking:
-            self.missing[what] = instead
+            self.missing[quantity] = instead
         else:
-            self.missing.pop(what, None)
+            self.missing.pop(quantity, None)
 
 
 def _pose(message: Any) -> tuple[Array, Array]:
@@ -339,7 +339,7 @@ def _pose(message: Any) -> tuple[Array, Array]:
 
 
 def _vector(message: Any) -> tuple[Array, bool]:
-    """Return a Vector3 or Point as an array (3,), and whether it is no nonsense."""
+    """Return a Vector3 or Point as an array (3,), and whether it is plausible."""
     x, y, z = message.x, message.y, message.z
     sane = abs(x) <= SANE and abs(y) <= SANE and abs(z) <= SANE  # written so that NaN fails
     return np.array([x, y, z]), sane

@@ -48,8 +48,7 @@ Table = Mapping[str, Sequence[Spec]]
 #: The parameters of the nodes that a flight needs.
 TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
                 'mavlink_bridge': mavlink_bridge_table.SPECS}
-#: Parameters that must be the same in all nodes: those by which one node knows what another one
-#: does, and the reading of the odometry, as a vehicle has one.
+#: Parameters that must be the same in all nodes: the cameras, and the reading of the odometry.
 COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 
 #: The section whose parameters hold for each node of a follower that has them.

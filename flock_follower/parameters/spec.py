@@ -66,8 +66,8 @@ class Spec:
     One parameter: its name, default, meaning and valid values.
 
     The type of ``default`` is the parameter's type; integers are accepted for a float. ``valid``
-    is the range of a number, or of each of a list, or the choices of a text. A list default fixes
-    the length where ``fixed_length`` is set. A node takes new values of ``live`` parameters in
+    is the range of a number, or of each of a list, or the choices of a text. With ``fixed_length``
+    a list must be as long as its default. A node takes new values of ``live`` parameters in
     flight, of others at start only.
     """
 

@@ -19,7 +19,7 @@ OpenCV 4.6 (Ubuntu 24.04) has free functions and ``DetectorParameters_create()``
 ``DetectorParameters()``; 4.7 brought ``ArucoDetector`` and 5 dropped the functions.
 Pixel coordinates are OpenCV's: (0, 0) at the centre of the top-left pixel.
 
-Who flies along: the neighbours and the markers they carry, read from YAML.
+The neighbours and the markers they carry, read from YAML.
 
 A file holds the dictionary of the markers and a list of neighbours::
 
@@ -120,7 +120,7 @@ def marker_cells(name: str) -> int:
 
 def correctable_cells(name: str) -> int:
     """
-    Return how many cells of a marker may be misread and it is still nearest to its own code.
+    Return how many cells of a marker may be misread while it is still nearest to its own code.
 
     :raises ValueError: for an unknown dictionary.
     """

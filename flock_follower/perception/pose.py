@@ -16,8 +16,8 @@
 From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
-and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
-is fitted as it is smeared.
+and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
+fitted as it is smeared.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ SMEAR_DEGREES = 200.0
 
 
 class Target(NamedTuple):
-    """A neighbour and what its markers, in their order, look like."""
+    """A neighbour and the image models of its markers, in their order."""
 
     neighbor: MarkedNeighbor
     model: EdgeModel
@@ -75,7 +75,7 @@ class Target(NamedTuple):
 
 
 def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
-    """Return what a neighbour with markers of a dictionary looks like."""
+    """Return the image model of a neighbour with markers of a dictionary."""
     return Target(neighbor, edge_model(neighbor, dictionary),
                   tuple(smear_model(marker, dictionary) for marker in neighbor.markers))
 
@@ -171,8 +171,8 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if len(seen.codes) == 1:
         return None
     if shown is None:  # one that is covered spoils them all
-        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
-                           spacing) for k in range(len(seen.codes))]
+        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
+                 for k in range(len(seen.codes))]
         shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return None
@@ -218,7 +218,7 @@ def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
 
 
 def _scale(found: EdgeFit) -> float:
-    """Return what its variances are to be multiplied by."""
+    """Return the factor on its variances."""
     return max(found.chi2, 1.0) * WIDENING**2
 
 
@@ -240,7 +240,7 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
 
 
 def _refit(camera: CameraModel, fitted: EdgeFit,
-          start: Transform) -> tuple[Transform, float] | None:
+           start: Transform) -> tuple[Transform, float] | None:
     """
     Return another pose near ``start`` that fits the edges found already, and its chi^2.
 

@@ -57,7 +57,7 @@ _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astyp
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
-_DARKER = 7  # by so much of the logarithm than the mean of the window is what is dark
+_DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
 _STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
@@ -73,7 +73,7 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
     """
     Return the markers about where a neighbour is expected (``T_camera_body``).
 
-    :param thorough: whether to look for the neighbour's own, by all means.
+    :param thorough: whether to search thoroughly, for the neighbour's own markers.
     """
     outlines = [camera.project((expected @ marker.T_body_marker).apply(
         marker_corners(marker.side_length))) for marker in neighbor.markers]

@@ -346,7 +346,8 @@ FAULTS: list[Fault] = [
           lambda seen: vars(seen).update(nodes=[f'/drone1{node}' for node in seen.nodes])),
     # Measured as it should be, or not at all.
     Fault('an offset that relative_pose has as a parameter', LIVE, OK, 'camera time offset',
-          'corrected by time_offset', '', together(change(shifts=shift_rows(offset=0.05)), parameter(
+          'corrected by time_offset', '',
+          together(change(shifts=shift_rows(offset=0.05)), parameter(
               'relative_pose', 'time_offset', -0.05))),
     Fault('the pose by tf_static is used', LIVE, OK, 'odom up', 'leans', '', together(
         child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
