@@ -31,8 +31,8 @@ import re
 import sys
 
 from flock_follower.check import SECONDS, table
-from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ready
+from flock_follower.checks.recorded_system import judge_all
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -31,9 +31,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
+from flock_follower.checks.findings import ERROR, Finding, first, OK, SURE, UNMEASURED, WARNING
 from flock_follower.checks.image_motion import OwnPath
-from flock_follower.checks.mounting import SURE
 from flock_follower.checks.observations import Observations
 from flock_follower.geometry import (
     Array,

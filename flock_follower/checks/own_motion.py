@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The odometry: velocity and jumps in it, its axes, and whether the images agree."""
+"""The odometry: its velocity, jumps and axes; the images and the mounting compared with it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import math
 from typing import Final
@@ -29,12 +29,12 @@ from flock_follower.checks.findings import (
     first,
     judged,
     OK,
+    SURE,
     UNMEASURED,
     WARNING,
 )
 from flock_follower.checks.image_motion import AxesFit, fit_axes, OwnPath
 from flock_follower.checks.marker_size import check_marker_size
-from flock_follower.checks.mounting import check_mounting, MOUNTED, SURE
 from flock_follower.checks.observations import Observations, OwnMotion
 from flock_follower.checks.pictures import camera_model
 from flock_follower.geometry import (
@@ -42,6 +42,7 @@ from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_to_matrix,
     R_FLU_OPTICAL,
+    rotation_vector_to_matrix,
     rpy_from_matrix,
 )
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
@@ -72,6 +73,12 @@ EVENTS: Final = (
      'turn off loop closure and relocalisation, or take the frame without them'),
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'))
+#: Errors of the mounting, rad, of a warning and of an error.
+LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(8.0)
+MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
+_AXES: Final = ('roll', 'pitch', 'yaw')
+_WAYS: Final = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
+                ('looks further right', 'looks further left'))
 TURN_MOVES: Final = 'images move as odometry turns'
 IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
@@ -262,3 +269,31 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     return judged(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
         wanted, 'is the calibration of this lens, and for this size of images?')
+
+
+def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Finding:
+    """
+    Return the finding about roll, pitch and yaw of the camera.
+
+    :param turn: the rotation vector (3,), rad, along base_link's axes, by which the camera is
+        mounted otherwise than configured; :param deviations: (3,) of it.
+    :param rpy: the configured ``camera_rpy``, rad.
+    """
+    margin = SURE * deviations
+    wrong = np.abs(turn) > np.maximum(LOOKS, margin)
+    unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
+                        if not bad and by > LOOKS)
+    looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
+                      for way, angle, bad in zip(_WAYS, turn.tolist(), wrong) if bad)
+    fitting = ','.join(str(round(angle, 3) + 0.0) for angle in rpy_from_matrix(
+        rotation_vector_to_matrix(np.where(wrong, turn, 0.0))
+        @ quaternion_to_matrix(quaternion_from_rpy(*rpy))).tolist())
+    measured = f'camera {looks} than configured{f"; {unknown} unknown" if unknown else ""}'
+    advice = (f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose '
+              'of the odometry on the body (odom_child_rpy) wrong?')
+    return first(
+        'camera mounting', MOUNTED,
+        (np.any(wrong & (np.abs(turn) > BAD_LOOKS)), ERROR, measured, advice),
+        (wrong.any(), WARNING, measured, advice),
+        (unknown, UNMEASURED, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', ''),
+        (True, OK, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', ''))

@@ -30,7 +30,6 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
 from flock_follower.checks.observations import (
@@ -40,6 +39,7 @@ from flock_follower.checks.observations import (
     TopicEnd,
     TopicSeen,
 )
+from flock_follower.checks.recorded_system import judge_all
 from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import TYPES
 from flock_follower.geometry import (

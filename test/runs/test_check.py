@@ -28,8 +28,7 @@ import pytest
 
 from flock_follower import check
 from flock_follower.bags.description import MARK
-from flock_follower.check import main
-from flock_follower.checks.bug_report import newest_recording
+from flock_follower.check import main, newest_recording
 from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.files import resource
 
