@@ -56,8 +56,8 @@ from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag, judge_all
 from flock_follower.checks.topic_names import full_name, parse_remaps
 from flock_follower.files import resource, whole_file
-from flock_follower.parameters.black_box_table import folder
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
+from flock_follower.parameters.tables import recordings_folder
 from flock_follower.ranges import Range
 
 SECONDS = 6.0
@@ -139,8 +139,9 @@ def _report(options: argparse.Namespace, seen: Observations,
     """Write the file for a bug report, with the newest recording, and print its size."""
     recorder = seen.statuses.get(full_name('black_box', options.namespace).lstrip('/'))
     running = Path(recorder.values.get('recording', '')) if recorder else Path()
+    home = os.environ.get('ROS_HOME', '')
     recording = options.bag or (running if running.name and running.exists() else newest_recording(
-        folder({'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace)))
+        recordings_folder({'record_folder': ''}, home, options.namespace)))
     write_report(options.report, seen, findings, recording)
     print(f'{options.report}: {options.report.stat().st_size / 1e6:.1f} MB, recording: '
           f'{recording or "none found"}', file=sys.stderr)

@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The values that a number may take, and the one check of them; every room uses it."""
+"""The values that a number may take, with the one check of them; the remedy for a wrong name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
+import difflib
 from functools import cache
 import math
 from numbers import Integral, Real
@@ -109,6 +110,12 @@ class Checked:
                     valid.check(name, number)
             elif value not in valid:
                 raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
+
+
+def suggestion(name: str, known: Collection[str], otherwise: str = 'it has') -> str:
+    """Return the known name that is nearest to a wrong one as a question, else all of them."""
+    near = difflib.get_close_matches(name, sorted(known), n=1)
+    return f'did you mean {near[0]}?' if near else f'{otherwise} {", ".join(sorted(known))}'
 
 
 def first_reason(*checks: tuple[object, str]) -> str:

@@ -68,9 +68,8 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters import planner_table, relative_pose_table
-from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import cameras, CameraValues, planner_params, tracker
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
@@ -155,9 +154,8 @@ class Evaluation(Listener):
         perception, bridge = values['relative_pose'], values['mavlink_bridge']
         self.bag, self.writer = bag, writer
         self.duration = bag.duration_ns / NANOSECONDS
-        self.params = planner_table.build(values['planner'])
-        self.perceiver = Perceiver(
-            relative_pose_table.build(perception), max_wait=perception['max_wait'])
+        self.params = planner_params(values['planner'])
+        self.perceiver = Perceiver(tracker(perception), max_wait=perception['max_wait'])
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.params, Gate(

@@ -40,8 +40,8 @@ from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import alone
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 

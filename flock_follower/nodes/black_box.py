@@ -63,9 +63,9 @@ from flock_follower.nodes.support.runtime import (
     spin,
     Waiting,
 )
-from flock_follower.parameters.black_box_table import build, folder, SPECS
-from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.files import FLOWN
+from flock_follower.parameters.tables import BLACK_BOX as SPECS
+from flock_follower.parameters.tables import cameras, recordings_folder
 from flock_follower.perception.images import decode_image, encode_jpeg
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
@@ -102,8 +102,9 @@ class BlackBox(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('black_box', **kwargs)
-        values = self.declare(SPECS, build).values
-        self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
+        values = self.declare(SPECS, dict).values
+        self._folder = recordings_folder(
+            values, os.environ.get('ROS_HOME', ''), self.get_namespace())
         self._limits = values['disk_used'], values['disk_free']
         self._recording: FlightRecording | None = None
         # One thread takes, one writes, and the executor's notes: none needs a lock.

@@ -80,8 +80,9 @@ from flock_follower.nodes.support.inputs import (
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
-from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import MAVLINK_BRIDGE as SPECS
+from flock_follower.parameters.tables import origin, recommendations
 
 # Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)

@@ -51,8 +51,8 @@ from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.cameras_table import cameras, CameraValues
-from flock_follower.parameters.relative_pose_table import build, SPECS
+from flock_follower.parameters.tables import cameras, CameraValues, tracker
+from flock_follower.parameters.tables import RELATIVE_POSE as SPECS
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
@@ -101,7 +101,7 @@ class RelativePose(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
-        parameters = self.declare(SPECS, build)
+        parameters = self.declare(SPECS, tracker)
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
         now = time.monotonic()

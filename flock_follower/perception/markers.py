@@ -53,7 +53,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-import difflib
 from functools import lru_cache
 import math
 from pathlib import Path
@@ -66,7 +65,7 @@ import yaml
 
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
 from flock_follower.perception.images import GrayImage
-from flock_follower.ranges import Range
+from flock_follower.ranges import Range, suggestion
 
 # Any: neither version's type stubs know the other's names.
 _cv_aruco: Any = cv2.aruco
@@ -333,10 +332,8 @@ def _check_keys(where: str, entry: Any, keys: set[str],
         raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
     unknown = sorted(map(str, set(entry) - keys - {*optional}))
     if unknown:
-        known = sorted({*keys, *optional})
-        near = difflib.get_close_matches(unknown[0], known, n=1)
-        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + (
-            f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
+        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + suggestion(
+            unknown[0], {*keys, *optional}, 'must be one of'))
     for key in sorted(keys - set(entry)):
         raise ValueError(f'{where} lacks {key}')
 
