@@ -35,7 +35,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from flock_follower.bags.description import incomplete, mcap_files, METADATA
+from flock_follower.bags.mcap_file import incomplete, mcap_files, METADATA
 from flock_follower.bags.message_types import migration_obstacle, typestore
 from flock_follower.bags.unfinished import has_end, UnfinishedReader
 

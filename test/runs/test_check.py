@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from flock_follower import check
-from flock_follower.bags.description import MARK
+from flock_follower.bags.mcap_file import MARK
 from flock_follower.check import main, newest_recording
 from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.files import resource
