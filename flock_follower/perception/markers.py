@@ -252,6 +252,12 @@ class NeighborConfig:
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
 
+def marker_corners(side_length: float) -> Array:
+    """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
+    return 0.5 * side_length * np.array(
+        [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
 def load(path: str | Path) -> NeighborConfig:
     """
     Read a neighbours file.

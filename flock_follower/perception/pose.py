@@ -18,6 +18,9 @@ From a neighbour's markers in an image to its pose and covariance.
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
 and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
 fitted as it is smeared.
+
+A square has two poses that explain its corners almost equally well, mirrored about the line of
+sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014; IPPE).
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import ippe
 from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor
+from flock_follower.perception.markers import MarkedNeighbor, marker_corners
 from flock_follower.perception.measurement import (
     angle,
     Choice,
@@ -64,6 +67,51 @@ NARROW = 0.01
 FOUND_INLIERS = 0.8
 #: Number of independent samples of a smeared print, to decide between two attitudes.
 SMEAR_DEGREES = 200.0
+
+
+def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
+    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
+    normalised = camera.undistort(corners)
+    if not np.all(np.isfinite(normalised)):
+        return []
+    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
+    # faces the camera upright is half a turn away from it. So it is given the square as if it
+    # lay in the image, x right and y down, whichever of its corners is on top.
+    quarters = int(np.argmin(normalised.sum(axis=1)))
+    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
+    # Undistorted coordinates and an identity matrix serve every lens model alike.
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
+        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
+    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
+    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
+            for r, t in zip(rotations, translations)
+            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
+
+
+def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
+           pose: Transform) -> tuple[Transform, Array] | None:
+    """
+    Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
+
+    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
+    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
+    """
+    for _ in range(20):
+        seen = pose.apply(points)
+        pixels, by_point = camera.linearize(seen)
+        residual = (corners - pixels).ravel()
+        middle = pose.apply(center[None])[0]
+        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
+        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
+        step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
+        if step is None or not np.all(np.isfinite(step)):
+            return None
+        if np.max(np.abs(step)) < 1e-7:
+            break
+        pose = moved(pose, middle, step)
+    return pose, jacobian
 
 
 class Target(NamedTuple):

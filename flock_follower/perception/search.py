@@ -33,7 +33,6 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
@@ -42,6 +41,7 @@ from flock_follower.perception.markers import (
     Marker,
     marker_cells,
     marker_code,
+    marker_corners,
     NO_DETECTIONS,
     outwards,
 )
