@@ -374,7 +374,7 @@ class Follower:
         self._use_ranges(perceiver)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
-        for outcome in perceiver.tracker.ranged():
+        for outcome in perceiver.tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 self._publish_neighbor(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:

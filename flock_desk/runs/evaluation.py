@@ -66,8 +66,7 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
-from flock_follower.odometry.cdr import read_odometry
-from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
 from flock_follower.parameters.tables import cameras, CameraValues, planner_params, tracker
 from flock_follower.perception.images import GrayImage

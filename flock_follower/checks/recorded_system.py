@@ -38,8 +38,7 @@ from flock_follower.checks.topic_names import (
 from flock_follower.checks.topics import check_nodes, check_topics
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
-from flock_follower.odometry.cdr import read_odometry
-from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
 from flock_follower.parameters.tables import alone
 from flock_follower.perception.images import GrayImage

@@ -61,7 +61,7 @@ from flock_follower.nodes.support.middleware import (
 )
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
-from flock_follower.odometry.cdr import read_odometry
+from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
 from flock_follower.parameters.tables import alone
 from flock_follower.perception.markers import load

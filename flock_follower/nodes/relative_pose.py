@@ -172,7 +172,7 @@ class RelativePose(FlockNode):
 
     def _use_ranges(self) -> None:
         """Publish the states of neighbours out of sight, from the ranges."""
-        for outcome in self._tracker.ranged():
+        for outcome in self._tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 state, acceleration = self._perceiver.messages(
                     make, outcome.stamp, outcome.name, outcome.estimate)

@@ -26,7 +26,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from driven import DEADLINE, Driven, overrides
+from driven import DEADLINE, Driven, overrides, to_odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -39,7 +39,7 @@ from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
-from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'update_velocity', 'forward',
          'receive', 'cycle', 'stop')
