@@ -85,7 +85,7 @@ class SimulatorOutputs:
             make, stamp_ns, ODOM_FRAME, _VEHICLES[topic], *motion[1:]))
 
     def motion(self, stamp_ns: int, true: TrueMotion) -> None:
-        """Publish the vehicle's true motion at 50 Hz, where another simulator wants it."""
+        """Publish the vehicle's true motion at 50 Hz, if another simulator subscribes."""
         if stamp_ns - self._motion_sent >= MOTION_PERIOD_NS and (
                 self._odometry[MOTION].get_subscription_count()):
             self._motion_sent = stamp_ns

@@ -108,11 +108,11 @@ class ExternalAutopilot:
 
     def await_pose(self, timeout: float, why_truth: str, wanted: Callable[[], bool]) -> None:
         """
-        Wait until the motion is known; take the autopilot's estimate where no truth comes.
+        Wait until the motion is known; take the autopilot's estimate if no truth comes.
 
         :param why_truth: why an estimate will not do; '': it will.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: if nothing comes within ``timeout`` s, or no truth where it has to.
+        :raises ValueError: if nothing comes within ``timeout`` s, or no truth although it must.
         """
         deadline = time.monotonic() + timeout
         while wanted():
@@ -138,7 +138,7 @@ class ExternalAutopilot:
 
     @property
     def flying(self) -> bool:
-        """Return whether it has said that it is in the air."""
+        """Return whether it has reported that it is in the air."""
         return self._link.telemetry.landed == mavlink.MAV_LANDED_STATE_IN_AIR
 
     @property

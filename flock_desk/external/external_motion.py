@@ -15,7 +15,7 @@
 """
 The motion of a vehicle that an external autopilot flies, from its MAVLink messages.
 
-Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); where neither
+Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); if neither
 comes, the autopilot's own estimate is LOCAL_POSITION_NED with ATTITUDE_QUATERNION. Times are
 integer nanoseconds of one monotonic clock, given by the caller; no clock is read here.
 """

@@ -18,7 +18,7 @@ One bag through perception, planner and gate, and the record of it.
 A message comes when it was recorded, so images and odometry are as late, and in the same order,
 as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
 mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
-``odom`` stand in where ``velocity_source`` asks for them.
+``odom`` replace them if ``velocity_source`` requires them.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
-#: What the autopilot is taken to be while the bag was recorded.
+#: The assumed status of the autopilot while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
 IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
@@ -155,7 +155,7 @@ class Evaluation(Listener):
         self.duration = bag.duration_ns / NANOSECONDS
         self.params = planner_params(values['planner'])
         self.perceiver = Perceiver(tracker(perception), max_wait=perception['max_wait'])
-        # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
+        # Other inputs of the planner, such as require_bridge, are as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.params, Gate(
                 filled(GateLimits(), bridge), bridge['velocity_source']),

@@ -245,7 +245,7 @@ class Processes:
 
         :param given_up: returns why to stop asking, '' to go on.
         :param value: ``('false',)``, or ``()`` for a Trigger.
-        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds; says why.
+        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds, with the reason.
         """
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout

@@ -195,7 +195,7 @@ class FlightController(ABC):
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 
     def check_arming(self, now: float, title: str = 'PreArm') -> list[str]:
-        """Return the conditions that prevent arming; ArduCopter says the first."""
+        """Return the conditions that prevent arming; ArduCopter reports the first."""
         missing = self.missing(self.mode, now, self.PROFILE.arming)
         if missing and not self.PROFILE.px4:
             reason = _REASONS[missing[0]].format(denial=self._arming_denial, mode=self.mode)

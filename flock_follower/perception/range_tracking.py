@@ -15,6 +15,9 @@
 """
 Tracks a neighbour that is out of sight by distances that a radio measures.
 
+One sensor measures the distances to a neighbour: all of them have one bias, one place of the own
+antenna, and stamps that only grow. A second sensor would need a series of its own.
+
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
 is learnt. Out of sight, a second filter continues from the state of the first. The second filter
 is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
