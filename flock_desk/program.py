@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The command ``flock_follower``: starts a node or a command by its name, where pip installed it.
+The command ``flock_follower`` of a pip installation: starts a node or a command by its name.
 
 ``ros2 run flock_follower NAME`` does the same with ROS. The parameters of every node as Markdown:
 ``python -m flock_desk.program --parameters > config/PARAMETERS.md``.

@@ -39,7 +39,7 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 
-#: Set up as config/px4.params recommends, where PX4's defaults are others.
+#: The values of config/px4.params that differ from PX4's defaults.
 RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,
                       'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 

@@ -16,7 +16,7 @@
 Work in other processes: children that are always stopped, and tasks for a Dask cluster.
 
 Dask is an extra, ``pip install 'flock_follower[cluster]'``, imported only where it is asked for;
-its workers need this package in the same version, and the same files where tasks name some.
+its workers need this package in the same version, and the files that tasks name.
 """
 
 from __future__ import annotations

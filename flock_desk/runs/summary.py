@@ -60,7 +60,7 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
     a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
-    3 where covariances are right.
+    3 if covariances are right.
     """
     rows = {column: np.concatenate([table[column] for table in tables]) for column in tables[0]}
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])

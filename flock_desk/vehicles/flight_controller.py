@@ -156,7 +156,7 @@ class FlightController(ABC):
 
     @abstractmethod
     def _supervise(self, now: float) -> None:
-        """Change the mode where a failsafe does."""
+        """Change the mode if a failsafe does."""
 
     def _fly_setpoints(self, now: float, dt: float) -> Array:
         """Return the acceleration (3,), m/s^2, of the mode that obeys setpoints."""

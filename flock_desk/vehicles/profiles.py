@@ -84,7 +84,7 @@ class Profile:
     arming: tuple[str, ...]
     """The conditions of arming, besides those of the mode."""
     refused: int
-    """MAV_RESULT where a condition is not met."""
+    """MAV_RESULT if a condition is not met."""
     unknown_message: int
     """MAV_RESULT of SET_MESSAGE_INTERVAL for a message that it does not send."""
     vision: Mapping[str, float]

@@ -45,8 +45,9 @@ ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',
 START: Final = 'ros2 launch flock_follower follower.launch.py'
 #: s: stamps that differ by more from the arrival are of another clock.
 OTHER_CLOCK: Final = 10.0
-#: s: stamps in the future: from which on there is a warning, and an error.
-AHEAD: Final = (0.003, 0.03)
+#: s: median of stamps in the future from which on there is a warning, and an error: the clocks
+#: differ. The nodes accept single stamps up to ``messages.FUTURE_TOLERANCE`` ahead.
+CLOCK_AHEAD: Final = (0.003, 0.03)
 #: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
 #: before the newest message of any topic.
 STOPPED: Final = (1.0, 3.0)
@@ -168,8 +169,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
          'computers; have the driver stamp by the clock of ROS (a replayed bag: ros2 bag record '
          '--use-sim-time)'),
-        (middle < -AHEAD[1], ERROR, ahead, synchronise),
-        (middle < -AHEAD[0], WARNING, ahead, synchronise),
+        (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronise),
+        (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronise),
         (middle > latencies[1], ERROR, measured, sooner),
         (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
         (True, OK, measured, ''))

@@ -225,7 +225,7 @@ def _machine(idle: float | None) -> Machine:
 
 
 def _open_nodes() -> list[str]:
-    """Return our nodes on this computer that the network reaches; as check, where none is read."""
+    """Return our nodes on this computer that the network reaches; if none is known, for check."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     found = {node: environment for node, environment in processes()
              if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}

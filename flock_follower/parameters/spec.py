@@ -181,7 +181,7 @@ def filled(params: P, values: Mapping[str, Any], prefix: str = '', **others: Any
 
 def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the value of every parameter, its default where none is given.
+    Return the value of every parameter, its default if none is given.
 
     :raises ValueError: for the first invalid value.
     """

@@ -146,7 +146,7 @@ class NeighborFilter:
         return self._predicted
 
     def place(self, stamp: float) -> Transform | None:
-        """Return about where :meth:`predict` expects the body, for far less."""
+        """Return the pose that :meth:`predict` expects, approximately, at far less cost."""
         now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None

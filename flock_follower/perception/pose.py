@@ -59,7 +59,7 @@ from flock_follower.perception.smear_fit import (
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
-#: Where cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
+#: If cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
