@@ -40,7 +40,7 @@ TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
 MEMORY: Final[int] = 256
 """Number of poses kept: more than one second."""
 LONGEST_GAP: Final[int] = 150_000_000
-"""Poses further apart than this, ns, have no known motion between them."""
+"""Poses farther apart than this, ns, have no known motion between them."""
 SMOOTHING: Final[float] = 1.0
 """Time constant, s, of the correction of the integrated velocity by reported places."""
 JUMP: Final[float] = 0.5

@@ -40,7 +40,7 @@ from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 
-#: Attitudes further than this from the truth count as wrong, rad.
+#: Attitudes farther than this from the truth count as wrong, rad.
 WRONG_ATTITUDE = math.radians(20.0)
 #: A mean NEES of three-dimensional errors that is still consistent; 3 is expected.
 CONSISTENT = (1.5, 6.0)
