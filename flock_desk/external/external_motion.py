@@ -39,7 +39,7 @@ CLOCK: Final[str] = 'SYSTEM_TIME'
 TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
 MEMORY: Final[int] = 256
 """Number of poses kept: more than one second."""
-LONGEST_GAP: Final[int] = 150_000_000
+POSE_GAP: Final[int] = 150_000_000
 """Poses farther apart than this, ns, have no known motion between them."""
 SMOOTHING: Final[float] = 1.0
 """Time constant, s, of the correction of the integrated velocity by reported places."""
@@ -114,7 +114,7 @@ class ExternalMotion:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
         before, after = self._around(time)
         return after is not None and (after.time == time or (
-            before is not None and after.time - before.time <= LONGEST_GAP))
+            before is not None and after.time - before.time <= POSE_GAP))
 
     def at(self, time: int) -> Motion:
         """
