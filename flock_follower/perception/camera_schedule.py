@@ -53,7 +53,6 @@ STEP = 1e-9
 NEAREST = 0.05
 
 
-
 class Sought(NamedTuple):
     """Names of neighbours: expected in the image, and to be searched for in the whole image."""
 

@@ -36,7 +36,7 @@ SIGMA_UPRIGHT = 0.25
 #: History may not outweigh the image for ever: its contribution to chi^2 is capped.
 MAX_HISTORY = 9.0
 #: Two attitudes closer than this, rad, are one.
-SAME = 0.02
+SAME_ATTITUDE = 0.02
 
 
 class PosePrior(NamedTuple):
@@ -70,7 +70,7 @@ class Choice(NamedTuple):
 
 def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
     """Return the likeliest of one or two poses, given their residuals and the prediction."""
-    if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME:
+    if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME_ATTITUDE:
         return Choice(min(poses, key=lambda p: p.chi2), 0.0)  # both in one: soon they may part
     first, second = (p.chi2 + _surprise(p.pose, expected) for p in poses)
     chosen, other = poses if first <= second else reversed(poses)

@@ -44,7 +44,7 @@ from flock_follower.perception.measurement import (
     Hypothesis,
     Measurement,
     PosePrior,
-    SAME,
+    SAME_ATTITUDE,
     widened,
     WIDENING,
 )
@@ -277,12 +277,12 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     other = -normal + 2.0 * float(normal @ sight) * sight
     axis = np.cross(normal, other)
     sine = float(np.linalg.norm(axis))
-    if sine < SAME:
+    if sine < SAME_ATTITUDE:
         return []
     turn = axis / sine * math.atan2(sine, float(normal @ other))
     start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
     refitted = _refit(camera, found, start)
-    if refitted is None or angle(refitted[0], found.pose) < SAME:
+    if refitted is None or angle(refitted[0], found.pose) < SAME_ATTITUDE:
         return []
     return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
 
