@@ -96,7 +96,7 @@ def test_nodes_that_are_started_wrongly_are_reported_with_the_remedy(tmp_path: P
     for what, measured, advice in (
             ('nodes', 'twice: planner', 'end one of each'),
             ('command/trajectory', '2 publishers on /command/trajectory: /planner', 'end'),
-            ('clock', 'use_sim_time is true in mavlink_bridge, but nobody', 'without'),
+            ('clock', 'use_sim_time is true in mavlink_bridge, but no node', 'without'),
             ('odom', 'no node publishes /odom', 'start its driver')):
         assert any(measured in f['measured'] and advice in f['advice'] and f['level'] == 'error'
                    for f in found.get(what, [])), (what, found.get(what, sorted(found)))
