@@ -349,7 +349,7 @@ def _logged(state: Odometry) -> tuple[Array, Array, Array]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; exit code 0 at the end of the scenario, 1 or 3 for what cannot be flown."""
+    """Run the node; exit code 0 at the end of the scenario, 1 or 3 if it cannot be flown."""
     cv2.setNumThreads(1)  # OpenCV's threads take twice the time, waiting
     return run(Simulator, args, Simulator.fly)
 

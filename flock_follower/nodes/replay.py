@@ -266,7 +266,7 @@ def bag_argument(args: list[str]) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; exit code 0 at the end of the bag, 1 for what cannot be played."""
+    """Run the node; exit code 0 at the end of the bag, 1 for a bag that cannot be played."""
     args = sys.argv[1:] if args is None else args
     return run(lambda: Replay(bag_argument(args)), args, Replay.play)
 

@@ -36,7 +36,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.print_model import EdgeModel
 
 #: How much more uncertain, in variance, all unknowns together may be than each would be alone.
-#: For good fits of rendered markers it is at most 5e3; at 1e16 nothing is left but rounding.
+#: For good fits of rendered markers it is at most 5e3; at 1e16 only rounding is left.
 MAX_INFLATION = 1e8
 _CHOLESKY = cv2.DECOMP_CHOLESKY
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out

@@ -149,8 +149,8 @@ MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.2, 16.0)
-#: After a longer gap, s, nothing is learnt: the mean restarts, and the factor is at least 1, so
-#: ``FilterParams`` holds.
+#: After a longer gap, s, the step is not learnt: the mean restarts, and the factor is at least 1,
+#: so ``FilterParams`` holds.
 LEARNING_GAP: Final = 0.3
 
 

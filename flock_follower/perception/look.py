@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One image on its way through perception: what is expected in it, and what was found.
+One image on its way through perception: the expected and the found content.
 
 ``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
 shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour

@@ -51,9 +51,9 @@ from flock_follower.perception.print_model import cell_code, shows_code
 SIDE = 56.0
 #: From this width on, px, a whole image is searched at half its size.
 LARGE = 1280
-_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels: what is darker is noise
+_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels; below about 12 they are noise
 _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
-#: Side of the window for the mean, px, and of the brush that removes what is narrower. A narrow
+#: Side of the window for the mean, px, and of the brush that removes narrower areas. A narrow
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
