@@ -121,9 +121,10 @@ class Flight:
 
     :param confirm: whether a key confirms each step. If not, each step is requested once, and a
         refusal ends the flight.
+    :param ready: False if ``check`` forbids a flight: then it only lands or hands over.
     """
 
-    def __init__(self, now: float, confirm: bool = True) -> None:
+    def __init__(self, now: float, confirm: bool = True, ready: bool = True) -> None:
         self.code: int | None = None
         """The exit code, once the flight has ended."""
         self.lines: list[str] = []
@@ -133,13 +134,14 @@ class Flight:
         self._ending: int | None = None
         self._question: str | None = None
         self._pending: set[str] = set()
-        self._confirm, self._requested = confirm, set[str]()
+        self._confirm, self._requested, self._ready = confirm, set[str](), ready
 
     def step(self, reports: Reports, now: float) -> list[str]:
         """Ask for the key of the step that is due, or request it; end after a landing."""
         if self._pending or self._ending is not None:
             return []
-        due, missing = reports.due(), reports.missing(self._answered + SETTLING)
+        due = reports.due() if self._ready else ''
+        missing = reports.missing(self._answered + SETTLING)
         if self._landing:
             if 'mavlink_bridge' not in missing and (
                     reports.value('mavlink_bridge', 'armed') == 'False'):
@@ -159,7 +161,8 @@ class Flight:
                 return self._request(due)
             self.lines.append(
                 f'{reports.bridge}: press {due[0]} for {due}' if due else
-                'the follower flies: press l to land; Ctrl-C brakes and hands over')
+                f'{"the follower flies" if self._ready else "not ready to fly, but in the air"}: '
+                'press l to land; Ctrl-C brakes and hands over')
         return []
 
     def press(self, key: str, reports: Reports) -> list[str]:
