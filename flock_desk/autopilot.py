@@ -156,7 +156,7 @@ class Endpoint:
             f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
 
     def receive(self, wait: float) -> None:
-        """Answer what arrives, the first of it within ``wait`` seconds."""
+        """Answer the messages that arrive, the first of them within ``wait`` seconds."""
         if not select.select([self._transport], [], [], max(0.0, wait))[0]:
             return
         for data, peer in self._transport.read():

@@ -78,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default='build/evaluate',
                         help='folder for the results (default: %(default)s)')
     parser.add_argument('--expect', type=Path, metavar='FILE',
-                        help='YAML file of bounds; exit code 1 where one is broken')
+                        help='YAML file of bounds; exit code 1 if one is broken')
     parser.add_argument('--check', choices=('fail', 'report', 'skip'), default='fail',
                         help='errors that the rules of check find in the bag: exit code 1, only '
                         'reported, or not looked for (default: %(default)s)')

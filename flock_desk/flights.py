@@ -83,7 +83,7 @@ class Task(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """What a task gives."""
+    """The result of a task."""
 
     runs: Measures
     exits: list[str]
@@ -163,7 +163,7 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
 def fly_all(scenarios: Sequence[Scenario], controllers: Sequence[str], runs: int, jobs: int,
             seed: int, scheduler: str = '') -> dict[str, dict[str, list[Flown]]]:
     """
-    Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
+    Fly scenarios in ``jobs`` processes, or on the cluster of a scheduler.
 
     Return the results of the tasks, by scenario and controller.
     """

@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-The command ``flock_follower``: starts a node or a command by its name, where pip installed it.
+The command ``flock_follower`` of a pip installation: starts a node or a command by its name.
 
-``ros2 run flock_follower NAME`` does the same with ROS.
+``ros2 run flock_follower NAME`` does the same with ROS. The parameters of every node as Markdown:
+``python -m flock_desk.program --parameters > config/PARAMETERS.md``.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from importlib import import_module
 import sys
 import textwrap
 from typing import Final
+
+from flock_follower.parameters.spec import Spec
 
 #: The module of each program; all programs of `ros2 run`, and a few more.
 PROGRAMS: Final = {
@@ -35,6 +38,19 @@ PROGRAMS: Final = {
     **{name: f'flock_desk.{name}' for name in (
         'demo', 'evaluate', 'figures', 'flights', 'fly', 'marker')},
 }
+#: The nodes on the page of parameters.
+NODES: Final = ('relative_pose', 'planner', 'mavlink_bridge', 'flock', 'replay', 'simulator',
+                'black_box', 'visualizer')
+INTRODUCTION: Final = """\
+# Parameters
+
+Set one at start with `--ros-args -p NAME:=VALUE`, or with a file (`--params-file`, see the files
+beside this one). Those marked live can be set while the node runs:
+`ros2 param set /planner v_max 0.4`. A value out of range, or a name no node knows, is refused with
+the reason.
+
+This page is made by `python -m flock_desk.program --parameters`.
+"""
 
 
 def usage() -> str:
@@ -48,6 +64,9 @@ def main() -> int:
     name = sys.argv[1] if len(sys.argv) > 1 else '--help'
     if name in ('-h', '--help'):
         print(usage())
+        return 0
+    if name == '--parameters':
+        print(markdown(), end='')
         return 0
     if name not in PROGRAMS:
         print(f'error: {name}: no such program\n{usage()}', file=sys.stderr)
@@ -64,6 +83,25 @@ def main() -> int:
         return 1
     code: int = program.main()
     return code
+
+
+def markdown() -> str:
+    """Return the page of all parameters, from the tables that the nodes use."""
+    sections = [INTRODUCTION]
+    for node in NODES:
+        specs: list[Spec] = import_module(PROGRAMS[node]).SPECS
+        sections.append('\n'.join([
+            f'## {node}\n', '| parameter | default | valid | live | meaning |',
+            '|---|---|---|---|---|', *(_row(spec) for spec in specs), '']))
+    return '\n'.join(sections)
+
+
+def _row(spec: Spec) -> str:
+    default = ('empty' if spec.default in ('', ['']) else
+               str(spec.default).lower() if isinstance(spec.default, bool) else
+               f'{spec.default:g}' if isinstance(spec.default, float) else str(spec.default))
+    live = 'yes' if spec.live else ''
+    return f'| `{spec.name}` | {default} | {spec.constraint} | {live} | {spec.meaning} |'
 
 
 if __name__ == '__main__':

@@ -30,7 +30,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from flock_follower.bags.bag import BagError
-from flock_follower.bags.description import incomplete
+from flock_follower.bags.mcap_file import incomplete
 from flock_follower.bags.writer import BagWriter
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class

@@ -125,7 +125,7 @@ class Recording:
 
     @cached_property
     def odometry(self) -> list[Odometry]:
-        """Return what the follower's VIO says."""
+        """Return the odometry of the follower's VIO."""
         times = np.arange(round(self.variant.duration * ODOMETRY_RATE) + 1) / ODOMETRY_RATE
         # Rounded: the last bits differ between processors.
         return [Odometry(o.time, o.position.round(6), o.quaternion.round(8), o.linear.round(6),

@@ -16,14 +16,14 @@
 The simulator node: the camera, the odometry and both vehicles of a flight on the desk.
 
 Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, and
-``ranges`` where the scenario has them, in real time. The follower is flown by an embedded
+``ranges`` if the scenario has them, in real time. The follower is flown by an embedded
 autopilot, connected to a ``mavlink_bridge`` on this machine. Follower and leader hover until
 ``planner/state`` reports that it is engaged and the autopilot is in offboard mode. Then the
 scenario begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an external autopilot, usually a simulator, and
 ``truth_connection`` reports its place. The leader appears at the place of the scenario as soon as
-``mavlink_bridge/state`` is ACTIVE. The scenario ends early where that is ACTIVE no more; the node
+``mavlink_bridge/state`` is ACTIVE. The scenario ends early if that is ACTIVE no more; the node
 ends when, after the scenario, the vehicle is disarmed. With ``leader_truth_connection`` the leader
 is another such vehicle, and is seen where it truly is. With ``leader_topic`` the leader is the
 vehicle of another simulator node, so followers fly in a column; the node ends with that one.
@@ -62,14 +62,14 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
-from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
+from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT
 from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
-LATE = 0.5  # s behind the clock from which on /diagnostics complains
+LATE = 0.5  # s behind the clock from which on /diagnostics reports an error
 #: Poses of an external vehicle arrive up to this much later, ns.
 POSES_LATE_NS = 40_000_000
 #: Messages taken in each service period: the vehicle ahead sends at 50 Hz, too.
@@ -127,7 +127,7 @@ class Simulator(FlockNode):
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
         self._early: tuple[float, str] | None = None
-        """When the bridge ended the scenario before its time, s, and with which words."""
+        """When the bridge ended the scenario before its time, s, and its state then."""
         self._line = LiveLine()
         self._delay = SchedulingDelay(os.getppid()) if self._values['end_if_busy'] else None
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
@@ -309,7 +309,7 @@ class Simulator(FlockNode):
         assert isinstance(self._vehicle, ExternalVehicle)
         self._vehicle.offboard = message.data.startswith('ACTIVE')
         if self._early is None and 0.0 <= self._flight.time < self._duration and (
-                not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
+                not message.data.startswith((ACTIVE, NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
     def _problem(self, now: float) -> Problem | None:
@@ -349,7 +349,7 @@ def _logged(state: Odometry) -> tuple[Array, Array, Array]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; exit code 0 at the end of the scenario, 1 or 3 for what cannot be flown."""
+    """Run the node; exit code 0 at the end of the scenario, 1 or 3 if it cannot be flown."""
     cv2.setNumThreads(1)  # OpenCV's threads take twice the time, waiting
     return run(Simulator, args, Simulator.fly)
 

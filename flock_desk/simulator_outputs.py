@@ -37,8 +37,8 @@ from flock_desk.closed_loop.real_time_flight import RenderedImage
 from flock_desk.external.external_motion import ExternalMotion, Motion
 from flock_desk.sensors.vio import Odometry as TrueMotion
 from flock_follower.geometry import normalize_quaternion
-from flock_follower.messages import from_odometry
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.messages import from_odometry, odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import Rate
 from flock_follower.nodes.support.runtime import FlockNode
 
@@ -81,11 +81,11 @@ class SimulatorOutputs:
 
     def odometry(self, topic: str, stamp_ns: int, motion: TrueMotion) -> None:
         """Publish odometry, or a true motion."""
-        self._odometry[topic].publish(to_odometry(
-            nanoseconds_to_stamp(stamp_ns), ODOM_FRAME, _VEHICLES[topic], *motion[1:]))
+        self._odometry[topic].publish(odometry(
+            make, stamp_ns, ODOM_FRAME, _VEHICLES[topic], *motion[1:]))
 
     def motion(self, stamp_ns: int, true: TrueMotion) -> None:
-        """Publish the vehicle's true motion at 50 Hz, where another simulator wants it."""
+        """Publish the vehicle's true motion at 50 Hz, if another simulator subscribes."""
         if stamp_ns - self._motion_sent >= MOTION_PERIOD_NS and (
                 self._odometry[MOTION].get_subscription_count()):
             self._motion_sent = stamp_ns

@@ -30,16 +30,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import distributions
 import json
 import os
 from pathlib import Path
+import platform
 import re
 import sys
 import textwrap
-from typing import Any
+from typing import Any, Final
+import zipfile
 
-from flock_follower.checks.bug_report import newest_recording, write_report
-from flock_follower.checks.every_check import judge_all
+from flock_follower.bags.recording import NAME
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -50,16 +53,18 @@ from flock_follower.checks.findings import (
     WARNING,
 )
 from flock_follower.checks.observations import Observations
-from flock_follower.checks.recorded_system import check_bag
+from flock_follower.checks.recorded_system import check_bag, judge_all
 from flock_follower.checks.topic_names import full_name, parse_remaps
-from flock_follower.files import resource
-from flock_follower.parameters.black_box_table import folder
+from flock_follower.files import resource, whole_file
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
+from flock_follower.parameters.tables import recordings_folder
 from flock_follower.ranges import Range
 
 SECONDS = 6.0
 VALID_SECONDS = Range(1.0, 600.0, 's')
 COLUMNS = 100
+#: Larger files of a recording are left out of a bug report, bytes; the black box writes none.
+LARGEST: Final = 200_000_000
 _MARKS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR', UNMEASURED: '?'}
 
 
@@ -131,12 +136,13 @@ def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
 
 def _report(options: argparse.Namespace, seen: Observations,
             findings: Sequence[Finding]) -> None:
-    """Write the file for a bug report."""
+    """Write the file for a bug report, with the newest recording, and print its size."""
     recorder = seen.statuses.get(full_name('black_box', options.namespace).lstrip('/'))
     running = Path(recorder.values.get('recording', '')) if recorder else Path()
+    home = os.environ.get('ROS_HOME', '')
     recording = options.bag or (running if running.name and running.exists() else newest_recording(
-        folder({'record_folder': ''}, os.environ.get('ROS_HOME', ''), options.namespace)))
-    write_report(options.report, seen, table(seen, findings), as_json(seen, findings), recording)
+        recordings_folder({'record_folder': ''}, home, options.namespace)))
+    write_report(options.report, seen, findings, recording)
     print(f'{options.report}: {options.report.stat().st_size / 1e6:.1f} MB, recording: '
           f'{recording or "none found"}', file=sys.stderr)
 
@@ -169,6 +175,49 @@ def table(seen: Observations, findings: Sequence[Finding]) -> str:
     if unknown:
         counts += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
     return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {counts}', COLUMNS)])
+
+
+def write_report(path: Path, seen: Observations, findings: Sequence[Finding],
+                 recording: Path | None) -> None:
+    """
+    Write the zip file of a bug report.
+
+    :param recording: a bag, of which the newest file is included, and the YAML files beside it;
+        None: there is none.
+    :raises OSError: naming the file, if it cannot be written.
+    """
+    with whole_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr('versions.txt', versions())
+        archive.writestr('check.txt', f'{table(seen, findings)}\n')
+        for name, content in (
+                ('check.json', as_json(seen, findings)), ('parameters.json', seen.parameters),
+                ('diagnostics.json', {
+                    node: asdict(status) for node, status in seen.statuses.items()})):
+            archive.writestr(name, json.dumps(content, indent=1, default=str))
+        for each in _files(recording) if recording else ():
+            if each.stat().st_size <= LARGEST:
+                archive.write(each, f'recording/{each.name}')
+
+
+def versions() -> str:
+    """Return the versions of Python, the system and the installed packages, one per line."""
+    packages = sorted(f'{each.name} {each.version}' for each in distributions())
+    return '\n'.join([f'Python {platform.python_version()}', platform.platform(), *packages, ''])
+
+
+def newest_recording(recordings: Path) -> Path | None:
+    """Return the newest recording of the black box in a folder; None if there is none."""
+    numbers = {path: int(name[1]) for path in recordings.glob('*_*')
+               if (name := NAME.fullmatch(path.name)) and any(path.glob('*.mcap'))}
+    return max(numbers, key=numbers.__getitem__, default=None)
+
+
+def _files(recording: Path) -> list[Path]:
+    """Return the YAML files of a bag and its newest file of messages."""
+    if recording.is_file():
+        return [recording]
+    data = [file for file in recording.iterdir() if file.suffix in ('.mcap', '.db3')]
+    return [*recording.glob('*.yaml'), *sorted(data, key=lambda file: file.stat().st_mtime)[-1:]]
 
 
 if __name__ == '__main__':

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files: where the package's own ones are, however it was installed; atomic writes."""
+"""Files: paths of those that the package ships, for every kind of installation; atomic writes."""
 
 from __future__ import annotations
 

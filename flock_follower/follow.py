@@ -16,9 +16,10 @@
 One command to follow: check, then arm, take off, offboard, engage; a key confirms each step.
 
 Run ``ros2 run flock_follower follow`` beside the nodes. It ends with the findings of ``check`` if
-these prevent a flight. A line shows state, distance, reason and battery. If a step is refused, the
-reason is printed and the step stays due. The key l lands. Ctrl-C, SIGTERM and a closed terminal
-brake and hand over: the planner is disengaged, and the autopilot holds.
+these prevent a flight; if the vehicle is in the air already, it only lands or hands over. A line
+shows state, distance, reason and battery. If a step is refused, the reason is printed and the step
+stays due. The key l lands. Ctrl-C, SIGTERM and a closed terminal brake and hand over: the planner
+is disengaged, and the autopilot holds.
 
 Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or ``check`` finds a fault.
 """
@@ -31,8 +32,9 @@ import re
 import sys
 
 from flock_follower.check import SECONDS, table
-from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ready
+from flock_follower.checks.recorded_system import judge_all
+from flock_follower.checks.topic_names import full_name
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -60,7 +62,12 @@ def main(args: Sequence[str] | None = None) -> int:
         return 130
     findings = judge_all(seen)
     print(table(seen, findings))
-    return fly(options.namespace, not options.yes) if ready(findings) else 1
+    flyable = ready(findings)
+    bridge = seen.statuses.get(full_name('mavlink_bridge', options.namespace).lstrip('/'))
+    flying = bridge is not None and bridge.values.get('flying') == 'True'
+    if not flyable and (options.yes or not flying):
+        return 1
+    return fly(options.namespace, not options.yes, flyable)
 
 
 if __name__ == '__main__':

@@ -15,11 +15,11 @@
 """
 One follower as one object: events in, each with its time; estimates, commands and setpoints out.
 
-Perception, planner and setpoint control are the objects of the three nodes, each of which is a
-process. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated one in
-``flights``, which has no images and no perception: there the neighbor filter gives the estimates.
-Computing and passing messages take no time: an estimate reaches the planner with its image, or
-with the odometry for which the image waited; a command reaches the control at the tick.
+Perception, planner and setpoint control are the same three objects that the nodes drive, each in
+a process of its own. Here they share the clock of the caller: that of a bag in ``evaluate``, a
+simulated one in ``flights``, which needs no perception. Computing and passing messages on take no
+time: an estimate reaches the planner when its image comes, or the odometry that the image waits
+for; a command reaches the control at the tick.
 
 The planner ticks every ``period``, and when images cease; the control sends every
 1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
@@ -195,7 +195,7 @@ class Follower:
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
         """Take the status of the vehicle."""
         self.advance(time)
-        self._control.see(status, self._seconds(), airborne)
+        self._control.take_status(status, self._seconds(), airborne)
         self._announce_bridge_state()
 
     def estimate(self, time: int, velocity: Array) -> None:
@@ -374,7 +374,7 @@ class Follower:
         self._use_ranges(perceiver)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
-        for outcome in perceiver.tracker.ranged():
+        for outcome in perceiver.tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 self._publish_neighbor(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:

@@ -47,49 +47,52 @@ ODOMETRY = 'nav_msgs/msg/Odometry'
 RANGE = 'sensor_msgs/msg/Range'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
-#: The second joint of a command, see :func:`trajectory`.
-SEPARATION = 'separation'
-THRUST_BIAS = 'lift'
+#: The names of further joints of a command, see :func:`trajectory`; both are on the wire.
+SEPARATION_JOINT, THRUST_BIAS_JOINT = 'separation', 'lift'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
 RELATIVE = 'flock_relative'
-#: On this topic the bridge publishes it while that is flown on.
+#: Topic on which the bridge publishes that motion during flight without odometry.
 MOTION_TOPIC = 'mavlink/relative'
-#: s without a message in that frame after which odometry counts again.
+#: s without a message in that frame after which odometry is used again.
 RELATIVE_SILENCE = 0.15
 #: Largest acceleration without odometry, m/s^2: by 1 m/s^2 a quadrotor tilts by 6 degrees.
 RELATIVE_MAX = 1.0
 #: Oldest image that such a command may rest on, s.
 OLDEST_MARKER = 0.5
 #: Suffix of a neighbour's name on ``neighbors``: another object with the same marker. The planner
-#: keeps clear of it, and never follows it.
+#: avoids it, and never follows it.
 DUPLICATE = '/duplicate'
 
-# Plausible values: each room that judges a value from outside uses these.
-#: m, m/s, m/s^2, rad/s, and entries of covariances: a number beyond is an error. Its square may
+# Bounds of plausible values from outside, for all packages.
+#: m, m/s, m/s^2, rad/s, and entries of covariances: a larger number is an error. Its square may
 #: overflow in time, and a filter that uses it never recovers.
 SANE = 1e6
-#: m: a neighbour is not measured farther away; m/s: nothing that flocks is faster.
+#: m: a neighbour is not measured farther away; m/s: no vehicle of a flock is faster.
 FARTHEST, FASTEST = 100.0, 50.0
-#: m/s: the own velocity, and the highest ``v_max``.
+#: m/s: a faster own velocity is an error, and unknown. Up to this, not only to FASTEST, the gate
+#: brakes on it: 5 times the highest ``v_max``.
 FASTEST_OWN = 100.0
 #: m: a position that differs by more from the expected one has jumped.
 POSITION_JUMP = 0.3
 #: s: a stamp may be ahead by this much: clocks differ, and /clock comes in steps.
 FUTURE_TOLERANCE = 0.1
-#: s: a stamp farther back is a new start (a bag played again), not disorder.
+#: s: a stamp farther back is a new start (a bag played again), not a message out of order.
 MAX_JUMP = 0.5
 #: m: odometry farther from its prediction has another frame than before: places in the old frame
 #: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source.
 ODOMETRY_JUMP = 0.25
 #: m: a neighbour's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
+#: Standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
+#: of an odometry whose covariances are missing or invalid.
+ODOMETRY_STD = (0.1, 0.05, 0.1, 0.05)
 
 Make = Callable[[str], Any]
 
 
 def duplicate_name(name: str, number: int) -> str:
-    """Return what the first, second, ... duplicate of a neighbour is called."""
+    """Return the name of the first, second, ... duplicate of a neighbour."""
     return f'{name}{DUPLICATE}{f"_{number}" if number > 1 else ""}'
 
 
@@ -173,7 +176,7 @@ class OdometryState(NamedTuple):
 
 
 class OdometryChoice:
-    """Selects the odometry to use: that in the frame ``RELATIVE`` as long as it comes."""
+    """Selects the odometry to use: that in the frame ``RELATIVE`` while it is received."""
 
     def __init__(self) -> None:
         self._newest: int | None = None
@@ -220,7 +223,7 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     that put the linear velocity in the header's frame.
 
     :raises ValueError: if position, attitude or velocity is not finite, or beyond ``SANE``, or
-        the stamp is none.
+        the stamp is invalid.
     """
     pose, twist = message.pose.pose, message.twist.twist
     x = pose.orientation
@@ -300,7 +303,7 @@ class AccelerationState(NamedTuple):
 
 def from_acceleration(message: Any) -> AccelerationState:
     """
-    Return what an AccelWithCovarianceStamped of a neighbour says.
+    Return the acceleration in an AccelWithCovarianceStamped of a neighbour.
 
     :raises ValueError: if the acceleration is not finite, or beyond ``SANE``.
     """
@@ -340,7 +343,7 @@ class Command(NamedTuple):
     stamp: int = 0
     ahead: int = 0
     thrust_bias: float = 0.0
-    """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
+    """The part of its vertical acceleration, m/s^2, that offsets a wrong hover thrust."""
     relative: bool = False
     """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
 
@@ -363,9 +366,9 @@ def trajectory(make: Make, command: Command) -> Any:
     message.header.frame_id = RELATIVE if command.relative else command.frame
     joints = {'base_link': command.acceleration}
     if command.separation_axis is not None:
-        joints[SEPARATION] = command.separation_axis
+        joints[SEPARATION_JOINT] = command.separation_axis
     if command.thrust_bias:
-        joints[THRUST_BIAS] = [0.0, 0.0, command.thrust_bias]
+        joints[THRUST_BIAS_JOINT] = [0.0, 0.0, command.thrust_bias]
     message.joint_names = list(joints)
     transform, velocity = make('geometry_msgs/msg/Transform'), _twist(make, [math.nan] * 3)
     set_vector(transform.translation, [math.nan] * 3)
@@ -402,8 +405,8 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     q = point.transforms[0].rotation
     more = {name: to_array(beside.linear) for name, beside in zip(
         message.joint_names[1:], point.accelerations[1:])}
-    separation_axis = _direction(more[SEPARATION]) if SEPARATION in more else None
-    thrust_bias = float(more[THRUST_BIAS][2]) if THRUST_BIAS in more else 0.0
+    separation_axis = _direction(more.get(SEPARATION_JOINT, np.zeros(3)))
+    thrust_bias = float(more.get(THRUST_BIAS_JOINT, np.zeros(3))[2])
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,

@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The values that a number may take, and the one check of them; every room uses it."""
+"""The values that a number may take, with the one check of them; the remedy for a wrong name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
+import difflib
 from functools import cache
 import math
 from numbers import Integral, Real
@@ -27,7 +28,7 @@ from typing import Any
 @dataclass(frozen=True)
 class Range:
     """
-    Finite numbers from ``low`` to ``high``, in a unit; both belong to it, if not said otherwise.
+    Finite numbers from ``low`` to ``high``, both included, in a unit.
 
     ``above`` excludes ``low`` itself; ``whole`` admits integers only. No limit is infinity.
     """
@@ -67,6 +68,12 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
+#: Values of parameters that planner and gate have in common.
+A_MAX = Range(0.1, 20.0, 'm/s^2')
+V_MAX = Range(0.05, 20.0, 'm/s')
+ODOM_TIMEOUT = Range(0.05, 1.0, 's')
+
+
 def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,
               live: bool | None = None) -> Any:
     """
@@ -103,6 +110,12 @@ class Checked:
                     valid.check(name, number)
             elif value not in valid:
                 raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')
+
+
+def suggestion(name: str, known: Collection[str], otherwise: str = 'it has') -> str:
+    """Return the known name that is nearest to a wrong one as a question, else all of them."""
+    near = difflib.get_close_matches(name, sorted(known), n=1)
+    return f'did you mean {near[0]}?' if near else f'{otherwise} {", ".join(sorted(known))}'
 
 
 def first_reason(*checks: tuple[object, str]) -> str:

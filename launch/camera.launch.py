@@ -28,7 +28,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
-from flock_follower.parameters.launch_arguments import refuse_unknown
+from flock_follower.parameters.spec import refuse_arguments
 
 FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 #: RealSense D435i: the left infrared image, emitter off. The IMU is 12 mm behind the lens, 6 mm to
@@ -70,7 +70,7 @@ def declare(context: LaunchContext) -> list[Any]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description; the file included takes the arguments declared here."""
-    refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *runpy.run_path(FOLLOWER)['ARGUMENTS']})
+    refuse_arguments(sys.argv, __file__, {*ARGUMENTS, *runpy.run_path(FOLLOWER)['ARGUMENTS']})
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
     return LaunchDescription([

@@ -30,7 +30,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
-from flock_follower.parameters.launch_arguments import refuse_unknown
+from flock_follower.parameters.spec import refuse_arguments
 
 MOST = 8  # each takes about one core
 EACH = {'namespace', 'target_system', 'connection'}  # every follower has its own
@@ -59,7 +59,7 @@ def start(context: LaunchContext) -> list[Any]:
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description."""
     of_follower = runpy.run_path(str(Path(__file__).with_name('follower.launch.py')))['ARGUMENTS']
-    refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *(of_follower.keys() - EACH)})
+    refuse_arguments(sys.argv, __file__, {*ARGUMENTS, *(of_follower.keys() - EACH)})
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

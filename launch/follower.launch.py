@@ -30,7 +30,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
 
-from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_unknown
+from flock_follower.parameters.spec import END_WITH_LAUNCH, refuse_arguments
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic and service'),
@@ -121,7 +121,7 @@ def start(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description."""
-    refuse_unknown(sys.argv, __file__, ARGUMENTS)
+    refuse_arguments(sys.argv, __file__, ARGUMENTS)
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -37,7 +37,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_unknown
+from flock_follower.parameters.spec import END_WITH_LAUNCH, refuse_arguments
 
 FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 ARGUMENTS = {
@@ -60,7 +60,7 @@ def generate_launch_description() -> LaunchDescription:
     the scenario. Limits and band are those of ``config``, not of the scenario.
     """
     of_follower = runpy.run_path(FOLLOWER)['ARGUMENTS'].keys() - {'connection', 'target_system'}
-    refuse_unknown(sys.argv, __file__, {*ARGUMENTS, *of_follower})
+    refuse_arguments(sys.argv, __file__, {*ARGUMENTS, *of_follower})
     port = LaunchConfiguration('port')
     simulator = Node(
         package='flock_follower', executable='simulator', exec_name='simulator', output='screen',

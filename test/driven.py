@@ -21,12 +21,14 @@ from collections.abc import Callable
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
+from flock_follower.messages import odometry, stamp_to_nanoseconds
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
 START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
 DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
@@ -40,6 +42,11 @@ def overrides(**values: Any) -> list[Parameter]:
 def as_taken(subscription: Subscription, message: Any) -> Any:
     """Return a message as a subscription passes it to its callback."""
     return serialize_message(message) if subscription.raw else message
+
+
+def to_odometry(stamp: Time, *fields: Any) -> Any:
+    """Return an Odometry message of rclpy; for the fields see ``messages.odometry``."""
+    return odometry(make, stamp_to_nanoseconds(stamp), *fields)
 
 
 class Driven:

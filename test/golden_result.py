@@ -29,8 +29,8 @@ from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.files import resource
 from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nanoseconds
 from flock_follower.odometry.reader import OdometrySource
-from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
+from flock_follower.parameters.tables import RELATIVE_POSE, tracker
 from flock_follower.perception.pending_images import Perceiver
 
 GOLDEN = Path(__file__).resolve().parent / 'frozen' / 'sample.csv'
@@ -70,8 +70,8 @@ def _row(topic: str, message: object, start: int) -> Row:
 
 def neighbors() -> list[Row]:
     """Return the rows of the neighbours from perception alone, which needs no pymavlink."""
-    values = check_values(SPECS, {})
-    perceiver, source = Perceiver(build(values), max_wait=values['max_wait']), OdometrySource()
+    values = check_values(RELATIVE_POSE, {})
+    perceiver, source = Perceiver(tracker(values), max_wait=values['max_wait']), OdometrySource()
     rows: list[Row] = []
     with open_bag(BAG) as bag:
         for topic, msgtype, time, data in bag.messages(

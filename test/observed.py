@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from flock_follower.checks.collector import read_own_motion
-from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.image_motion import COLUMNS, ROWS
 from flock_follower.checks.observations import (
@@ -36,6 +35,7 @@ from flock_follower.checks.observations import (
     TopicEnd,
     TopicSeen,
 )
+from flock_follower.checks.recorded_system import judge_all
 from flock_follower.checks.topic_names import names_there, TYPES
 from flock_follower.files import resource
 from flock_follower.geometry import (

@@ -35,9 +35,10 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Tran
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import ippe, marker_corners, refine
 from flock_follower.perception.look import View
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
+from flock_follower.perception.pose import ippe, refine
 from flock_follower.perception.time_offset import TimeOffset
 from flock_follower.perception.tracker import camera_mounting
 

@@ -23,16 +23,11 @@ from typing import Any
 from launch_files import Context, LAUNCH, launched, stand_ins
 import pytest
 
-from flock_follower.parameters import (
-    black_box_table,
-    mavlink_bridge_table,
-    planner_table,
-    relative_pose_table,
-)
+from flock_follower.parameters.tables import BLACK_BOX, MAVLINK_BRIDGE, PLANNER, RELATIVE_POSE
 
 PAGE = (LAUNCH.parent / 'docs' / 'sensors.md').read_text(encoding='utf-8')
-SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
-         'mavlink_bridge': mavlink_bridge_table.SPECS, 'black_box': black_box_table.SPECS}
+SPECS = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER, 'mavlink_bridge': MAVLINK_BRIDGE,
+         'black_box': BLACK_BOX}
 RECIPES = ('d435i_openvins', 'd435i_vins_fusion', 'd435i_rtabmap', 't265', 'usb_camera')
 FOLLOWER, CAMERA = 'follower.launch.py', 'camera.launch.py'
 END_WITH_LAUNCH = ['setpriv', '--pdeathsig', 'TERM']

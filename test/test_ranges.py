@@ -27,7 +27,7 @@ import pytest
 
 from flock_desk import scenarios
 import flock_follower
-from flock_follower.parameters import mavlink_bridge_table
+from flock_follower.parameters.tables import origin
 from flock_follower.ranges import Checked, parameter, Range
 
 SPEED = Range(0.05, 20.0, 'm/s')
@@ -117,6 +117,6 @@ def test_every_number_of_a_checked_dataclass_has_a_range() -> None:
     ([0.0, -181.0, 0.0], r'longitude = -181\.0: must be a number in \[-180, 180\] deg'),
     ([0.0, 0.0, 2e4], r'height = 20000\.0: must be a number in \[-10000, 10000\] m')])
 def test_an_origin_off_the_earth_is_refused(place: list[float], message: str) -> None:
-    assert mavlink_bridge_table.origin([47.4, 8.5, 488.0]) == (47.4, 8.5, 488.0)
+    assert origin([47.4, 8.5, 488.0]) == (47.4, 8.5, 488.0)
     with pytest.raises(ValueError, match=rf'^global_origin = \[.*\]: {message}$'):
-        mavlink_bridge_table.origin(place)
+        origin(place)

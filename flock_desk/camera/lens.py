@@ -84,7 +84,7 @@ class Camera:
         """
         Return the pixels (n, 2) that see points (n, 3) of the optical frame ahead of it.
 
-        A point further off the axis than every pixel appears just outside of the image.
+        A point farther off the axis than every pixel appears just outside of the image.
         """
         aside = points[:, :2] / points[:, 2:]
         radius = np.maximum(np.hypot(aside[:, 0], aside[:, 1]), 1e-9)

@@ -22,7 +22,7 @@ whose noise has the covariance given with them; a marker is seen if it is in the
 not too oblique, with no vehicle in between.
 
 ============  ========  =======================================================
-what          rate, Hz  remark
+part          rate, Hz  remark
 ============  ========  =======================================================
 vehicle, air  120       first the vehicle moves, then everything looks
 odometry      60        arrives ``latency`` later; messages arrive, too
@@ -103,7 +103,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
 
 
 def _noise(scenario: Scenario) -> PerceptionNoise:
-    """Return the errors of perception, and what the cameras of a scenario see."""
+    """Return the errors of perception, and the field of view of a scenario's cameras."""
     flock, usual = scenario.flock, PerceptionNoise()
     if flock is None:
         return usual

@@ -26,7 +26,7 @@ import numpy as np
 
 from flock_desk.closed_loop.scenario_run import ScenarioRun
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.external_motion import ExternalMotion, LONGEST_GAP, Motion
+from flock_desk.external.external_motion import ExternalMotion, Motion, POSE_GAP
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
 from flock_desk.vehicles.flight_log import FlightLog
@@ -39,7 +39,7 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 
-#: Set up as config/px4.params recommends, where PX4's defaults are others.
+#: The values of config/px4.params that differ from PX4's defaults.
 RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,
                       'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 
@@ -138,7 +138,7 @@ class ExternalLeader(_Reported):
     def motion(self, time_ns: int, time: float) -> Odometry | None:
         """Return the reported motion; of a future moment, the newest; None once poses stall."""
         newest, at = self._motion.newest, self._start_ns + time_ns
-        if newest is None or at - newest > LONGEST_GAP:
+        if newest is None or at - newest > POSE_GAP:
             return None
         return self.at(time_ns)._replace(time=time)
 

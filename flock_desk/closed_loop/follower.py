@@ -65,10 +65,10 @@ from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParam
 from flock_follower.planner.sight import View
 from flock_follower.planner.step import Decision
 
-_AFTER = 1  # ns by which ticks come after what arrives at their moment
+_AFTER = 1  # ns by which ticks come after the messages of their moment
 _ZERO, _LEVEL = np.zeros(3), np.eye(3)
 _UNKNOWN = np.zeros((6, 6))
-_ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is known
+_ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of an unknown yaw
 MANUAL, TAKEOFF = 'POSCTL', PX4.takeoff_modes[0]  # the pilot's mode, and that of the take-off
 HEARTBEAT_PERIOD: Final = 1.0  # s
 SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T as recommended
@@ -156,7 +156,7 @@ class SimulatedFollower(Listener):
             self._follower.receive(to_nanoseconds(now), message)
 
     def plan(self, now: float, looked: list[float], seen: list[Sighted]) -> None:
-        """Tick with what has arrived: stamps of images, s, and estimates."""
+        """Tick with the arrivals: stamps of images, s, and estimates."""
         if self.failed:
             return
         for stamp in looked:

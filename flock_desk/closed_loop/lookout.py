@@ -276,7 +276,7 @@ _Coming = list[tuple[float, T]]
 
 
 def _due(coming: _Coming[T], now: float) -> list[T]:
-    """Take out what has arrived."""
+    """Remove and return the items that have arrived."""
     due = [each for arrival, each in coming if arrival <= now + 1e-9]
     coming[:] = [each for each in coming if each[0] > now + 1e-9]
     return due

@@ -47,7 +47,7 @@ from flock_follower.geometry import (
 STEP_NS = round(STEP * 1e9)
 IMAGE_RATE = 30  # Hz
 FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
-#: An image that is due for longer than this is left out, ns: where the machine does not keep up,
+#: An image that is due for longer than this is left out, ns: if the machine does not keep up,
 #: odometry and vehicle come first.
 LATEST_NS = 30_000_000
 SENSOR = Sensor(sub_poses=2)
@@ -131,7 +131,7 @@ class RealTimeFlight:
         return arrived
 
     def measured(self) -> float | None:
-        """Return the distance that radios measure at the last step, m, where it is time to."""
+        """Return the distance that radios measure at the last step, m; None if none is due."""
         if self._radios is None or math.isnan(self.distance):
             return None
         radios, due = self._radios

@@ -204,10 +204,10 @@ class World:
 
     def flown(self, now: float) -> list[tuple[Array, Array, float, Array, float]]:
         """
-        Return each vehicle's position, velocity and yaw, and what its autopilot knows.
+        Return each vehicle's position, velocity, yaw, and its autopilot's velocity and height, m.
 
-        That is a velocity, and a height, m, by its barometer, which rests on no odometry. To be
-        called once in every control cycle: each call is a new sample of the noise.
+        The height is that of its barometer, which rests on no odometry. To be called once in every
+        control cycle: each call is a new sample of the noise.
         """
         vehicle = self.vehicle
         return list(zip(vehicle.position, vehicle.velocity, vehicle.yaw.tolist(),

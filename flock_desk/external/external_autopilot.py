@@ -42,7 +42,7 @@ from flock_desk.external.external_motion import (
     ESTIMATE,
     ExternalMotion,
     HIL_STATE,
-    LONGEST_GAP,
+    POSE_GAP,
     SIM_STATE,
 )
 from flock_follower.mavlink.link import Link
@@ -108,11 +108,11 @@ class ExternalAutopilot:
 
     def await_pose(self, timeout: float, why_truth: str, wanted: Callable[[], bool]) -> None:
         """
-        Wait until the motion is known; take the autopilot's estimate where no truth comes.
+        Wait until the motion is known; take the autopilot's estimate if no truth comes.
 
         :param why_truth: why an estimate will not do; '': it will.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: if nothing comes within ``timeout`` s, or no truth where it has to.
+        :raises ValueError: if nothing comes within ``timeout`` s, or no truth although it must.
         """
         deadline = time.monotonic() + timeout
         while wanted():
@@ -138,7 +138,7 @@ class ExternalAutopilot:
 
     @property
     def flying(self) -> bool:
-        """Return whether it has said that it is in the air."""
+        """Return whether it has reported that it is in the air."""
         return self._link.telemetry.landed == mavlink.MAV_LANDED_STATE_IN_AIR
 
     @property
@@ -264,12 +264,12 @@ class ExternalVehicles:
         problems = []
         for name, link in self._links:
             # Whether the leader's poses reach up to now is known a little later.
-            at = self.start_ns + time_ns - (LONGEST_GAP if name == 'leader' else 0)
+            at = self.start_ns + time_ns - (POSE_GAP if name == 'leader' else 0)
             lacking = 'no image' if name == 'leader' else 'no image, no odometry'
             age = now - link.known
             if age > LATE:
                 problems.append(
                     f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
-            elif time_ns > 2 * LONGEST_GAP and not link.motion.knows(at):  # one pose at first
+            elif time_ns > 2 * POSE_GAP and not link.motion.knows(at):  # one pose at first
                 problems.append(f'poses of the {name} come too far apart: {lacking} between them')
         return '; '.join(problems)

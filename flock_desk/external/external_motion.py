@@ -15,7 +15,7 @@
 """
 The motion of a vehicle that an external autopilot flies, from its MAVLink messages.
 
-Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); where neither
+Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); if neither
 comes, the autopilot's own estimate is LOCAL_POSITION_NED with ATTITUDE_QUATERNION. Times are
 integer nanoseconds of one monotonic clock, given by the caller; no clock is read here.
 """
@@ -28,14 +28,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import (
-    Array,
-    frd_to_flu,
-    ned_to_enu,
-    normalize_quaternion,
-    quaternion_ned_frd_to_enu_flu,
-    slerp,
-)
+from flock_follower.geometry import Array, ned_to_enu, slerp
+from flock_follower.mavlink.telemetry import decode_attitude
 
 SIM_STATE: Final[str] = 'SIM_STATE'
 HIL_STATE: Final[str] = 'HIL_STATE_QUATERNION'
@@ -45,8 +39,8 @@ CLOCK: Final[str] = 'SYSTEM_TIME'
 TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
 MEMORY: Final[int] = 256
 """Number of poses kept: more than one second."""
-LONGEST_GAP: Final[int] = 150_000_000
-"""Poses further apart than this, ns, have no known motion between them."""
+POSE_GAP: Final[int] = 150_000_000
+"""Poses farther apart than this, ns, have no known motion between them."""
 SMOOTHING: Final[float] = 1.0
 """Time constant, s, of the correction of the integrated velocity by reported places."""
 JUMP: Final[float] = 0.5
@@ -101,7 +95,7 @@ class ExternalMotion:
         elif kind == ESTIMATE and self.estimated:
             self._estimate(message, now)
         elif kind == ATTITUDE and self.estimated:
-            self._turned = _attitude(
+            self._turned = decode_attitude(
                 [message.q1, message.q2, message.q3, message.q4],
                 (message.rollspeed, message.pitchspeed, message.yawspeed))
 
@@ -120,7 +114,7 @@ class ExternalMotion:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
         before, after = self._around(time)
         return after is not None and (after.time == time or (
-            before is not None and after.time - before.time <= LONGEST_GAP))
+            before is not None and after.time - before.time <= POSE_GAP))
 
     def at(self, time: int) -> Motion:
         """
@@ -162,7 +156,7 @@ class ExternalMotion:
             rates = message.rollspeed, message.pitchspeed, message.yawspeed
         if not latitude and not longitude:
             return  # not simulated yet, or an ArduPilot before 4.3, whose floats are too coarse
-        turned = _attitude(quaternion, rates)
+        turned = decode_attitude(quaternion, rates)
         if turned is not None:
             self.source = message.get_type()
             self._place(now, self._local(latitude * 1e-7, longitude * 1e-7, height),
@@ -198,13 +192,3 @@ class ExternalMotion:
                 share = 1.0 - math.exp(-elapsed / SMOOTHING)
                 position = expected + share * (reported - expected)
         self.add(Motion(now, position, velocity, *turned))
-
-
-def _attitude(wxyz: list[float],
-              rates: tuple[float, float, float]) -> tuple[Array, Array] | None:
-    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are invalid."""
-    try:
-        quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
-    except ValueError:
-        return None
-    return quaternion, np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)

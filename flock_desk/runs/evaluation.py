@@ -18,7 +18,7 @@ One bag through perception, planner and gate, and the record of it.
 A message comes when it was recorded, so images and odometry are as late, and in the same order,
 as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
 mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
-``odom`` stand in where ``velocity_source`` asks for them.
+``odom`` replace them if ``velocity_source`` requires them.
 """
 
 from __future__ import annotations
@@ -66,11 +66,9 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
-from flock_follower.odometry.cdr import read_odometry
-from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters import planner_table, relative_pose_table
-from flock_follower.parameters.cameras_table import cameras, CameraValues
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import cameras, CameraValues, planner_params, tracker
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
@@ -78,7 +76,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
-#: What the autopilot is taken to be while the bag was recorded.
+#: The assumed status of the autopilot while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
 IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
@@ -155,10 +153,9 @@ class Evaluation(Listener):
         perception, bridge = values['relative_pose'], values['mavlink_bridge']
         self.bag, self.writer = bag, writer
         self.duration = bag.duration_ns / NANOSECONDS
-        self.params = planner_table.build(values['planner'])
-        self.perceiver = Perceiver(
-            relative_pose_table.build(perception), max_wait=perception['max_wait'])
-        # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
+        self.params = planner_params(values['planner'])
+        self.perceiver = Perceiver(tracker(perception), max_wait=perception['max_wait'])
+        # Other inputs of the planner, such as require_bridge, are as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.params, Gate(
                 filled(GateLimits(), bridge), bridge['velocity_source']),

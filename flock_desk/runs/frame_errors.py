@@ -53,7 +53,7 @@ STAGES = ('none', 'track', 'roi', 'full')
 
 #: The columns of n images by name, (n,) or (n, 3), see :meth:`FrameErrors.table`.
 Table = Mapping[str, Array]
-#: States further apart than this are not interpolated, ns.
+#: States farther apart than this are not interpolated, ns.
 MAX_GAP = NANOSECONDS // 2
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))

@@ -15,8 +15,8 @@
 """
 Work in other processes: children that are always stopped, and tasks for a Dask cluster.
 
-Dask is an extra, ``pip install 'flock_follower[cluster]'``, imported only where it is asked for;
-its workers need this package in the same version, and the same files where tasks name some.
+Dask is an extra, ``pip install 'flock_follower[cluster]'``, imported only on request;
+its workers need this package in the same version, and the files that tasks name.
 """
 
 from __future__ import annotations
@@ -107,16 +107,16 @@ def free_udp_port() -> int:
             return port
 
 
-def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None:
+def wait_until(condition: Callable[[], bool], timeout: float, event: str) -> None:
     """
     Wait until the condition holds, looking every 20 ms.
 
-    :raises TimeoutError: naming ``what`` is missing, after ``timeout`` seconds.
+    :raises TimeoutError: naming the ``event`` that did not come within ``timeout`` seconds.
     """
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError(f'waited {timeout:g} s in vain for {what}')
+            raise TimeoutError(f'waited {timeout:g} s in vain for {event}')
         time.sleep(0.02)
 
 
@@ -245,7 +245,7 @@ class Processes:
 
         :param given_up: returns why to stop asking, '' to go on.
         :param value: ``('false',)``, or ``()`` for a Trigger.
-        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds; says why.
+        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds, with the reason.
         """
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout
@@ -295,7 +295,7 @@ class Processes:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        """Stop whatever still runs."""
+        """Stop the children that still run."""
         self.stop_all()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)

@@ -100,7 +100,7 @@ class LiveFlight(Flight):
     """
     A flight of a scenario, in the odom frame without drift; its paths are the true ones.
 
-    An image of the table counts as one with the leader in view if the simulator says that the
+    An image of the table counts as one with the leader in view if the simulator reports that the
     leader can be seen and placed. ``log`` is the simulator's, see ``FlightLog``, cut to the
     scenario. If an external autopilot flew it, ``setpoints`` are the planner's commands.
     """
@@ -280,7 +280,7 @@ def estimates(states: Iterable[OdometryState]) -> dict[int, dict[str, Estimate]]
     """
     Return the estimates of states published on ``neighbors``, by stamp, ns, and name.
 
-    What a state does not hold is zero. Those of flight without odometry are in no frame of it.
+    Missing parts of a state are zero. Those of flight without odometry are in no frame of it.
     """
     found: dict[int, dict[str, Estimate]] = {}
     for state in states:

@@ -14,7 +14,7 @@
 
 
 """
-What ``evaluate``, ``demo`` and ``fly`` show of a flight: a table on the console, a page of HTML.
+The results of ``evaluate``, ``demo`` and ``fly``: a table on the console, a page of HTML.
 
 The console names figures by their keys in summary.json, as bounds do; the page in words, with the
 key beside each bound, and in the tooltip of each figure.
@@ -194,7 +194,7 @@ def _group(group: str, figures: Mapping[str, Any]) -> str:
 
 
 def text(value: Any) -> str:
-    """Return a figure with the digits that people read."""
+    """Return a figure as text, rounded for reading."""
     if value is None:
         return 'unknown'
     if isinstance(value, bool):

@@ -40,7 +40,7 @@ from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 
-#: Attitudes further than this from the truth count as wrong, rad.
+#: Attitudes farther than this from the truth count as wrong, rad.
 WRONG_ATTITUDE = math.radians(20.0)
 #: A mean NEES of three-dimensional errors that is still consistent; 3 is expected.
 CONSISTENT = (1.5, 6.0)
@@ -60,7 +60,7 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of
     a track: the planner refuses them. ``velocity_rms_of_all_m_s`` does not. ``nees_`` are means,
-    3 where covariances are right.
+    3 if covariances are right.
     """
     rows = {column: np.concatenate([table[column] for table in tables]) for column in tables[0]}
     found, known = np.isfinite(rows['distance']), np.isfinite(rows['true_distance'])

@@ -40,7 +40,7 @@ from flock_follower.geometry import Array
 STEP = 1.0 / 120.0  # s
 TURN_GAIN, TURN_RATE = 2.0, 1.0  # 1/s and rad/s, of a leader that faces away from the follower
 Stretch = tuple[float, float, float, float]  # duration, s; forward, left and up, m/s
-_SLACK = 1.02  # what sampling may add to the bound on the acceleration
+_SLACK = 1.02  # factor on the bound on the acceleration: sampling adds to it
 
 
 @dataclass(frozen=True)

@@ -323,7 +323,7 @@ class Scenario(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.flock is not None and self.flock.ranges and not self.ranges.rate:
-            raise ValueError('ranges: rate = 0: must be above 0 Hz where flock: ranges is true')
+            raise ValueError('ranges: rate = 0: must be above 0 Hz if flock: ranges is true')
         if self.flock is not None and self.prints:
             raise ValueError('prints: only for one follower: there must be no flock')
 
@@ -350,7 +350,7 @@ class Scenario(Part):
         """
         Return the generator of one thing that chance decides in one run.
 
-        :param follower: its number, where each has its own; the first has that of a lone one.
+        :param follower: its number, if each has its own; the first has that of a lone one.
         """
         whose = what if follower == 1 else f'{what}/follower_{follower}'
         return np.random.default_rng([run, zlib.crc32(f'{self.name}/{whose}'.encode())])

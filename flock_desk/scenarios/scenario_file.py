@@ -53,7 +53,7 @@ _KINDS = {float: 'a number', int: 'an integer', str: 'a text', bool: 'true or fa
 
 
 class ScenarioError(ValueError):
-    """A scenario file that cannot be flown; the message says where and why."""
+    """A scenario file that cannot be flown; the message names the key and the reason."""
 
 
 def names() -> list[str]:

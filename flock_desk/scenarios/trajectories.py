@@ -16,10 +16,10 @@
 Trajectories of a rendered flight: a leader on a winding course and its follower.
 
 The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form
-and the course goes on for as long as wanted, forwards. The follower is flown in closed loop by
+and the course has no end, and leads forwards. The follower is flown in closed loop by
 the project's own law at 10 Hz, through an attitude lag, and turns its camera towards the leader,
-so that a planner's commands in replay resemble the recorded flight. Where a wider range is wanted
-than the law allows, it falls back from the leader and catches up again instead (:class:`Swing`).
+so that a planner's commands in replay resemble the recorded flight. For a wider range than the law
+allows, it falls back from the leader and catches up again instead (:class:`Swing`).
 
 Everything is in the odom frame (ENU, origin below the follower's start), m, s, rad. States are
 rounded at every step: differences in the last bit between processors do not grow.

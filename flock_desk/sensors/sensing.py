@@ -36,7 +36,7 @@ DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back'
 @dataclass(frozen=True)
 class PerceptionNoise:
     """
-    Standard deviations of a marker's measured position, and what the camera sees.
+    Standard deviations of a marker's measured position, and the camera's field of view.
 
     As measured on rendered flights, marker 0.16 m and focal length 611 px: along the line of
     sight 0.4 mm at 1.2 m, 1.2 mm at 2.2 m, 2 to 6 mm at 3 to 4 m with motion blur.

@@ -47,7 +47,7 @@ _NO_COVARIANCE = np.zeros((6, 6))
 
 
 class Odometry(NamedTuple):
-    """What a ``nav_msgs/Odometry`` holds: pose in odom, twist in the child frame."""
+    """The content of a ``nav_msgs/Odometry``: pose in odom, twist in the child frame."""
 
     time: float
     """s."""
@@ -182,7 +182,7 @@ class GaussMarkov:
     :param size: of the vector that each is.
     :param deviation: of each component, standard; :param memory: its time constant, s.
     :param period: between steps, s.
-    :param bias: standard deviation of what does not change, and adds to it.
+    :param bias: standard deviation of the constant part, which is added.
     """
 
     def __init__(self, generators: Sequence[np.random.Generator], size: int, deviation: float,

@@ -56,7 +56,7 @@ class ArduCopter(FlightController):
         self._stop()
 
     def on_setpoint(self, message: Any, now: float) -> None:
-        """Take an acceleration, in GUIDED only; whatever else comes stops it."""
+        """Take an acceleration, in GUIDED only; any other setpoint stops it."""
         if self.mode != 'GUIDED':
             return
         setpoint = decode_setpoint(message)

@@ -107,7 +107,7 @@ class EmbeddedAutopilot:
         return self._start + self._steps * STEP
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
-        """Take bytes that have arrived, and return what goes out at once."""
+        """Take bytes that have arrived, and return the datagrams to send at once."""
         answers = []
         for message in self._codec.parse_buffer(data) or []:
             if now >= self._silent_until:
@@ -116,7 +116,7 @@ class EmbeddedAutopilot:
         return answers
 
     def step(self, now: float) -> list[bytes]:
-        """Fly on to ``now``, a STEP after the last, and return what goes out."""
+        """Fly on to ``now``, a STEP after the last, and return the datagrams to send."""
         self._steps += 1
         messages = []
         vehicle, controller = self.vehicle, self.controller
@@ -265,7 +265,7 @@ class EmbeddedAutopilot:
                 return (boot_ms, w, x, y, z,
                         *flu_to_frd(self.vehicle.angular_velocity).tolist())
             case 'GLOBAL_POSITION_INT' if met['global']:
-                # Vision alone says nothing of where on Earth it is.
+                # Vision alone knows no place on Earth.
                 heading = round(math.degrees(math.pi / 2.0 - estimate.yaw) % 360.0 * 100.0) % 36000
                 return (boot_ms, *global_position(position),
                         round(float(position[2] - home[2]) * 1e3),

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the embedded autopilot measures: its position estimator, barometer and battery.
+The sensors of the embedded autopilot: its position estimator and its barometer.
 
 With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
 they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
@@ -47,7 +47,7 @@ from flock_follower.geometry import (
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2
-#: Vision further than this from the estimate, m, is an outlier unless it announces a reset.
+#: Vision farther than this from the estimate, m, is an outlier unless it announces a reset.
 INNOVATION_GATE: Final[float] = 1.0
 _TIME_CONSTANT: Final[float] = 0.2  # s in which the estimate follows the vision
 _FUTURE: Final[float] = 0.1  # s
@@ -76,12 +76,12 @@ class Estimator:
 
     @property
     def position(self) -> Array:
-        """Return where it takes itself to be, (3,), m."""
+        """Return the estimated position (3,), m."""
         return self._vehicle.position + self._position_error
 
     @property
     def velocity(self) -> Array:
-        """Return how fast it takes itself to move, (3,), m/s."""
+        """Return the estimated velocity (3,), m/s."""
         return self._vehicle.velocity + self._velocity_error
 
     @property
@@ -102,7 +102,7 @@ class Estimator:
         """Take an ODOMETRY of an age, s, if it is one that the autopilot uses."""
         profile, (w, x, y, z) = self._profile, message.q
         numbers = [message.x, message.y, message.z, message.vx, message.vy, message.vz, w, x, y, z]
-        # PX4 wants the six variances on the diagonals.
+        # PX4 requires the six variances on the diagonals.
         filled = not profile.px4 or all(
             math.isfinite(matrix[i]) and matrix[i] > 0.0 for i in (0, 6, 11, 15, 18, 20)
             for matrix in (message.pose_covariance, message.velocity_covariance))

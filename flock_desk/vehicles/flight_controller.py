@@ -55,7 +55,7 @@ ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 #: Of a type mask: the bits of position, velocity, acceleration and force, and those that ignore
 #: all but the acceleration.
 _WHICH, _ACCELERATION = 0x3FF, 0x03F
-#: ArduCopter's words for a condition that is not met.
+#: ArduCopter's text for a condition that is not met.
 _REASONS: Final = {'permission': '{denial}', 'vision': 'VisOdom: not healthy',
                    'armable': '{mode} mode not armable', 'position': 'Need Position Estimate'}
 
@@ -69,7 +69,7 @@ class FlownSetpoint(NamedTuple):
 
 def decode_setpoint(message: Any) -> FlownSetpoint | None:
     """
-    Return the acceleration in a SET_POSITION_TARGET_LOCAL_NED; None for whatever else it holds.
+    Return the acceleration in a SET_POSITION_TARGET_LOCAL_NED; None for any other setpoint.
 
     Setpoints of position, velocity and yaw rate, which the bridge never sends, are not simulated.
     """
@@ -156,7 +156,7 @@ class FlightController(ABC):
 
     @abstractmethod
     def _supervise(self, now: float) -> None:
-        """Change the mode where a failsafe does."""
+        """Change the mode if a failsafe does."""
 
     def _fly_setpoints(self, now: float, dt: float) -> Array:
         """Return the acceleration (3,), m/s^2, of the mode that obeys setpoints."""
@@ -164,15 +164,15 @@ class FlightController(ABC):
 
     @abstractmethod
     def _detect_ground(self, wanted: Array, dt: float) -> None:
-        """Update ``on_ground`` after a step with a wanted acceleration (3,), m/s^2."""
+        """Update ``on_ground`` after a step with a nominal acceleration (3,), m/s^2."""
 
     @property
     @abstractmethod
     def _disarms_after(self) -> float:
-        """Return after how long on the ground it disarms, s."""
+        """Return the time on the ground after which it disarms, s."""
 
     def position_known(self, now: float) -> bool:
-        """Return whether there is an estimate, and vision, where it needs it, not long gone."""
+        """Return whether there is an estimate, with recent vision if it needs vision."""
         timeout = self.PROFILE.position_timeout + 1e-6 * self.parameters.get('EKF2_NOAID_TOUT', 0)
         return now >= self.estimator.ready_at and self.estimator.vision_age(now) <= timeout
 
@@ -195,7 +195,7 @@ class FlightController(ABC):
         return [name for name in (*arming, *self.PROFILE.modes[mode].needs) if not met[name]]
 
     def check_arming(self, now: float, title: str = 'PreArm') -> list[str]:
-        """Return the conditions that prevent arming; ArduCopter says the first."""
+        """Return the conditions that prevent arming; ArduCopter reports the first."""
         missing = self.missing(self.mode, now, self.PROFILE.arming)
         if missing and not self.PROFILE.px4:
             reason = _REASONS[missing[0]].format(denial=self._arming_denial, mode=self.mode)
@@ -284,7 +284,7 @@ class FlightController(ABC):
         return self.PROFILE.modes[self.mode].flies
 
     def _control(self, now: float, dt: float) -> Array:
-        """Return the wanted acceleration (3,), m/s^2, in the frame of the estimate."""
+        """Return the nominal acceleration (3,), m/s^2, in the frame of the estimate."""
         flies, (parameter, unit) = self._flies, self.PROFILE.landing_speed
         if flies == SETPOINTS:
             if math.isfinite(self._setpoint.yaw):

@@ -44,7 +44,7 @@ _COLUMNS: Final = {
 
 class FlightLog:
     """
-    Collects what happened; ``save`` writes it.
+    Collects the events of a flight; ``save`` writes them.
 
     Times are s on the system's monotonic clock, vectors ENU. An autopilot fills ``state_time``
     (n,), ``position``, ``velocity``, ``acceleration`` (n, 3), ``yaw`` (n,), ``armed`` (n,),

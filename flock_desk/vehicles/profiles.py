@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What distinguishes the embedded autopilots, as tables: measured, see docs/autopilots.md.
+The differences of the embedded autopilots, as tables: measured, see docs/autopilots.md.
 
 Written out here, not taken from the bridge: a mistake there must not hide itself.
 
@@ -78,13 +78,13 @@ class Profile:
     landing_speed: tuple[str, float]
     """Its parameter, and the unit of that, m/s."""
     rates: Mapping[int, float]
-    """Hz, by message id; 0: once it is asked for."""
+    """Hz, by message id; 0: only on request."""
     mode_message: int
     """Message id that shows a change of the mode at once."""
     arming: tuple[str, ...]
     """The conditions of arming, besides those of the mode."""
     refused: int
-    """MAV_RESULT where a condition is not met."""
+    """MAV_RESULT if a condition is not met."""
     unknown_message: int
     """MAV_RESULT of SET_MESSAGE_INTERVAL for a message that it does not send."""
     vision: Mapping[str, float]

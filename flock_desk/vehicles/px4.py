@@ -15,14 +15,14 @@
 """
 PX4, as far as a companion computer meets it: setpoints, take-off, landing, failsafes.
 
-Measured on PX4 1.16, see docs/autopilots.md. Somebody chooses a mode, and PX4 flies it as long as
-it can: OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s), Hold a global position, that is GPS
+Measured on PX4 1.16, see docs/autopilots.md. PX4 flies the chosen mode as long as it can:
+OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s), Hold a global position, that is GPS
 or an origin. Otherwise a failsafe flies another and ends by itself when the chosen mode can
 be flown again: setpoints alone bring OFFBOARD back. After landing the mode from before is back.
 No speed limit applies to acceleration setpoints; vertical acceleration 0 leaves the height open.
 When external vision stops OFFBOARD stays, and drifts.
 
-After arming the motors spin up, then idle until a setpoint asks upwards; that may be any upward
+After arming the motors spin up, then idle until a setpoint demands a climb: any upward
 acceleration, however small. A ramp then limits the climb rate of the own modes, and leaves
 acceleration setpoints alone. The land detector looks at the thrust: it reports the
 take-off at once, and a landing only while a downward velocity is commanded. Acceleration setpoints
@@ -47,7 +47,7 @@ from flock_desk.vehicles.profiles import LAND, PX4
 from flock_follower.geometry import Array, GRAVITY
 
 OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
-_SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
+_SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one starts no take-off
 #: Modes after the loss of the stream, by COM_OBL_RC_ACT: the first possible one.
 _LOST_STREAM: Final = {4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
 _CLIMB_MAX: Final[float] = 3.0  # m/s, MPC_Z_VEL_MAX_UP
@@ -160,10 +160,10 @@ class Px4(FlightController):
         elif 0.0 <= self._ramp < 1.0:
             self._ramp = min(1.0, self._ramp + dt / max(self.parameters['MPC_TKO_RAMP_T'], dt))
         elif self._ramp < 0.0 and self._armed_for >= self.parameters['COM_SPOOLUP_TIME'] and (
-                self._asks_upwards(now)):
+                self._demands_climb(now)):
             self._ramp = 0.0
 
-    def _asks_upwards(self, now: float) -> bool:
+    def _demands_climb(self, now: float) -> bool:
         if self.mode == OFFBOARD:
             recent = now - self._setpoint_time < _SETPOINT_MAX_AGE
             return recent and bool(self._setpoint.acceleration[2] > 0.0)

@@ -35,7 +35,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from flock_follower.bags.description import incomplete, mcap_files, METADATA
+from flock_follower.bags.mcap_file import incomplete, mcap_files, METADATA
 from flock_follower.bags.message_types import migration_obstacle, typestore
 from flock_follower.bags.unfinished import has_end, UnfinishedReader
 
@@ -57,7 +57,7 @@ class BagMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag holds of one topic; ``latched`` is ROS 1's word for transient local."""
+    """One topic of a bag; ``latched`` is ROS 1's term for transient local."""
 
     name: str
     msgtype: str
@@ -88,7 +88,7 @@ class Bag(AbstractContextManager['Bag']):
 
     ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
     read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
-    ``incomplete`` says why the bag was never finished, '' if it was.
+    ``incomplete`` is the reason if the bag was never finished, else ''.
     """
 
     def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader,
@@ -123,7 +123,7 @@ class Bag(AbstractContextManager['Bag']):
 
     def select(self, topics: Collection[str] = ()) -> list[str]:
         """
-        Return the absolute names of the topics asked for, all readable ones if none are named.
+        Return the absolute names of the topics requested, all readable ones if none are named.
 
         :raises BagError: the bag does not hold one of them, or cannot read it.
         """
@@ -218,7 +218,7 @@ def _refuse_unclosed(path: Path) -> None:
 
 
 def _missing_end(path: Path, files: Sequence[Path]) -> str:
-    """Return what MCAP files lack that those of a finished bag have, or ''."""
+    """Return the part of a finished bag that MCAP files lack, or ''."""
     for file in files:
         if not has_end(file):
             return f'{file.name} was cut short'
@@ -229,7 +229,7 @@ def _missing_end(path: Path, files: Sequence[Path]) -> str:
 
 @contextmanager
 def failures(subject: str | Path, what: str) -> Iterator[None]:
-    """Turn whatever a damaged file makes the libraries raise into a BagError of one line."""
+    """Turn every exception that the libraries raise for a damaged file into a BagError."""
     try:
         yield
     except BagError:

@@ -47,7 +47,7 @@ class LiveLine:
         else:
             print(line, file=self._stream, flush=True)
 
-    def say(self, text: str) -> None:
+    def print_above(self, text: str) -> None:
         """Print text that stays above the line."""
         print(f'\r\x1b[K{text}' if self.on_terminal else text, file=self._stream, flush=True)
 

@@ -19,6 +19,10 @@ On request every write is flushed to the disk: a recording has to survive a kill
 a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
 at the end (https://mcap.dev/spec, which names the records). A file without its end is good up to
 its last whole chunk, see ``bags.unfinished``.
+
+Beside the files of a bag lies its ``metadata.yaml``. A bag's folder holds a file MARK from when it
+is made until it is finished. If writing ended otherwise (a full disk, an exception, a kill), the
+mark stays.
 """
 
 from __future__ import annotations
@@ -34,11 +38,16 @@ from typing import Any, NamedTuple
 import zlib
 
 from flock_follower.bags.message_types import typestore
+from flock_follower.files import whole_file
 
 #: The first and the last bytes of every MCAP file.
 MCAP_MAGIC = b'\x89MCAP0\r\n'
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 0x07, 0x08, 0x0B, 0x0F
+#: The file in a bag's folder until the bag is finished.
+MARK = 'INCOMPLETE.txt'
+METADATA = 'metadata.yaml'
+_UNFINISHED = 'still being written, or the process that wrote it failed or was killed'
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # rosbag2's spelling
 
 
@@ -197,7 +206,7 @@ def _text(text: str) -> bytes:
 @cache
 def definition(msgtype: str) -> str:
     """
-    Return the text that says what a type holds.
+    Return the definition text of a type.
 
     :raises KeyError: for a type that ROS 2 Jazzy does not have.
     """
@@ -212,3 +221,57 @@ def type_hash(msgtype: str) -> str:
     :raises KeyError: for a type that ROS 2 Jazzy does not have.
     """
     return str(typestore().hash_rihs01(msgtype))
+
+
+def mark_incomplete(folder: Path) -> None:
+    """
+    Mark a bag as not finished.
+
+    :raises OSError: that cannot be written.
+    """
+    (folder / MARK).write_text(f'This bag is incomplete: {_UNFINISHED}\n')
+
+
+def incomplete(path: Path) -> str:
+    """Return why a bag, its folder or the file in it, was not finished; '' if it was."""
+    folder = path if path.is_dir() else path.parent
+    return _UNFINISHED if (folder / MARK).exists() else ''
+
+
+def mcap_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a recording in the order in which they were written."""
+    return sorted((file for file in folder.iterdir() if file.suffix == '.mcap'),
+                  key=lambda file: (len(file.name), file.name))
+
+
+def finish(folder: Path, files: Sequence[McapFile]) -> None:
+    """
+    Write the ``metadata.yaml`` of a bag of several closed files, and remove its mark.
+
+    :raises OSError: if that fails.
+    """
+    counts: Counter[RecordedTopic] = Counter()
+    for file in files:
+        counts.update(file.counts)
+    with whole_file(folder / METADATA) as metadata:  # as rosbag2 has it; JSON is YAML
+        metadata.write(json.dumps({'rosbag2_bagfile_information': {
+            'version': 9, 'storage_identifier': 'mcap', 'compression_format': '',
+            'compression_mode': '', 'custom_data': None, 'ros_distro': 'jazzy',
+            'relative_file_paths': [file.path.name for file in files],
+            'message_count': counts.total(), **_span(files),
+            'files': [{'path': file.path.name, 'message_count': file.counts.total(),
+                       **_span([file])} for file in files],
+            'topics_with_message_count': [{
+                'topic_metadata': {
+                    'name': topic.name, 'type': topic.msgtype, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': topic.qos,
+                    'type_description_hash': type_hash(topic.msgtype)},
+                'message_count': count} for topic, count in counts.items()]}}, indent=1).encode())
+    (folder / MARK).unlink()
+
+
+def _span(files: Sequence[McapFile]) -> dict[str, Any]:
+    start = min((file.start_ns for file in files if file.counts), default=0)
+    end = max((file.end_ns for file in files), default=0)
+    return {'starting_time': {'nanoseconds_since_epoch': start},
+            'duration': {'nanoseconds': end - start}}

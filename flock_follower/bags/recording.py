@@ -31,8 +31,15 @@ import re
 import shutil
 import time
 
-from flock_follower.bags.description import finish, mark_incomplete, mcap_files, METADATA
-from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
+from flock_follower.bags.mcap_file import (
+    finish,
+    mark_incomplete,
+    mcap_files,
+    McapFile,
+    METADATA,
+    RecordedTopic,
+    TakenMessage,
+)
 from flock_follower.bags.schedule import NANOSECONDS
 from flock_follower.files import whole_file
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-When to publish which message of a bag: the arithmetic of playback, without ROS or a clock.
+The schedule of playback: when each message of a bag falls due, without ROS or a clock.
 
 Wall time is float seconds of any monotonic clock and always passed in; bag time is integer
 nanoseconds.
@@ -50,7 +50,7 @@ def section(bag_start_ns: int, bag_end_ns: int, start: float, duration: float) -
 
 class Timeline:
     """
-    Where in the bag playback is, and when a stamp falls due.
+    The position of playback in the bag, and the time at which a stamp falls due.
 
     Both follow from one anchor (this wall time is that bag time), so errors of single waits never
     add up. Position never moves before the anchor's wall time: an anchor in the future is a

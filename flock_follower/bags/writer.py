@@ -23,8 +23,13 @@ import shutil
 from typing import Any
 
 from flock_follower.bags.bag import absolute, BagError, failures, serialize
-from flock_follower.bags.description import finish, mark_incomplete
-from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
+from flock_follower.bags.mcap_file import (
+    finish,
+    mark_incomplete,
+    McapFile,
+    RecordedTopic,
+    TakenMessage,
+)
 from flock_follower.bags.message_types import typestore
 
 #: Messages of so many bytes are written at once.
@@ -37,7 +42,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     The bytes written depend only on the calls made and the directory's name, never on a clock, so
     a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
-    but the last chunk of 1 MiB is kept and marked incomplete, see ``bags.description``. An empty
+    but the last chunk of 1 MiB is kept and marked incomplete, see ``bags.mcap_file``. An empty
     bag is deleted then.
 
     :param path: directory to create; it must not exist.

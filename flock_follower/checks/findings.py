@@ -23,9 +23,11 @@ OK: Final = 'ok'
 WARNING: Final = 'warning'
 ERROR: Final = 'error'
 UNMEASURED: Final = 'not measured'
+#: A measured error counts if it exceeds so many of its deviations.
+SURE: Final = 3.0
 #: The system is not ready while one of these is unmeasured. All others may be measured later.
 ESSENTIAL: Final = frozenset({
-    'images rate', 'odom rate', 'relative_pose says', 'planner says', 'mavlink_bridge says',
+    'images rate', 'odom rate', 'relative_pose status', 'planner status', 'mavlink_bridge status',
     'ready to arm'})
 _CAMERA: Final = ('images', 'camera_info', 'calibration')
 _AXES: Final = (*_CAMERA, 'odom', 'odom positions', 'odom up', 'odom ahead')
@@ -35,9 +37,9 @@ CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     'camera time offset': _AXES, 'marker size': (*_AXES, 'focal length'),
     'focal length': _AXES, 'camera mounting': _AXES,
     'images rate': ('images',), 'odom rate': ('odom',),
-    'relative_pose says': (*_CAMERA, 'odom'),
-    'planner says': (*_CAMERA, 'odom', 'relative_pose says'),
-    'mavlink_bridge says': ('autopilot',),
+    'relative_pose status': (*_CAMERA, 'odom'),
+    'planner status': (*_CAMERA, 'odom', 'relative_pose status'),
+    'mavlink_bridge status': ('autopilot',),
 }
 
 

@@ -86,7 +86,7 @@ class OwnPath:
             for state in states])
 
     def attitude(self, times: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return attitudes (m, 4) at stamps (m,), s, and where they are known (m,)."""
+        """Return attitudes (m, 4) at stamps (m,), s, and which of them are known (m,)."""
         stamps = self._stamps
         after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
         span = stamps[after] - stamps[after - 1]
@@ -243,7 +243,7 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
 
 
 def _turned(rows: Array, path: OwnPath, offset: float) -> tuple[Array, Array]:
-    """Return rotation vectors in base_link (n, 3), and those rows for which they are known."""
+    """Return rotation vectors in base_link (n, 3), and the rows for which they are known."""
     (q1, known1), (q2, known2) = (path.attitude(rows[:, k] - offset) for k in (0, 1))
     known = known1 & known2
     v1, w1, v2, w2 = q1[known, :3], q1[known, 3:], q2[known, :3], q2[known, 3:]

@@ -31,9 +31,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import ERROR, Finding, first, OK, UNMEASURED, WARNING
+from flock_follower.checks.findings import ERROR, Finding, first, OK, SURE, UNMEASURED, WARNING
 from flock_follower.checks.image_motion import OwnPath
-from flock_follower.checks.mounting import SURE
 from flock_follower.checks.observations import Observations
 from flock_follower.geometry import (
     Array,
@@ -94,7 +93,7 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
     measured = f'moves {found.ratio:.2f} ± {found.deviation:.2f} times as far'
     advice = (
         f'measure marker {number}, its black square from edge to edge: {side / found.ratio:.3f} m '
-        f'would fit, config/neighbors.yaml says {side:g}. If that is right: is the calibration '
+        f'would fit, config/neighbors.yaml has {side:g}. If that is right: is the calibration '
         'of this lens, and the scale of the odometry right?')
     return first(what, wanted, (wrong and off > BAD_SIZE, ERROR, measured, advice),
                  (wrong, WARNING, measured, advice), (True, OK, measured, ''))
@@ -103,7 +102,7 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
 def distance_ratio(arms: Array, positions: Array, rotations: Array, camera: Array
                    ) -> Ratio | None:
     """
-    Return the ratio of the changes of the distance to the way moved, None of too few sightings.
+    Return the ratio of the changes of the distance to the way moved; None if sightings are few.
 
     :param arms: (n, 3), m, from the camera to the marker as seen, along base_link's axes.
     :param positions: (n, 3), m, and :param rotations: (n, 3, 3) of base_link in odom.

@@ -66,8 +66,8 @@ class Picture:
     An image that was searched for markers.
 
     ``brightness`` and ``contrast`` are mean and deviation of its grey levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px; ``fault`` says why it cannot be
-    decoded.
+    ids of the markers found to the length of their sides, px; ``fault`` is the reason if it cannot
+    be decoded.
     """
 
     stamp: float
@@ -99,7 +99,7 @@ class Machine:
     ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
     ``shares_memory``: whether images may come through shared memory; ``segment``: its size, bytes.
     ``open_nodes``: our nodes on this computer that others on the network can reach; 'check' if
-    theirs are unknown and others can reach itself.
+    those are unknown and others can reach ``check`` itself.
     """
 
     processors: int = 0

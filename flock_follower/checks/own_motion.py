@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The odometry: velocity and jumps in it, its axes, and whether the images agree."""
+"""The odometry: its velocity, jumps and axes; the images and the mounting compared with it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import math
 from typing import Final
@@ -29,12 +29,12 @@ from flock_follower.checks.findings import (
     first,
     judged,
     OK,
+    SURE,
     UNMEASURED,
     WARNING,
 )
 from flock_follower.checks.image_motion import AxesFit, fit_axes, OwnPath
 from flock_follower.checks.marker_size import check_marker_size
-from flock_follower.checks.mounting import check_mounting, MOUNTED, SURE
 from flock_follower.checks.observations import Observations, OwnMotion
 from flock_follower.checks.pictures import camera_model
 from flock_follower.geometry import (
@@ -42,6 +42,7 @@ from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_to_matrix,
     R_FLU_OPTICAL,
+    rotation_vector_to_matrix,
     rpy_from_matrix,
 )
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
@@ -72,6 +73,12 @@ EVENTS: Final = (
      'turn off loop closure and relocalisation, or take the frame without them'),
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'))
+#: Errors of the mounting, rad, of a warning and of an error.
+LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(8.0)
+MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
+_AXES: Final = ('roll', 'pitch', 'yaw')
+_WAYS: Final = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
+                ('looks further right', 'looks further left'))
 TURN_MOVES: Final = 'images move as odometry turns'
 IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
@@ -85,7 +92,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     count = motion.lost + len(motion.states)
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
-                     f'{motion.lost} of {count} say nothing: {motion.last_error}',
+                     f'{motion.lost} of {count} are invalid: {motion.last_error}',
                      'position and attitude', 'wait until its source is initialised; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
@@ -123,7 +130,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
 
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
-    """Report parameters of odometry and cameras that our nodes do not have alike."""
+    """Report parameters of odometry and cameras that differ between our nodes."""
     shared = (*COMMON, 'camera_rpy')
     for name in sorted({name for own in seen.parameters.values() for name in own
                         if name in shared or name.startswith('camera.')}):
@@ -171,7 +178,7 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
          'if it was not started higher up, z points down: set up its source to send ENU '
          '(REP-103)'),
         (still, UNMEASURED, f'{still} moved too little: carry it, and lift it', ''),
-        (True, OK, 'as the velocity says', ''))
+        (True, OK, 'agree with the velocity', ''))
 
 
 def _twist(motion: OwnMotion) -> Finding:
@@ -180,7 +187,7 @@ def _twist(motion: OwnMotion) -> Finding:
         'odom velocity', 'as its positions move',
         ('velocity' in motion.source.missing, WARNING, 'none (not finite)', DERIVED),
         (twist.wanted in (CHILD, ODOM) and twist.found not in ('', twist.wanted), ERROR,
-         f'read in {twist.wanted}, the positions say {twist.found}',
+         f'read in {twist.wanted}, the positions fit {twist.found}',
          'set odom_twist_frame:=auto'),
         (twist.found == NONE, WARNING, f'off by {twist.contradiction:.2f} m/s in either frame',
          f'{DERIVED}; check the velocity of the odometry source'),
@@ -249,12 +256,12 @@ def _offset(fit: AxesFit, share: str, period: float, known: float) -> Finding:
         (rest > OFFSET, ERROR if rest > BAD_OFFSET else WARNING,
          f'images are stamped {off} {side} than odometry', 'have the driver stamp the middle of '
          f'the exposure, by one clock; else set time_offset:={-fit.offset:.3f} of relative_pose'),
-        (True, OK, f'{off} {side}, as time_offset says', ''))
+        (True, OK, f'{off} {side}, corrected by time_offset', ''))
 
 
 def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     """Check the focal length; in a fisheye image the flow changes too much within a part."""
-    what, wanted = 'focal length', 'images move as far as it says'
+    what, wanted = 'focal length', 'images move as far as it predicts'
     if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
         return Finding(UNMEASURED, what, 'a fisheye lens' if fisheye else
                        'turned too little: pitch and yaw it by hand', wanted)
@@ -262,3 +269,31 @@ def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     return judged(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
         wanted, 'is the calibration of this lens, and for this size of images?')
+
+
+def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Finding:
+    """
+    Return the finding about roll, pitch and yaw of the camera.
+
+    :param turn: the rotation vector (3,), rad, along base_link's axes, by which the camera is
+        mounted otherwise than configured; :param deviations: (3,) of it.
+    :param rpy: the configured ``camera_rpy``, rad.
+    """
+    margin = SURE * deviations
+    wrong = np.abs(turn) > np.maximum(LOOKS, margin)
+    unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
+                        if not bad and by > LOOKS)
+    looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
+                      for way, angle, bad in zip(_WAYS, turn.tolist(), wrong) if bad)
+    fitting = ','.join(str(round(angle, 3) + 0.0) for angle in rpy_from_matrix(
+        rotation_vector_to_matrix(np.where(wrong, turn, 0.0))
+        @ quaternion_to_matrix(quaternion_from_rpy(*rpy))).tolist())
+    measured = f'camera {looks} than configured{f"; {unknown} unknown" if unknown else ""}'
+    advice = (f'camera_rpy:=[{fitting}] would fit, in relative_pose and planner; or is the pose '
+              'of the odometry on the body (odom_child_rpy) wrong?')
+    return first(
+        'camera mounting', MOUNTED,
+        (np.any(wrong & (np.abs(turn) > BAD_LOOKS)), ERROR, measured, advice),
+        (wrong.any(), WARNING, measured, advice),
+        (unknown, UNMEASURED, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', ''),
+        (True, OK, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', ''))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The observations in a bag: the checks judge them as those of a running system."""
+"""All checks, of a running system or of a bag, whose observations are the same."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ from typing import Any, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.every_check import judge_all
-from flock_follower.checks.findings import Finding
+from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
+from flock_follower.checks.own_motion import check_own_motion
+from flock_follower.checks.pictures import check_pictures
+from flock_follower.checks.system import check_diagnostics, check_machine
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
     images_by_type,
@@ -33,12 +35,12 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.checks.topics import check_nodes, check_topics
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY
-from flock_follower.odometry.cdr import read_odometry
-from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters.cameras_table import alone
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import alone
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
 
@@ -49,6 +51,19 @@ _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: The topics to take, and their types.
 READ: Final = {**{name: TYPES[name] for name in (*_IMAGES, 'odom', 'camera_info')},
                DIAGNOSTICS: 'diagnostic_msgs/msg/DiagnosticArray'}
+
+
+def judge_all(seen: Observations) -> list[Finding]:
+    """
+    Return the findings of every check, in the order in which they should be fixed.
+
+    Those that only follow from another one are left out.
+    """
+    if seen.live and not seen.nodes:
+        return [check_nodes(seen)]
+    return without_consequences(finding for check in (
+        check_topics, check_pictures, check_own_motion, check_machine, check_diagnostics)
+        for finding in check(seen))
 
 
 class RecordedSystem:

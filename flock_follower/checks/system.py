@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The computer, and what our nodes and the autopilot report on ``/diagnostics``."""
+"""The computer; the reports of our nodes and of the autopilot on ``/diagnostics``."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ ADVICE: Final[Mapping[str, str]] = {
     'not aligned': 'let the autopilot fuse this odometry (forward_odometry:=true)',
     'no autopilot': 'check cable, connection and baud rate; is the autopilot on?',
     'autopilot lost': 'check cable and power of the autopilot',
-    'no publisher': 'start what publishes it, or connect its name (above)',
-    'none sending': 'look at the log of what publishes it',
+    'no publisher': 'start its publisher, or connect its name (above)',
+    'none sending': 'look at the log of its publisher',
     'not in sight': 'hold the leader before the camera',
     'QoS mismatch': 'change the QoS of the publisher',
     'another clock': 'set use_sim_time alike everywhere',
@@ -129,12 +129,12 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
         status = seen.statuses.get(full.lstrip('/'))
         if status is None:
             if full in seen.nodes:
-                yield Finding(UNMEASURED, f'{node} says', 'nothing received on /diagnostics',
+                yield Finding(UNMEASURED, f'{node} status', 'nothing received on /diagnostics',
                               'running')
             continue
         advice = next((advice for words, advice in ADVICE.items() if words in status.message),
                       "see the node's log")
-        found = [judged(status.level > 1, status.level == 1, f'{node} says', status.message,
+        found = [judged(status.level > 1, status.level == 1, f'{node} status', status.message,
                         'running', advice)]
         if node == 'mavlink_bridge':
             found += _autopilot(status.values)
@@ -158,14 +158,15 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         if key.startswith(PARAMETER):
             yield Finding(WARNING, 'autopilot parameter',
                           f'{key.removeprefix(PARAMETER)} {values[key]}', 'as config/ recommends',
-                          'set it in the ground station, or know why not')
+                          'set it in the ground station, or accept it')
     if 'parameters' not in values:
         yield Finding(UNMEASURED, 'autopilot parameters', 'not compared yet: check again in '
                       'some seconds', 'as config/ recommends')
-    wanted = 'nothing speaks against it'
+    wanted = 'no obstacle'
     for what, key, advice in (
-            ('ready to arm', NOT_READY, 'these are its own words: settle them, then check again'),
-            ('ready for offboard', REFUSED, 'settle that: the bridge would refuse offboard')):
+            ('ready to arm', NOT_READY, 'fix the reported causes, then check again'),
+            ('ready for offboard', REFUSED, 'fix the reported cause: the bridge would refuse '
+             'offboard')):
         if key in values:
             yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
                          wanted, wanted, advice)

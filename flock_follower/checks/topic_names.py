@@ -27,7 +27,7 @@ INFO: Final = 'sensor_msgs/msg/CameraInfo'
 RAW_IMAGES: Final = 'image_raw'
 COMPRESSED_IMAGES: Final = 'image_raw/compressed'
 
-#: What our topics hold.
+#: The types of our topics.
 TYPES: Final[Mapping[str, str]] = {
     RAW_IMAGES: IMAGE, COMPRESSED_IMAGES: COMPRESSED, 'camera_info': INFO, 'odom': ODOMETRY,
     'neighbors': ODOMETRY, 'neighbors/frames': 'std_msgs/msg/Header',
@@ -35,7 +35,7 @@ TYPES: Final[Mapping[str, str]] = {
     'ranges': RANGE, 'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
 #: Parts of the names of images that show no brightness.
 _NEVER: Final = ('depth', 'disparity', 'confidence')
-#: Parts of names that speak against a topic, and for it.
+#: Parts of the names of unlikely topics, and of likely ones.
 _UNLIKELY: Final = ('debug', 'theora', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
                     'imu_propagate', 'right', 'infra2', 'fisheye2')
 _LIKELY: Final = ('infra1', 'mono', 'left', 'fisheye1', 'gray', 'image_rect', 'odomimu', 'vio',
@@ -60,7 +60,7 @@ def parse_remaps(remaps: Iterable[str]) -> dict[str, str]:
 
 
 def full_name(name: str, namespace: str = '') -> str:
-    """Return the full name of a topic, which has a slash before it where it is one already."""
+    """Return the full name of a topic; a name that begins with a slash is full already."""
     if name.startswith('/'):
         return name
     return '/' + '/'.join(filter(None, [namespace.strip('/'), name.strip('/')]))
@@ -79,7 +79,7 @@ def topics_of_camera(image: str, camera_info: str) -> dict[str, str]:
 
 def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
     """
-    Exchange the names of raw and compressed images where the topics hold the other kind.
+    Exchange the names of raw and compressed images if the topics hold the other kind.
 
     :param names: those of :func:`names_there`, changed in place.
     :param topics: the type of each topic that is there, by its full name.
@@ -95,7 +95,7 @@ def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> st
 
     :param name: ours; ``image_raw`` also stands for the compressed ones.
     :param topics: the type of each topic that is there, by its full name.
-    :param taken: those that are something else already.
+    :param taken: topics that have another name of ours already.
     """
     msgtypes = (IMAGE, COMPRESSED) if name == RAW_IMAGES else (TYPES[name],)
     found = sorted(

@@ -45,8 +45,9 @@ ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',
 START: Final = 'ros2 launch flock_follower follower.launch.py'
 #: s: stamps that differ by more from the arrival are of another clock.
 OTHER_CLOCK: Final = 10.0
-#: s: stamps in the future: from which on there is a warning, and an error.
-AHEAD: Final = (0.003, 0.03)
+#: s: median of stamps in the future from which on there is a warning, and an error: the clocks
+#: differ. The nodes accept single stamps up to ``messages.FUTURE_TOLERANCE`` ahead.
+CLOCK_AHEAD: Final = (0.003, 0.03)
 #: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
 #: before the newest message of any topic.
 STOPPED: Final = (1.0, 3.0)
@@ -65,13 +66,13 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     late = float(seen.value('planner', 'odom_timeout', 0.3))
     yield from _stream(
         seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
-        faster='raise the frame rate of the camera; less exposure time where it is dark',
+        faster='raise the frame rate of the camera; reduce the exposure time in the dark',
         sooner='send smaller images, or grey ones; have the camera on this computer')
     yield from _stream(
         seen, 'odom', seen.topic('odom'), rates=(18.0, 8.0), latencies=(0.5 * late, 0.8 * late),
-        faster='raise the output rate of the odometry (IMU rate, where its driver offers that)',
+        faster='raise the output rate of the odometry (IMU rate, if its driver offers that)',
         sooner='give its source more processor time, or smaller images; have it publish per IMU '
-        'message where it can')
+        'message if it can')
     if seen.live:
         yield from _publishers(seen)
 
@@ -101,11 +102,11 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
     wrong = ', '.join(node for node, value in simulated.items() if value != clock)
     if simulated:
         yield first(
-            'clock', 'use_sim_time where /clock is',
+            'clock', 'use_sim_time if there is a /clock, and only then',
             (wrong and clock, ERROR,
              f'/clock is published, but use_sim_time is false in {wrong}',
              'start with -p use_sim_time:=true; or end the publisher of /clock'),
-            (wrong, ERROR, f'use_sim_time is true in {wrong}, but nobody publishes /clock',
+            (wrong, ERROR, f'use_sim_time is true in {wrong}, but no node publishes /clock',
              'start without use_sim_time; or replay with /clock'),
             (True, OK, 'the same for all our nodes', ''))
 
@@ -122,7 +123,7 @@ def _needed(seen: Observations, name: str) -> Finding:
         what, msgtype.replace('/msg/', '/'),
         (full in seen.unreadable, ERROR, f'{full} cannot be read: {seen.unreadable.get(full)}',
          'record it anew'),
-        (not topic.publishers and seen.live, ERROR, f'nobody publishes {full}',
+        (not topic.publishers and seen.live, ERROR, f'no node publishes {full}',
          connect or 'start its driver'),
         (not topic.publishers, ERROR, f'the bag lacks {full}',
          connect or 'record it; evaluate needs it'),
@@ -168,8 +169,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
          'computers; have the driver stamp by the clock of ROS (a replayed bag: ros2 bag record '
          '--use-sim-time)'),
-        (middle < -AHEAD[1], ERROR, ahead, synchronise),
-        (middle < -AHEAD[0], WARNING, ahead, synchronise),
+        (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronise),
+        (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronise),
         (middle > latencies[1], ERROR, measured, sooner),
         (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
         (True, OK, measured, ''))
@@ -183,8 +184,9 @@ def _publishers(seen: Observations) -> Iterator[Finding]:
             yield Finding(ERROR, name, f'{len(nodes)} publishers on {seen.names[name]}: '
                           f'{", ".join(nodes)}', 'one', 'end all but one, or remap them')
     nodes = seen.machine.open_nodes
-    yield judged(False, bool(nodes), 'network', f'everybody on it can command: {", ".join(nodes)} '
-                 'started without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' if nodes else
+    yield judged(False, bool(nodes), 'network', 'any computer on it can command: '
+                 f'{", ".join(nodes)} started without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'
+                 if nodes else
                  'ROS stays on this computer, or with named peers',
                  'the network does not reach the nodes',
                  'start every node with it, see docs/deploy.md')

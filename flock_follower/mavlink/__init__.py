@@ -15,5 +15,6 @@
 """
 MAVLink connection to the autopilot: link, dialects, requests, setpoint gate.
 
-NED exists only here. The planner is imported for its limits: the gate applies them again.
+NED exists only here. The planner is imported for its limits, which the gate applies again, and for
+the names of the bridge's states.
 """

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The bridge without ROS: what comes in, one cycle of the control loop, and the way out.
+The bridge without ROS: inputs, one cycle of the control loop, outputs.
 
 One thread owns it, see ``setpoint_thread``; other threads may only read.
 """
@@ -33,18 +33,18 @@ from flock_follower.mavlink.commands import NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
-from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import FELL_SILENT, NO_AUTOPILOT
+from flock_follower.mavlink.permission import FELL_SILENT
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
-from flock_follower.mavlink.status_texts import StatusTexts
+from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT
-from flock_follower.messages import OdometryState
+from flock_follower.messages import OdometryState, to_nanoseconds
+from flock_follower.planner.modes import NO_AUTOPILOT
 from flock_follower.ranges import first_reason
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
@@ -59,13 +59,13 @@ _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 
 
 class Cycle(NamedTuple):
-    """What one cycle did."""
+    """The result of one cycle."""
 
     setpoint: Setpoint
     sent: bool
-    """Whether a setpoint went out."""
+    """Whether the setpoint was sent."""
     first: AcceptedCommand | None
-    """The command, where it went out for the first time."""
+    """The command, if it was sent for the first time."""
 
 
 class Bridge:
@@ -74,10 +74,10 @@ class Bridge:
 
     :param forwarder: if given, its odometry is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
-    :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
-    :param recommendations: these three are those of ``Housekeeping``.
+    :param require_failsafe: whether offboard requires the ``rules`` of the dialect.
+    :param recommendations: this, ``estimate_rate`` and ``origin`` are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
-    :param end: when the bridge itself ends a flight.
+    :param end: conditions under which the bridge itself ends a flight.
     :param report_to_gcs: whether the pilot's ground station receives reports.
     """
 
@@ -101,6 +101,7 @@ class Bridge:
         self.end = FlightEnd(end)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
+        self.status = self.requests.status
         self.motion: tuple[OdometryState, float] | None = None
         """While it flies without odometry, the motion by the attitude at a time, s."""
         self.handover: Request | None = None
@@ -119,11 +120,7 @@ class Bridge:
         self._takers: dict[str, Callable[[Any, float], object]] = {
             'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
             'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
-            'PARAM_VALUE': self.housekeeping.take_parameter}
-
-    def status(self, now: float) -> VehicleStatus | None:
-        """Return the vehicle's status, None while the link is not alive."""
-        return self.telemetry.current(now, self.gate.limits.link_timeout)
+            'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message)}
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is connected."""
@@ -137,12 +134,12 @@ class Bridge:
             (not self.alive(now), f'{NO_AUTOPILOT}: lost, {announced} before'), (True, announced))
 
     def withheld(self) -> str:
-        """Return why no setpoint may go out, or ''."""
+        """Return why no setpoint may be sent, or ''."""
         return NOT_RECEIVED if self.telemetry.dialect is None else self.gate.withheld
 
     def forward(self, state: OdometryState, time: float, now: float) -> str:
         """
-        Take odometry stamped at a time, s, to send on; return '' or why it is refused.
+        Take odometry stamped at a time, s, to forward it; return '' or why it is refused.
 
         Its vertical velocity is corrected by the barometer: the autopilot's height follows it,
         in the hold mode too.
@@ -175,7 +172,7 @@ class Bridge:
     # The setpoint thread.
 
     def receive(self, now: float) -> list[Any]:
-        """Take what has arrived and return the autopilot's messages."""
+        """Take the data that have arrived, and return the autopilot's messages."""
         messages = self.link.receive(now)
         for message in messages:
             self._take(message, now)
@@ -201,30 +198,31 @@ class Bridge:
         return messages
 
     def _age(self, estimate: LocalPosition | Attitude, now: float) -> float:
-        return self.housekeeping.timesync.age(estimate.time_boot_ms, round(now * 1e9))
+        return self.housekeeping.timesync.age(estimate.time_boot_ms, to_nanoseconds(now))
 
     def _take(self, message: Any, now: float) -> None:
         if (status := self.telemetry.shown(message)) is not None:
-            # Each one: the pilot may have switched away and back between two that came at once.
-            self._look(status, now)
+            # Each one: of two that arrive at once, the first may show that the pilot took over.
+            self._take_status(status, now)
         elif message.get_type() in self._takers:
             self._takers[message.get_type()](message, now)
 
     def cycle(self, now: float) -> Cycle:
         """Send the messages due at ``now``: a setpoint, HEARTBEAT, commands and requests."""
         status = self.telemetry.status
-        if self.telemetry.dialect is not None:
+        if (dialect := self.telemetry.dialect) is not None:
+            self.gate.hover_thrust = dialect.hover_thrust
             self.gate.compensates_wind = self._wind_compensation == 'always' or (
-                self._wind_compensation == 'auto' and not self.telemetry.dialect.compensates_wind)
+                self._wind_compensation == 'auto' and not dialect.compensates_wind)
         if status is not None:
-            self._look(status, now)
+            self._take_status(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
         setpoint, accepted = self.gate.decide(
             now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
         if flew and not self.gate.flies:
             self._fell_silent(now)
-        # TCP buffers: do not queue setpoints while the link is dead.
+        # TCP buffers data: no setpoint is queued while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
         sent = setpoint.kind != NONE and not late and self.link.send(
             self._message(setpoint.acceleration, setpoint, now))
@@ -252,7 +250,7 @@ class Bridge:
         return round((now - self._start) * 1e3) % 2**32
 
     def _streaming_for(self, now: float) -> float:
-        """Return how long setpoints have been sent without a gap, s."""
+        """Return the time for which setpoints have been sent without a gap, s."""
         broken = now - self._last_sent > 1.0 / MINIMUM_STREAM_RATE
         return 0.0 if broken else now - self._streaming_since
 
@@ -267,7 +265,7 @@ class Bridge:
                 self.requests.begin(commands.land, now))
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
-        """Let heights count from the place of arming; above home if that was not seen."""
+        """Set the zero of heights: the place of arming; home if the arming was not observed."""
         heights, flying = self.gate.heights, self.telemetry.flying(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
         if not status.armed:
@@ -279,7 +277,7 @@ class Bridge:
             heights.refer(above, now)
 
     def _end_flight(self, now: float) -> None:
-        """Hand the vehicle over if its flight has to end."""
+        """Hand the vehicle over if its flight must end."""
         flies, pending, status = self.gate.flies, self.requests.pending, self.status(now)
         handover = self.handover
         if status is None:
@@ -298,7 +296,7 @@ class Bridge:
             self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
-        """Send the odometry that waits to be forwarded."""
+        """Send the odometry that is queued for forwarding."""
         if self.forwarder is None or self.telemetry.dialect is None:
             return
         for message in self.forwarder.messages(self.telemetry.dialect, now):
@@ -319,12 +317,11 @@ class Bridge:
 
     def finish(self, now: float) -> None:
         """
-        Send the last words.
+        Send the final messages.
 
-        A vehicle that still flies our setpoints is asked to hold its position, or again to land
-        where it is being asked to. The very last message is a level setpoint, because autopilots
-        go on obeying it for up to seconds: a braking one would by then make the vehicle fly
-        backwards.
+        A vehicle that still flies our setpoints receives a hold command, or the land command again
+        if a landing is pending. The last message is a level setpoint, because autopilots obey it
+        for up to seconds: after that time a braking one would make the vehicle fly backwards.
         """
         if self.telemetry.dialect is not None and self.gate.flies:
             make = commands.land if self.requests.landing else commands.hold
@@ -335,12 +332,12 @@ class Bridge:
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 
-    def _look(self, status: VehicleStatus, now: float) -> None:
-        """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
+    def _take_status(self, status: VehicleStatus, now: float) -> None:
+        """Pass the status in a HEARTBEAT or CURRENT_MODE to the permission."""
         before, self._vehicle = self._vehicle, (self.telemetry.reboots, self.link.peer_changes)
         if before != self._vehicle:
             if before[1] != self._vehicle[1] and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
             self.gate.permit(self.gate.permission.restarted(
                 'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
-        self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))

@@ -20,7 +20,7 @@ request succeeds when the vehicle shows the result (the mode in HEARTBEAT, the h
 take-off). If it does not, the result in the ACK and the autopilot's STATUSTEXT give the reason. A
 HEARTBEAT from before the command was sent does not count.
 
-``Goal`` is what a request asks for, ``Request`` the state machine that pursues it.
+``Goal`` is the requested state, ``Request`` the state machine that pursues it.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Vehicle(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The result of a request, in words for people."""
+    """The result of a request, with a text for people."""
 
     success: bool
     message: str
@@ -83,7 +83,7 @@ class Goal:
     modes: tuple[str, ...] = ()
     """The modes that it leads through; (): any. In any other mode the pilot has taken over."""
     ends_flight: bool = False
-    """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
+    """Whether it ends our control of the vehicle: it waits for no other request or HEARTBEAT."""
     insists: bool = False
     """Whether it is requested even if the vehicle already shows it."""
     timeout: float = CONFIRM_TIMEOUT
@@ -91,7 +91,7 @@ class Goal:
     stream: float = 0.0
     """Time for which setpoints must have been sent before, s."""
     before: Goal | None = None
-    """What has to be reached first."""
+    """The goal to reach first."""
     instead: Goal | None = None
     """The request that replaces it if the autopilot refuses it."""
     too_late: Goal | None = None
@@ -143,8 +143,8 @@ def takeoff(dialect: Dialect, height: float, altitude: float, sea_level_altitude
     """
     Return the goal of climbing by ``height``, m, from the present height.
 
-    Nearly: autopilots are content a little below. ArduPilot takes off in its offboard mode. A
-    climb that takes too long may go on: the vehicle lands.
+    Autopilots end a take-off a little below that height. ArduPilot takes off in its offboard mode.
+    A climb that takes too long may go on: the vehicle lands.
 
     :param altitude: present height above the local origin, m.
     :param sea_level_altitude: present height above sea level, m; None if unknown.
@@ -165,9 +165,9 @@ class Request:
     """
     One request to the autopilot, stepped until it has an ``outcome``.
 
-    Feed it every COMMAND_ACK and call ``step`` often; it returns when to send which command.
+    It takes every COMMAND_ACK; ``step``, called often, returns whether to send its command.
 
-    :param superseded: the goal that was still requested, and may be reached yet.
+    :param superseded: the goal of a pending request, which may still be reached.
     :param own: whether the bridge itself makes the request.
     """
 
@@ -184,7 +184,7 @@ class Request:
 
     def _begin(self, goal: Goal, now: float, mode: str) -> None:
         self.current = goal
-        """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
+        """The present goal: ``goal``, or the one before it, or the one that replaces it."""
         self._since = self._last_sent = now  # since the beginning, then since the first command
         self._attempts = 0
         self._mode = mode  # the vehicle's at the beginning
@@ -192,7 +192,7 @@ class Request:
         self._refused_at: float | None = None
 
     def acknowledge(self, command: int, result: int, now: float) -> bool:
-        """Take a COMMAND_ACK; return whether it is the first that refuses."""
+        """Take a COMMAND_ACK; return whether it is the first refusal."""
         if command != self.current.command or not self._attempts:
             return False
         refuses = result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
@@ -208,7 +208,7 @@ class Request:
         Return the confirmation count with which to send the command of ``current`` now, or None.
 
         :param vehicle: its state now, None if no HEARTBEAT is fresh.
-        :param streaming_for: how long setpoints have been going out without a gap, s.
+        :param streaming_for: time for which setpoints have been sent without a gap, s.
         """
         if self.outcome is not None or (vehicle is not None and self._shown(vehicle, now)):
             return None
@@ -224,7 +224,7 @@ class Request:
                 self._finish(False, f'{self.current.name}: {missing}')
             return None
         waited = now - self._since
-        # Of a vehicle that is not received no other mode is requested: a pilot may have switched.
+        # While the vehicle is not received no other mode is requested: a pilot may have switched.
         instead = None if vehicle is None else self.current.instead
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
             self._fail(self._refusal(texts), instead, vehicle, now)
@@ -233,9 +233,9 @@ class Request:
             late = None if holds else self.current.too_late
             self._fail(self._unconfirmed(vehicle, texts), late or instead, vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and (self._result is None or (
-                # An ACK of a mode command may answer an earlier one: it does not say. If it was
-                # this one's, the pilot may have left the mode between two HEARTBEATs: only what
-                # ends a flight is sent again.
+                # The ACK does not identify the request: it may answer an earlier mode command. If
+                # it answers this one, the pilot may have left the mode between two HEARTBEATs:
+                # only a command that ends a flight is sent again.
                 self.current.ends_flight and self.current.command == _SET_MODE)):
             return self._send(now)
         return None
@@ -269,7 +269,7 @@ class Request:
         self._finish(True, f'{self.current.name}: {_status(vehicle)}, {duration}')
 
     def _fail(self, why: str, instead: Goal | None, vehicle: Vehicle | None, now: float) -> None:
-        """Request something else after a refusal or in vain, or end."""
+        """Request another goal after a refusal or a timeout, or end."""
         if instead is None or self._result is None:
             self._finish(False, why)
             return
@@ -277,13 +277,13 @@ class Request:
         self._begin(instead, now, self._mode if vehicle is None else vehicle.status.mode)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
-        """Return what the pilot, or a failsafe, has done meanwhile, or ''."""
+        """Return the change by the pilot, or a failsafe, since the beginning, or ''."""
         status, through = vehicle.status, self._dialect.takeoff_modes
         if self.current.command == TAKEOFF and not status.armed:
             return 'disarmed meanwhile'
         expected = {self._mode, *self.current.modes,
                     *(self._superseded.modes if self._superseded is not None else ()),
-                    # One leads on to the next.
+                    # One leads to the next.
                     *(through if self._mode in through else ())}
         return '' if status.mode in expected or not self.current.modes else (
             f'the mode was changed to {status.mode} meanwhile')
@@ -294,7 +294,7 @@ class Request:
         return min(self._attempts - 1, 255)
 
     def _refusal(self, texts: StatusTexts) -> str:
-        # PX4 reports what speaks against a mode, or against arming in one.
+        # PX4 reports the failed checks of a mode, or of arming in it.
         modes = (*self.current.modes, '' if self.current.ends_flight else self._mode)
         reasons = '; '.join(texts.why(self._since, modes[0])) or (
             '' if self.current.instead else self._dialect.no_reason)

@@ -36,7 +36,15 @@ from typing import Final, NamedTuple
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import product, Side
-from flock_follower.ranges import Checked, first_reason, parameter, Range
+from flock_follower.ranges import (
+    A_MAX,
+    Checked,
+    first_reason,
+    ODOM_TIMEOUT,
+    parameter,
+    Range,
+    V_MAX,
+)
 
 #: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
 #: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
@@ -49,14 +57,12 @@ class GateLimits(Checked):
     """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
 
     a_max: float = parameter(
-        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest magnitude of the acceleration', live=True)
-    v_max: float = parameter(
-        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed', live=True)
+        2.5, A_MAX, 'largest magnitude of the acceleration', live=True)
+    v_max: float = parameter(0.5, V_MAX, 'largest speed', live=True)
     planner_timeout: float = parameter(
         0.2, Range(0.15, 1.0, 's'), 'largest age of a command; the planner sends one every 0.1 s',
         live=False)
-    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'largest age of a '
-                                                                'velocity', live=True)
+    odom_timeout: float = parameter(0.3, ODOM_TIMEOUT, 'largest age of a velocity', live=True)
     link_timeout: float = parameter(
         1.0, Range(0.2, 5.0, 's'), 'silence of the autopilot before braking', live=True)
     blind_timeout: float = parameter(
@@ -112,20 +118,20 @@ class GateLimits(Checked):
 
 #: The share of ``a_max`` that a stop at a bound is planned with: the rest is for errors of thrust.
 BRAKING_SHARE: Final[float] = 0.4
-#: Time from a decision to the acceleration that it asks for, s: attitude, sending, velocity.
+#: Time from a decision to the commanded acceleration, s: attitude, sending, velocity.
 REACTION_TIME: Final[float] = 0.4
-#: Time constant and largest speed of the way back from beyond a bound, s and m/s.
-RETURN_TIME: Final[float] = 1.0
-RETURN_SPEED: Final[float] = 0.3
+#: Time constant and largest speed of the return from beyond a bound of the envelope, s and m/s.
+ENVELOPE_RETURN_TIME: Final[float] = 1.0
+ENVELOPE_RETURN_SPEED: Final[float] = 0.3
 #: Beyond a bound by more than this, m, the vehicle is handed over: 5 sigma of the height.
 TOLERANCE: Final[float] = 0.15
 
 
 class Location(NamedTuple):
-    """Where the vehicle is in its envelope."""
+    """The vehicle's location in its envelope."""
 
     height: float | None = None
-    """m; None if it is not known: then nothing bounds it."""
+    """m; None if it is unknown: then it is not bounded."""
     climb_rate: float = 0.0
     """m/s, by the source of the height."""
     offset: Array | None = None
@@ -143,7 +149,7 @@ def approach_speed(distance: float, deceleration: float) -> float:
     :param deceleration: m/s^2.
     """
     if distance <= 0.0:
-        return max(distance / RETURN_TIME, -RETURN_SPEED)
+        return max(distance / ENVELOPE_RETURN_TIME, -ENVELOPE_RETURN_SPEED)
     lost = deceleration * REACTION_TIME
     return math.sqrt(lost * lost + 2.0 * deceleration * distance) - lost
 
@@ -158,7 +164,7 @@ def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offse
     :param horizon: time in which the speed is to be reached, s.
     :param a_max: largest magnitude of the acceleration, m/s^2.
     """
-    if place.height is None:
+    if place.height is None or not math.isfinite(place.height + place.climb_rate):
         return -math.inf, math.inf
     braking = BRAKING_SHARE * a_max
     falling = approach_speed(place.height - limits.height_min, braking)
@@ -176,18 +182,17 @@ def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float)
     """
     if place.offset is None:
         return None
-    offset = complex(*place.offset.tolist())
-    distance = abs(offset)
-    if distance <= 0.5 * limits.radius_max:
+    distance = math.hypot(*place.offset.tolist())
+    if not 0.5 * limits.radius_max < distance < math.inf:
         return None  # at the centre no direction is outwards
-    outward = offset / distance
+    outward = complex(*place.offset.tolist()) / distance
     speed = approach_speed(limits.radius_max - distance, BRAKING_SHARE * limits.a_max)
     closing = product(outward, complex(float(velocity[0]), float(velocity[1])))
     return -outward, (closing - speed) / horizon
 
 
 def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
-    """Return which bound the vehicle is beyond by more than a tolerance, m, in words, or ''."""
+    """Return the bound that the vehicle exceeds by more than a tolerance, m, as text, or ''."""
     height = limits.height_min if place.height is None else place.height
     distance = 0.0 if place.offset is None else math.hypot(*place.offset.tolist())
     return first_reason(
@@ -266,7 +271,7 @@ class HeightEstimator:
         """
         elapsed = now - self._time
         # Written so that NaN fails.
-        if refused := first_reason((not abs(altitude) <= SANE, 'not finite'),
+        if refused := first_reason((not abs(altitude) <= SANE, 'not plausible'),
                                    (not elapsed > 0.0, 'not newer')):
             return refused
         if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:

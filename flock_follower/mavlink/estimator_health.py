@@ -29,21 +29,15 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.mavlink.dialects import Dialect
 from flock_follower.ranges import first_reason
 
 #: The estimate uses forwarded odometry for this long after the last ODOMETRY, s: PX4's limit.
 FORWARDED_TIMEOUT: Final[float] = 0.2
-#: What the estimator said of itself longer ago than this, s, is the past.
+#: A status older than this, s, is not used.
 STATUS_TIMEOUT: Final[float] = 3.0
-#: The flags that are set and that are not if the estimator has a velocity, by the message. PX4's
-#: second one is whether any source of horizontal motion is in use: cleared 0.6 s after vision is
-#: gone, the first only after 5 s. ArduPilot's integrates nothing at a position taken for constant.
-_VELOCITY: Final[dict[str, tuple[int, int]]] = {
-    'ESTIMATOR_STATUS': (
-        mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, 0),
-    'EKF_STATUS_REPORT': (mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE)}
-#: The flags that a flight needs, by number; EKF_STATUS_REPORT numbers and names them likewise.
-#: Without PRED_POS_HORIZ_REL nothing carries the position, without POS_HORIZ_ABS it has no origin.
+#: The flags that a flight needs, by number; those of EKF_STATUS_REPORT have the same numbers and
+#: names. Without PRED_POS_HORIZ_REL the position has no source, without POS_HORIZ_ABS no origin.
 _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_ATTITUDE: 'ATTITUDE',
     mavlink.ESTIMATOR_VELOCITY_HORIZ: 'VELOCITY_HORIZ',
@@ -52,13 +46,13 @@ _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_POS_HORIZ_ABS: 'POS_HORIZ_ABS',
     mavlink.ESTIMATOR_POS_VERT_ABS: 'POS_VERT_ABS',
     mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
-#: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
-#: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
+#: For this long, s, after its fix was lost an estimator may still report a valid velocity: 7 s on
+#: PX4 and on ArduPilot. If it reports one afterwards, it has another source, such as optical flow.
 GPS_SILENCE: Final[float] = 10.0
 
 
 class GpsFix(NamedTuple):
-    """GPS_RAW_INT: whether the receiver knows where it is."""
+    """GPS_RAW_INT: whether the receiver has a position fix."""
 
     fixed: bool
     lost: float
@@ -73,15 +67,14 @@ class EstimatorStatus(NamedTuple):
     time: float
     """Time of reception, s."""
     has_velocity: bool
-    """Whether the estimator has a horizontal velocity, and something it rests on."""
+    """Whether the estimator has a horizontal velocity, and a source for it."""
     missing: tuple[str, ...]
-    """The flags that a flight needs and that are not set, as MAVLink names them."""
+    """The names of the flags that a flight needs and that are not set."""
 
 
-def estimator_status(message: Any, now: float) -> EstimatorStatus:
-    """Return what an ESTIMATOR_STATUS or EKF_STATUS_REPORT says."""
-    flags = message.flags
-    needed, forbidden = _VELOCITY[message.get_type()]
+def estimator_status(message: Any, dialect: Dialect, now: float) -> EstimatorStatus:
+    """Return the status in an ESTIMATOR_STATUS or EKF_STATUS_REPORT."""
+    flags, (needed, forbidden) = message.flags, dialect.velocity_flags
     return EstimatorStatus(now, flags & (needed | forbidden) == needed, tuple(
         name for flag, name in _NEEDED.items() if not flags & flag))
 
@@ -108,22 +101,22 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
 
     :param status: the newest, None if it sends none.
     :param gps: the newest, None if it sends none.
-    :param forwarded: how long ago ODOMETRY was last sent, s; infinite if never.
+    :param forwarded: time since ODOMETRY was last sent, s; infinite if never.
     """
     return first_reason(
         (FORWARDED_TIMEOUT < forwarded < math.inf, 'rests on odometry that is lost'),
         (math.isinf(forwarded) and gps is not None and not gps.fixed
          and now - gps.lost <= GPS_SILENCE, 'rests on GPS, whose fix is lost'),
         (status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity,
-         'is none, says its estimator'))
+         'is invalid according to its estimator'))
 
 
 #: Rates and pauses are reported over this time, s.
 RECENT: Final[float] = 5.0
-#: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
+#: A rate is measured over this time, s, or over the time of ``FEWEST`` messages.
 WINDOW: Final[float] = 1.0
 FEWEST: Final[int] = 5
-#: Stands for all messages in the place of an id.
+#: The id that stands for all messages.
 ANY: Final[int] = -1
 #: A rate below this share of the requested one is too low; autopilots round intervals.
 ENOUGH: Final[float] = 0.7
@@ -143,12 +136,12 @@ class Arrivals:
                 times.popleft()
 
     def recent(self, message_id: int, now: float, window: float = RECENT) -> list[float]:
-        """Return when a message came within ``window``, s, at most ``RECENT``."""
+        """Return the times of a message within ``window``, s, at most ``RECENT``."""
         # A copy: other threads read too.
         return [time for time in self._times[message_id].copy() if now - time < window]
 
     def rate(self, message_id: int, now: float) -> float:
-        """Return how often a message has come within RECENT, Hz."""
+        """Return the rate of a message within RECENT, Hz."""
         return len(self.recent(message_id, now)) / RECENT
 
     def longest_pause(self, now: float) -> float:

@@ -16,10 +16,10 @@
 Ends a flight: when the bridge itself requests the autopilot's hold mode, and a landing.
 
 The bridge hands over a vehicle that flies our setpoints if no command came for COMMAND_TIMEOUT, if
-the vehicle is outside the envelope, if its sources contradict each other or its thrust, or if the
-battery is low. A landing follows only if a parameter asks for it, and only while the autopilot
-stays in the hold mode: any other mode is a person's decision. While the autopilot is not received,
-its mode is unknown, and nothing is requested. Time is an argument; no clock is read.
+the vehicle is outside the envelope, if its sources contradict each other, if its hover thrust is
+wrong, or if the battery is low. A landing follows only if a parameter requests it, and only while
+the autopilot stays in the hold mode: any other mode is a person's decision. While the autopilot is
+not received, its mode is unknown, and nothing is requested. Time is an argument; no clock is read.
 
 ``CommandSources`` detects that two nodes publish commands. rclpy does not report the publisher of
 a message, but the middleware numbers the messages of each publisher upwards from 1
@@ -42,7 +42,7 @@ FELL_SILENT_AFTER: Final[float] = 0.3
 
 
 class CommandSources:
-    """Remembers who commanded last, to notice another one who does."""
+    """Detects a second publisher of commands by its sequence numbers."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -55,7 +55,7 @@ class CommandSources:
         A publisher that replaces a silent one does not count as a second.
 
         :param number: its sequence number, from 1; None if the middleware has none.
-        :param time: when it came, s on a monotonic clock.
+        :param time: its time of arrival, s on a monotonic clock.
         """
         if number is None:
             return False
@@ -69,7 +69,7 @@ HOLD, LAND = ACTIONS = ('hold', 'land')
 COMMAND_TIMEOUT: Final[float] = 3.0
 #: The battery has to be low for this long, s: a climb lowers its voltage.
 BATTERY_TIME: Final[float] = 5.0
-#: A battery reported longer ago than this, s, is not known.
+#: A report of the battery older than this, s, is not used.
 BATTERY_TIMEOUT: Final[float] = 30.0
 #: A handover that failed is requested again after this, s.
 RETRY_PERIOD: Final[float] = 2.0
@@ -134,11 +134,11 @@ class FlightEnd:
     def reason(self, active_since: float, command_time: float, handover: str,
                now: float) -> tuple[str, str]:
         """
-        Return why a vehicle that flies our setpoints has to be handed over, or '', and the action.
+        Return why a vehicle that flies our setpoints must be handed over, or '', and the action.
 
-        :param active_since: since when it is ACTIVE, s; infinite while it is not.
-        :param command_time: when a command was accepted last, s.
-        :param handover: why the gate wants to, or ''.
+        :param active_since: time from which it has been ACTIVE, s; infinite while it is not.
+        :param command_time: time of the last accepted command, s.
+        :param handover: the gate's reason for a handover, or ''.
         """
         if handover:
             return handover, HOLD
@@ -154,11 +154,11 @@ class FlightEnd:
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
              status: VehicleStatus, now: float) -> str:
         """
-        Return what to request of the autopilot at ``now``: HOLD, LAND or '' for nothing.
+        Return the request to the autopilot at ``now``: HOLD, LAND or '' for none.
 
         :param flies: whether the vehicle, as far as known, flies our setpoints.
         :param pending: whether a request that ends the flight is open.
-        :param why: why it has to be handed over, or ''; and the ``action`` that follows.
+        :param why: why it must be handed over, or ''; and the ``action`` that follows.
         :param held_mode: the mode that the handover requested and reached, or ''.
         :param status: of the vehicle.
         """

@@ -48,6 +48,7 @@ from flock_follower.mavlink.velocity_check import (
     Motion,
     ODOM,
     Path,
+    plausible_velocity,
     refusal,
     Source,
     VELOCITIES_DISAGREE,
@@ -78,8 +79,8 @@ class Gate:
     received, s, so that the gate needs no second clock.
 
     :param limits: at start; ``limits`` may be lowered later, braking and separation keep these.
-    :param velocity_source: whose velocity a command is judged with and has to be fresh: 'odom',
-        'autopilot', or 'auto', which is odom as soon as odom was received once.
+    :param velocity_source: source of the velocity that commands are checked against; it must be
+        fresh: 'odom', 'autopilot', or 'auto', which is odom once odom was received.
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
@@ -87,8 +88,10 @@ class Gate:
         self.velocity_source = velocity_source
         self.compensates_wind = False
         """Whether setpoints offset the wind."""
+        self.hover_thrust = 'the hover thrust'
+        """The autopilot's parameter of the hover thrust."""
         self.fused = False
-        """Whether the autopilot's estimate rests on our odometry, so that it proves nothing."""
+        """Whether the autopilot's estimate rests on our odometry, so that it is no evidence."""
         self.heights = HeightEstimator()
         self.relative = RelativeFlight(
             self.limits.relative_timeout if self.limits.relative_flight else 0.0)
@@ -98,7 +101,7 @@ class Gate:
         """Time of the last accepted command, s."""
         self.permission = Permission()
         self.active_since = math.inf
-        """Since when it is ACTIVE, s; infinite while it is not."""
+        """Time from which it has been ACTIVE, s; infinite while it is not."""
         self._was_active = False  # since offboard was last requested
         self._status: VehicleStatus | None = None
         self._airborne: bool | None = None
@@ -126,7 +129,8 @@ class Gate:
         if (before.phase is Phase.ACTIVE) != (phase is Phase.ACTIVE):
             self._command = None  # it brakes until the next one
 
-    def see(self, status: VehicleStatus, received: float, airborne: bool | None = True) -> None:
+    def take_status(self, status: VehicleStatus, received: float,
+                    airborne: bool | None = True) -> None:
         """
         Take the status in a HEARTBEAT or CURRENT_MODE, received at a time, s.
 
@@ -180,8 +184,10 @@ class Gate:
         :param yaw: of the same message, rad; NaN without one.
         :param position: of the same message (3,), m, and its standard deviation ``std``, m.
         """
-        v, known = finite_vector(velocity), self._sources[source]
-        refused = 'not finite' if v is None else refusal(age, self.limits.odom_timeout)
+        v, known = plausible_velocity(velocity), self._sources[source]
+        refused = first_reason(
+            (finite_vector(velocity) is None, 'not finite'), (v is None, 'too fast'),
+        ) or refusal(age, self.limits.odom_timeout)
         if v is not None and not refused:
             known.velocity, known.velocity_time = v, now - max(age, 0.0)
             known.take_yaw(yaw, known.velocity_time)
@@ -198,9 +204,9 @@ class Gate:
             known.std = std if math.isfinite(std) else 0.0
 
     def update_height(self, altitude: float, now: float, sensor: str = '') -> str:
-        """Take an altitude, m, of a barometer or another sensor; return '' or why not."""
+        """Take an altitude, m, of a barometer or another sensor; return '' or the refusal."""
         known = self._known(now)
-        # Also from an invalid source: a constant error is estimated and removed.
+        # Also of an invalid source: a constant error is estimated and removed.
         velocity = None if self.relative.reckoning else known.velocity or known.braking
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now, sensor)
@@ -230,7 +236,7 @@ class Gate:
         return self._known(now).turned
 
     def contradiction(self, now: float) -> str:
-        """Return what odom and the autopilot disagree about, in words for people, or ''."""
+        """Return the contradiction between odom and the autopilot as text, or ''."""
         known, turned = self._known(now), math.degrees(self.yaw_difference(now) or 0.0)
         more = {
             YAWS_DISAGREE: f' by {turned:.0f} deg: their frames are not aligned, commands would '
@@ -251,7 +257,7 @@ class Gate:
         return '' if now - self._disturbance.excess_since <= longer else (
             f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
             f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
-            'battery, MPC_THR_HOVER or MOT_THST_HOVER')
+            f'battery, and {self.hover_thrust}')
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
@@ -259,7 +265,7 @@ class Gate:
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def place(self, now: float) -> Location:
-        """Return where the vehicle is in its envelope."""
+        """Return the vehicle's location in its envelope."""
         position = self._sources[self._source()].path.position
         height = self.heights.height(now)
         if (motion := self.relative.reckoning) is not None:
@@ -269,24 +275,23 @@ class Gate:
                          position - self._start)[:2])
 
     def handover(self, now: float) -> str:
-        """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        displaced_for = now - self._displaced_since
+        """Return why the vehicle must be handed to the autopilot's hold mode, or ''."""
+        displaced = now - self._displaced_since > velocity_check.DISPLACED_HANDOVER_TIME
         return first_reason(
-            (displaced_for > velocity_check.HANDOVER_TIME and math.isnan(self.relative.lasts(now)),
-             self._displaced),
+            (displaced and math.isnan(self.relative.lasts(now)), self._displaced),
             (now - self._heightless_since > HEIGHT_HANDOVER_TIME, 'no height from the autopilot'),
         ) or envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
-            now, setpoint_rules.HANDOVER_TIME)
+            now, setpoint_rules.THRUST_HANDOVER_TIME)
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
-        Return what to send at ``now``, s, and the command it comes from, if any.
+        Return the setpoint to send at ``now``, s, and its command, if any.
 
         Once the vehicle flies our setpoints, yaw and height to hold are frozen where braking
         begins, and the radius counts from there; before, they follow the vehicle.
 
-        :param link_age: how long the autopilot has been missing, s.
+        :param link_age: time since the autopilot is missing, s.
         :param withheld: a reason of the caller's own to send nothing.
         :param distrusted: why the velocity of the autopilot is invalid, or ''.
         """
@@ -298,10 +303,10 @@ class Gate:
         status, withheld = self._status, withheld or self.withheld
         armed = status is not None and status.armed
         engaged = status is not None and status.offboard and armed and not withheld
-        # In flight only the landing that lasts counts: a false report must not remove thrust.
+        # In flight only a lasting landed report counts: a false one must not remove thrust.
         airborne = self._airborne is True or self._was_active
         self._compare(engaged, now)
-        # While nothing is received the height is missing, too: that is no fault of its sensor.
+        # While nothing is received the height is missing, too, without a fault of its sensor.
         heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
         self._heightless_since = min(self._heightless_since, now) if heightless else math.inf
         known, place = self._known(now), self.place(now)
@@ -354,7 +359,7 @@ class Gate:
     def _known(self, now: float) -> KnownMotion:
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
         yaw, time = odom.yaw()
-        # Compared at the same time: at 1 rad/s odometry 0.25 s late would seem turned by 0.25 rad.
+        # Compared at the same time: at 1 rad/s odometry 0.25 s late would differ by 0.25 rad.
         then, _ = autopilot.yaw(time)
         return known_motion(
             self.limits, Motion(odom.velocity, now - odom.velocity_time, yaw, now - time),
@@ -368,7 +373,7 @@ class Gate:
         known, odom = self._known(now), self._sources[ODOM]
         self._comparison.take(
             known.difference, self.limits.velocity_tolerance, engaged, now)
-        # An estimate that rests on our odometry, or on nothing, proves nothing.
+        # An estimate that rests on our odometry, or on no sensor, is no evidence.
         proves = not self.fused and math.isinf(self._distrusted_since)
         self._displaced = '' if known.source != ODOM else displaced(
             odom, self._sources[AUTOPILOT] if proves else None,
@@ -377,7 +382,7 @@ class Gate:
             self._displaced) else math.inf
 
     def _hold(self, known: KnownMotion, place: Location, engaged: bool, now: float) -> None:
-        """Note what braking keeps, and where the radius counts from."""
+        """Store the yaw and height that braking holds, and the origin of the radius."""
         if not engaged or self._start is None:
             self._start = self._sources[self._source()].path.position
         height = None
@@ -388,7 +393,7 @@ class Gate:
             held_height = height if self._held.height is None else self._held.height
             self._held = self._held._replace(height=held_height)
             return
-        # The autopilot's own yaw first: it is the one that will obey.
+        # The autopilot's own yaw first: the autopilot obeys in its own frame.
         yaws = [self._sources[source].yaw() for source in (AUTOPILOT, ODOM)]
         fresh = [yaw for yaw, time in yaws if now - time <= self.limits.odom_timeout]
         self._last_yaw = fresh[0] if fresh else self._last_yaw

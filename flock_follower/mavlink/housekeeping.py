@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Requests to the autopilot besides flying: telemetry rates, clock offset, parameters, messages.
+Requests beside the flight: telemetry rates, clock offset, parameters, reasons, origin.
 
 Every request is repeated after a reboot of the autopilot, and when a lost link returns.
 
@@ -40,16 +40,17 @@ from flock_follower.mavlink.estimator_health import RECENT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
+from flock_follower.messages import to_nanoseconds
 
-#: Time between two questions, s.
+#: Time between two requests of TIMESYNC, s.
 PERIOD: Final[float] = 1.0
-#: The answer with the shortest way among this many gives the offset: delay only ever adds.
+#: The answer with the shortest delay among this many gives the offset.
 WINDOW: Final[int] = 10
-#: An autopilot that answers nothing for so long, s, does not receive our messages.
+#: An autopilot that does not answer for this long, s, does not receive our messages.
 UNANSWERED_MAX: Final[float] = 5.0
-#: Answers older than this no longer count, ns: clocks drift by 0.1 ms/s at the most.
+#: Answers older than this, ns, are not used: clocks drift by up to 0.1 ms/s.
 MEMORY: Final[int] = 30_000_000_000
-#: Two clocks of the same speed may contradict themselves by this in that time, ns.
+#: In that time the samples of two clocks of the same speed may differ by this, ns.
 TOLERANCE: Final[int] = 10_000_000
 _MILLISECOND = 1_000_000  # ns
 _WRAP = 2**32 * _MILLISECOND  # of time_boot_ms, after 50 days
@@ -59,9 +60,9 @@ class Sample(NamedTuple):
     """One answer: the bounds of the autopilot's clock minus ours, ns."""
 
     most: int
-    """It was written after the question."""
+    """The answer was written after the request."""
     least: int
-    """It was written before it arrived."""
+    """The answer was written before it arrived."""
     time: int
     """Time of reception, ns."""
 
@@ -73,13 +74,13 @@ class TimeSync:
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
         self._asked: deque[int] = deque(maxlen=WINDOW)
 
-    def question(self, now: int) -> Any:
-        """Return the message that asks for the autopilot's time."""
+    def request(self, now: int) -> Any:
+        """Return the request for the autopilot's time."""
         self._asked.append(now)
         return mavlink.MAVLink_timesync_message(0, now)
 
     def take(self, message: Any, now: int) -> Any | None:
-        """Take a TIMESYNC; return the answer where it is a question."""
+        """Take a TIMESYNC; return the answer if it is a request."""
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
         if message.ts1 in self._asked:  # else another system has sent the request
@@ -87,7 +88,7 @@ class TimeSync:
         return None
 
     def unanswered(self, now: int) -> float:
-        """Return for how long, s, no question has been answered; 0 if none waits."""
+        """Return the age, s, of the oldest request without an answer since; 0 if none waits."""
         # Copies: diagnostics read them from another thread.
         answered = max((sample.time for sample in self._samples.copy()), default=0)
         waiting = (now - time for time in self._asked.copy() if time > answered)
@@ -97,12 +98,12 @@ class TimeSync:
         """
         Return the largest possible age, s, of a message received now and stamped ``time_boot_ms``.
 
-        An answer is written after its question, so the autopilot's clock is ahead of ours by at
-        most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
+        An answer is written after its request, so the autopilot's clock is ahead of ours by at
+        most ``tc1 - ts1``. The age is therefore never too small: it includes the shortest delay
         to the autopilot, as control loops through it do. The age is 0 if unknown: without a
         stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
         ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
-        that is behind that clock by any time is as old as it says.
+        behind that clock is used, however old it is.
         """
         if not time_boot_ms:
             return 0.0
@@ -111,19 +112,19 @@ class TimeSync:
             return 0.0
         ahead = min(sample.most for sample in samples)
         if max(sample.least for sample in samples) > ahead + TOLERANCE:
-            return 0.0  # they clash: trust none
+            return 0.0  # contradictory samples: age unknown
         late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
         return max(late, 0) * 1e-9
 
 
-#: Messages that come too seldom are requested again after this, s: another program on the line may
-#: have set other rates (MAVProxy does, every 15 s).
+#: Messages whose rate is too low are requested again after this, s: another program on the line
+#: may have set other rates (MAVProxy does, every 15 s).
 STREAM_REQUEST_PERIOD: Final[float] = 5.0
 #: The messages whose rate is reported.
 ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
     'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
-#: The rates of the other messages wanted from any autopilot, Hz.
+#: The requested rates of other messages of any autopilot, Hz.
 RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
@@ -149,7 +150,7 @@ WHY_WAIT: Final[float] = 3.0
 
 
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
-    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
+    """Return the requested messages by id, and their rates, Hz."""
     return {dialect.mode_message: dialect.mode_rate, dialect.estimator_status: 5.0,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
             **dict.fromkeys(ESTIMATE.values(), estimate_rate), **RATES}
@@ -160,7 +161,7 @@ class Housekeeping:
     Sends HEARTBEAT, requests and origins, and takes the answers.
 
     :param recommendations: the parameters to compare, by the name of the dialect.
-    :param estimate_rate: wanted rate of the autopilot's position and attitude, Hz.
+    :param estimate_rate: requested rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, sent to an estimator without an origin.
     :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
         receives ``ANY_ORIGIN`` if ``origin`` is None.
@@ -183,13 +184,9 @@ class Housekeeping:
         self._requested: dict[int, float] = {}  # when each message was requested last, s
 
     def take_timesync(self, message: Any, now: float) -> None:
-        """Take a TIMESYNC, and answer it if it is a question."""
-        if (answer := self.timesync.take(message, round(now * 1e9))) is not None:
+        """Take a TIMESYNC, and answer it if it is a request."""
+        if (answer := self.timesync.take(message, to_nanoseconds(now))) is not None:
             self._link.send(answer)
-
-    def take_parameter(self, message: Any, now: float) -> None:
-        """Take a PARAM_VALUE."""
-        self.parameters.take(message)
 
     def step(self, now: float, alive: bool) -> None:
         """Send HEARTBEAT and due requests; ``alive``: whether the autopilot is connected."""
@@ -206,7 +203,7 @@ class Housekeeping:
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now
-            self._link.send(self.timesync.question(round(now * 1e9)))
+            self._link.send(self.timesync.request(to_nanoseconds(now)))
         self._send_origin(now)
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
@@ -222,7 +219,7 @@ class Housekeeping:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
     def has_reasons(self, now: float) -> bool:
-        """Return whether the autopilot was asked what keeps it from arming, and had the time."""
+        """Return whether the arming reasons were requested and the answer time is over."""
         return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
     def _new_check(self) -> ParameterCheck:
@@ -238,20 +235,20 @@ class Housekeeping:
     def unreceived(self, now: float) -> str:
         """Return why the autopilot does not receive our messages, or ''."""
         if self._link.signing or not self._link.autopilot_signs or (  # USB needs no signature
-                self.timesync.unanswered(round(now * 1e9)) < UNANSWERED_MAX):
+                self.timesync.unanswered(to_nanoseconds(now)) < UNANSWERED_MAX):
             return ''
         return ('the autopilot signs its messages and answers none of ours: '
                 'set signing_key_file')
 
     def rates(self, now: float) -> dict[str, float]:
-        """Return how often the estimate comes, Hz, by the message's name."""
+        """Return the rates of the estimate, Hz, by the message's name."""
         return {name: self._link.telemetry.arrivals.rate(message_id, now)
                 for name, message_id in ESTIMATE.items()}
 
     def too_slow(self, now: float) -> str:
-        """Return that the estimate comes too seldom, or that the link stalls, or ''."""
+        """Return that the rate of the estimate is too low, or that the link stalls, or ''."""
         if now - self._alive_since < RECENT + PERIOD:
-            return ''  # the requested messages have not come for so long
+            return ''  # the streams were requested too recently
         problems = [f'{name} comes at {rate:.0f} Hz of {self._estimate_rate:g} requested'
                     for name, rate in self.rates(now).items()
                     if 0.0 < rate < FEW * self._estimate_rate]
@@ -262,12 +259,12 @@ class Housekeeping:
         return '; '.join(problems)
 
     def _request_streams(self, now: float) -> None:
-        """Request each message once, and again if it comes too seldom."""
+        """Request each message once, and again if its rate is too low."""
         arrivals, dialect = self._link.telemetry.arrivals, self._link.telemetry.dialect
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
-        # Permission, braking and heights rest on them, and a request may be lost.
+        # Permission, braking and heights depend on them, and a request may be lost.
         least = {**wanted, dialect.mode_message: dialect.least_mode_rate}
         due = {message_id: wanted[message_id] for message_id in wanted
                if message_id not in self._requested or (
@@ -279,7 +276,7 @@ class Housekeeping:
     def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin
         dialect = telemetry.dialect
-        # An autopilot that has one, from GPS or from before, keeps it.
+        # An autopilot that has an origin, by GPS or from before, keeps it.
         if dialect is None or 'GPS_GLOBAL_ORIGIN' in telemetry.newest or (
                 now - self._origin_sent < ORIGIN_PERIOD):
             return
@@ -291,7 +288,7 @@ class Housekeeping:
                 telemetry.estimator is not None and not telemetry.estimator.has_velocity):
             return
         latitude, longitude, height = origin
-        # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
+        # PX4's heights jumped by it whenever odometry returned: a take-off went on to 30 m.
         height = height if dialect.origin_has_height else 0.0
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),

@@ -56,7 +56,7 @@ BAD_SIGNATURE: Final[str] = (
 
 
 class Codec(mavlink.MAVLink):  # type: ignore[misc]
-    """Decodes the messages of one sender, and refuses forged ones and those of another time."""
+    """Decodes the messages of one sender, and refuses forged ones and those from the future."""
 
     latest = 0
     """The latest timestamp to accept."""
@@ -72,7 +72,7 @@ class Codec(mavlink.MAVLink):  # type: ignore[misc]
 
 class Framer:
     """
-    Takes the bytes of one sender as they arrive.
+    Decodes the bytes of one sender as they arrive.
 
     :param codec: decodes, and checks signatures.
     """
@@ -129,7 +129,7 @@ class Framer:
 
 
 def frame_length(buffer: bytearray, start: int) -> int:
-    """Return the length of the message that starts there, or more than there is if unknown."""
+    """Return the length of the message that starts there; 3, the length needed, if unknown."""
     if len(buffer) < start + 3:
         return 3
     marker, payload, flags = buffer[start:start + 3]
@@ -147,7 +147,7 @@ SIGNING_KEY_SIZE: Final[int] = 32
 _SIGNING_EPOCH: Final[float] = 1420070400.0
 _SIGNING_TICKS: Final[float] = 1e5
 _MOST_PEERS: Final[int] = 16
-#: Of messages and pieces of garbage taken in one call; what a flood brings beyond is dropped.
+#: Messages and pieces of garbage that one call takes; a flood beyond that is dropped.
 MOST_PIECES: Final[int] = 300
 #: How far ahead of our clock a signed message may be, s. MAVLink's rules send with the latest
 #: timestamp that was accepted, and refuse a new stream (the autopilot, started again) that is more
@@ -240,7 +240,7 @@ class Link:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
         messages = []
         self.transport.reopen(now)
-        # What the vehicle may take of one call's time, and what all others together.
+        # Pieces of the vehicle, and of all other senders together.
         budgets = {True: MOST_PIECES, False: MOST_PIECES}
         for data, peer in self.transport.read():
             self.bytes_received += len(data)
@@ -262,7 +262,7 @@ class Link:
         return messages
 
     def _framer(self, peer: Any, now: float) -> Framer:
-        # One for each sender, so that garbage from one cannot cut into another's messages.
+        # One for each sender, so that garbage of one does not damage messages of another.
         if peer not in self._framers:
             if len(self._framers) >= _MOST_PEERS:
                 del self._framers[next(iter(self._framers))]
@@ -314,7 +314,7 @@ class Link:
             *params, *(0.0,) * (7 - len(params))))
 
     def request_streams(self, rates: Mapping[int, float]) -> None:
-        """Ask for messages by id, at rates in Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        """Request messages by id, at rates in Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."""
         for message_id, hertz in rates.items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Forwarding odometry to the autopilot as ODOMETRY, for flight without GPS.
+Forwards odometry to the autopilot as ODOMETRY, for flight without GPS.
 
 Each autopilot takes it in one pair of frames only: PX4 LOCAL_NED and BODY_FRD, ArduPilot LOCAL_FRD
 and BODY_FRD, both with the same numbers (ENU turned into NED). The velocity is that of the body,
@@ -40,19 +40,20 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.messages import FUTURE_TOLERANCE, OdometryState, POSITION_JUMP, SANE
+from flock_follower.messages import (
+    FUTURE_TOLERANCE,
+    ODOMETRY_STD,
+    OdometryState,
+    POSITION_JUMP,
+    SANE,
+)
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is an error, s.
-LONGEST_GAP: Final[float] = 0.1
-#: Older odometry than this is not worth fusing, s.
+FORWARDING_GAP: Final[float] = 0.1
+#: Older odometry than this, s, is not forwarded.
 OLDEST: Final[float] = 0.3
-#: An attitude further than this from the predicted one has jumped (a loop closure, a restart).
-ATTITUDE_JUMP: Final[float] = 0.2  # rad
-#: Standard deviations used if a covariance is missing or invalid.
-POSITION_STD: Final[float] = 0.1  # m
-ATTITUDE_STD: Final[float] = 0.05  # rad
-VELOCITY_STD: Final[float] = 0.1  # m/s
-RATE_STD: Final[float] = 0.05  # rad/s
+#: An attitude further than this, rad, from the prediction has jumped (a loop closure, a restart).
+ATTITUDE_JUMP: Final[float] = 0.2
 _R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
 _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
@@ -60,9 +61,9 @@ _UPPER = np.triu_indices(6)
 
 class OdometryForwarder:
     """
-    Takes odometry as it comes, and hands it on as messages no faster than the line carries.
+    Takes odometry as it arrives, and returns messages no faster than the line carries.
 
-    :param rate: most messages per second, Hz; a link of 57,600 baud carries 10 of 245 bytes.
+    :param rate: largest rate of the messages, Hz; a link of 57,600 baud carries 10 of 245 bytes.
     """
 
     def __init__(self, rate: float = 30.0) -> None:
@@ -88,14 +89,14 @@ class OdometryForwarder:
             self.counters['jumps'] += 1
         if last is not None and time < last[1]:
             self._due = time
-        # The slack keeps a source of just the wanted rate from losing every second state.
+        # The tolerance: a source of exactly this rate would lose every second state.
         if time >= self._due - 0.25 * self._spacing:
             self._due = max(self._due + self._spacing, time)
             self._queue.append((state, time, self.reset_counter))
         return ''
 
     def messages(self, dialect: Dialect, now: float) -> list[Any]:
-        """Return the messages to send now, oldest first; what waited for too long is lost."""
+        """Return the messages to send now, oldest first; states that are too old are dropped."""
         fresh = [entry for entry in self._queue if now - entry[1] <= OLDEST]
         if lost := len(self._queue) - len(fresh):
             self.counters['too old to send'] += lost
@@ -103,7 +104,7 @@ class OdometryForwarder:
         return [encode_odometry(state, time, dialect, count) for state, time, count in fresh]
 
     def sent(self, success: bool, now: float) -> None:
-        """Note that a message went out, or that the link had no room for it."""
+        """Record that a message was sent, or that the link had no room for it."""
         if not success:
             self.counters['not sent'] += 1
             return
@@ -111,12 +112,12 @@ class OdometryForwarder:
         self.counters['sent'] += 1
 
     def silence(self, now: float) -> float:
-        """Return how long nothing has gone out, s; infinite before the first message."""
+        """Return the time since the last message was sent, s; infinite before the first one."""
         return now - self._sent
 
 
 def jumped(before: OdometryState, then: float, after: OdometryState, now: float) -> bool:
-    """Return whether a pose is not where the motion at time ``then``, s, leads, or time fell."""
+    """Return whether a pose differs from the one predicted from time ``then``, s, or time fell."""
     dt = now - then
     mean_velocity = 0.5 * (before.velocity + after.velocity)
     moved = after.position - before.position - mean_velocity * dt
@@ -133,19 +134,19 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
     Return the ODOMETRY message of a state, at a time, s, in the frames of the autopilot.
 
     Covariances are the row-major upper triangles of (6, 6). One that is missing (zeros), not
-    finite, absurdly large or without positive variances is replaced by a diagonal of the
-    deviations above.
+    finite, above ``SANE`` or without positive variances is replaced by a diagonal of the
+    deviations ``ODOMETRY_STD``.
     """
     R_enu_flu = quaternion_to_matrix(state.quaternion)
+    position_std, attitude_std, velocity_std, rate_std = ODOMETRY_STD
     x, y, z, w = quaternion_enu_flu_to_ned_frd(state.quaternion).tolist()
     # The covariance of R x is R C R^T.
     pose_covariance = _transformed(
-        _valid(state.pose_covariance, [POSITION_STD] * 3 + [ATTITUDE_STD] * 3),
-        _R_NED_ENU)
+        _valid(state.pose_covariance, [position_std] * 3 + [attitude_std] * 3), _R_NED_ENU)
     twist_covariance: Array = np.zeros((6, 6))
     twist_covariance[:3, :3] = (
-        R_enu_flu.T @ _valid(state.velocity_covariance, [VELOCITY_STD] * 3) @ R_enu_flu)
-    twist_covariance[3:, 3:] = _valid(state.twist_covariance[3:, 3:], [RATE_STD] * 3)
+        R_enu_flu.T @ _valid(state.velocity_covariance, [velocity_std] * 3) @ R_enu_flu)
+    twist_covariance[3:, 3:] = _valid(state.twist_covariance[3:, 3:], [rate_std] * 3)
     twist_covariance = _transformed(twist_covariance, _R_FRD_FLU)
     return mavlink.MAVLink_odometry_message(
         max(0, round(time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,

@@ -13,35 +13,34 @@
 # limitations under the License.
 
 """
-Reads the autopilot's parameters that the bridge depends on, and reports those that differ.
+Reads the autopilot's parameters that the bridge depends on, and reports differences.
 
 The bridge writes no parameter. The recommendations are the files in ``config/`` that
 QGroundControl (``.params``) and MAVProxy (``.parm``) load; the comment before an entry gives its
 reason. If the comment begins with ``Any but 0``, the entry differs only if the value is 0: off.
 
-``obstacle`` returns which of these parameters forbid ``offboard``, and why.
+``obstacle`` returns the parameter that forbids ``offboard``, and the reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 import math
 import re
 import struct
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import Dialect
+from flock_follower.mavlink.dialects import Dialect, Rule
 
-#: An unanswered question is asked again after this, s.
+#: An unanswered request is repeated after this, s.
 RETRY_PERIOD: Final[float] = 2.0
 #: The differences are reported after this, s, if some are not answered by then.
 PATIENCE: Final[float] = 5.0
 #: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
-#: How the comment of an entry begins of which any other value but 0 will do.
+#: Beginning of the comment of an entry that admits any value but 0.
 ANY_BUT_ZERO: Final[str] = 'Any but 0'
 _ENTRY: Final = re.compile(
     r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')
@@ -59,7 +58,7 @@ class Recommendation(NamedTuple):
     why: str
 
     def differs(self, value: float) -> bool:
-        """Return whether a value is another than recommended, in a way that matters."""
+        """Return whether a value differs from the recommended one."""
         if self.why.startswith(ANY_BUT_ZERO):
             return value == 0.0
         return not math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9)
@@ -69,7 +68,7 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     """
     Return the entries of a ``.params`` or ``.parm`` file.
 
-    :param forwarding: whether those that matter only with forwarded odometry are wanted too.
+    :param forwarding: whether to return those that matter only with forwarded odometry, too.
     :raises ValueError: naming the first line that is neither an entry, a comment, nor empty.
     """
     found: list[Recommendation] = []
@@ -111,17 +110,17 @@ class CheckResult(NamedTuple):
     differing: int
     unanswered: int
     lines: tuple[str, ...]
-    """For people: what differs and why it matters."""
+    """For people: each difference, and its reason."""
 
 
 class ParameterCheck:
     """
-    Reads parameters; ``step`` returns which one to ask for now, one at a time.
+    Reads parameters; ``step`` returns the one to request now, one at a time.
 
     ``values`` holds the autopilot's answers. ``result`` may be called from any thread, everything
     else from one.
 
-    :param needed: names to read that are not compared with anything.
+    :param needed: names to read, and not to compare.
     """
 
     def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool = False,
@@ -134,7 +133,7 @@ class ParameterCheck:
         self._patient = True
 
     def step(self, now: float) -> str:
-        """Return the name to ask for at ``now``, s, or ''."""
+        """Return the name to request at ``now``, s, or ''."""
         self._begun = min(self._begun, now)
         self._patient = now - self._begun < PATIENCE
         due = [name for name, asked in self._asked.items()
@@ -166,58 +165,16 @@ class ParameterCheck:
         return CheckResult(len(values), differing, len(unanswered), tuple(lines))
 
 
-#: An autopilot may fly the last setpoint for this long, s. ArduPilot's default is 3 s, in which it
-#: gained 8.5 m/s, at 2.5 m/s^2, and flew 36 m.
-LONGEST: Final[float] = 1.0
-#: Bits of PX4's EKF2_EV_CTRL: horizontal position, and velocity.
-_FUSED_BITS: Final[int] = 1 | 4
-_EXTERNAL_NAVIGATION: Final[int] = 6
 _ANYWAY: Final[str] = 'require_failsafe:=false'
-
-
-class Rule(NamedTuple):
-    """A parameter, and the values of it with which nothing may be flown by setpoints."""
-
-    name: str
-    forbidden: Callable[[float], bool]
-    advice: str
-    """What follows NAME = VALUE: why, and what to set."""
-    forwarding: bool = False
-    """Whether it matters only if odometry is forwarded."""
-
-
-_TOO_LONG: Final[str] = (' s: it would fly the last acceleration for so long if the bridge died; '
-                         f'set it to {LONGEST:g} s at most')
-_NOT_FUSED: Final[str] = ': it does not fuse the odometry that is forwarded to it; '
-
-
-#: By the name of the dialect; the values are those of PX4 1.14 to 1.16, ArduCopter 4.6 and 4.7.
-RULES: Final[Mapping[str, tuple[Rule, ...]]] = MappingProxyType({
-    'px4': (
-        Rule('COM_OF_LOSS_T', lambda value: value > LONGEST, _TOO_LONG),
-        Rule('COM_OBL_RC_ACT', lambda value: value in (6, 7),
-             ': it would stop its motors in the air (6: terminate, 7: disarm) if the bridge died; '
-             'set it to 5 (Hold), or 4 (Land) where odometry is forwarded'),
-        Rule('EKF2_EV_CTRL', lambda value: not (
-            math.isfinite(value) and int(value) & _FUSED_BITS == _FUSED_BITS),
-             f'{_NOT_FUSED}set bits 0 (horizontal position) and 2 (velocity), as 13 does',
-             forwarding=True)),
-    'ardupilot': (
-        Rule('GUID_TIMEOUT', lambda value: value > LONGEST, _TOO_LONG),
-        Rule('VISO_TYPE', lambda value: value == 0, f'{_NOT_FUSED}set it to 1 (MAVLink)',
-             forwarding=True),
-        *(Rule(f'EK3_SRC1_{source}', lambda value: value != _EXTERNAL_NAVIGATION,
-               f'{_NOT_FUSED}set it to {_EXTERNAL_NAVIGATION} (ExternalNav)', forwarding=True)
-          for source in ('POSXY', 'VELXY')))})
 
 
 def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
     """Return the rules that apply; ``forwarding`` is whether odometry is forwarded."""
-    return [rule for rule in RULES[dialect.name] if forwarding or not rule.forwarding]
+    return [rule for rule in dialect.rules if forwarding or not rule.forwarding]
 
 
 def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
-    """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
+    """Return the reason in the autopilot's parameters against flying by setpoints, or ''."""
     values, applicable = parameters.values, rules(dialect, forwarding)
     for rule in applicable:
         if rule.name in values and rule.forbidden(values[rule.name]):

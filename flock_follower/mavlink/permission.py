@@ -18,12 +18,12 @@ State machine of the permission to fly: which setpoints the bridge may send.
 Only the service ``mavlink_bridge/offboard`` gives permission. The permission ends with its flight.
 
 ===========  ==================================  ================================================
-phase        what the bridge sends               announced on ``mavlink_bridge/state`` as
+phase        the bridge sends                    announced on ``mavlink_bridge/state`` as
 ===========  ==================================  ================================================
 INACTIVE     nothing                             INACTIVE
-READY        what holds the vehicle still        READY
+READY        setpoints that hold it still        READY
 ACTIVE       the planner's commands, limited     ACTIVE
-GIVING_BACK  what brakes the vehicle             READY
+GIVING_BACK  braking setpoints                   READY
 TAKEN_OVER   nothing                             TAKEN_OVER
 ===========  ==================================  ================================================
 
@@ -39,8 +39,8 @@ import math
 from typing import Final
 
 from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.planner import modes
 
-NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground'
 FELL_SILENT: Final[str] = 'fell silent'
@@ -53,13 +53,13 @@ LONGEST_SILENCE: Final[float] = 5.0
 
 
 class Phase(enum.Enum):
-    """What may be sent; the value is the word that is announced."""
+    """A phase; the value is announced."""
 
-    INACTIVE = 'INACTIVE'
-    READY = 'READY'
-    ACTIVE = 'ACTIVE'
-    GIVING_BACK = 'READY: giving back'
-    TAKEN_OVER = 'TAKEN_OVER'
+    INACTIVE = modes.INACTIVE
+    READY = modes.READY
+    ACTIVE = modes.ACTIVE
+    GIVING_BACK = f'{modes.READY}: giving back'
+    TAKEN_OVER = modes.TAKEN_OVER
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Permission:
 
     @property
     def streams(self) -> bool:
-        """Return whether setpoints may go out at all."""
+        """Return whether setpoints may be sent at all."""
         return self.phase in (Phase.READY, Phase.ACTIVE, Phase.GIVING_BACK)
 
     @property
@@ -100,13 +100,13 @@ class Permission:
     # The permission after an event.
 
     def requested(self, time: float) -> Permission:
-        """Permit to try offboard, requested at a time, s."""
+        """Permit setpoints for a request of offboard at a time, s."""
         return self if self.phase is Phase.ACTIVE else Permission(
             Phase.READY, 'waiting for offboard mode', time)
 
     def failed(self, why: str) -> Permission:
-        """End what the vehicle did not do, or not in time."""
-        # Should the mode come late, nothing is to follow from it.
+        """End a request that the vehicle refused, or did not execute in time."""
+        # A mode that is reached late has no effect then.
         ends = self.phase is Phase.READY and not self.obeyed
         return Permission(reason=why) if ends else self
 
@@ -123,20 +123,20 @@ class Permission:
 
     def blinded(self, why: str) -> Permission:
         """Fall silent without a valid velocity: only silence starts the failsafe."""
-        # Setpoints alone would end the failsafe of PX4, should a velocity come back.
+        # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return Permission(reason=f'{FELL_SILENT}: {why}') if self.streams else self
 
     def landed(self) -> Permission:
-        """End a flight that has been on the ground for long enough."""
+        """End a flight after a landing."""
         return Permission(reason=ON_GROUND) if self.streams else self
 
     def restarted(self, why: str) -> Permission:
-        """Forget a request that the autopilot, rebooted or replaced, has not received."""
+        """Reset: the autopilot, rebooted or replaced, has not received the request."""
         return Permission(reason=why)
 
     def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
         """
-        Follow a HEARTBEAT or CURRENT_MODE that came at the time ``received``, s.
+        Follow a HEARTBEAT or CURRENT_MODE that was received at the time ``received``, s.
 
         :param airborne: whether the vehicle reports that it flies: on the ground setpoints could
             start a take-off. None: it does not report, which permits nothing.

@@ -16,7 +16,7 @@
 Flight without odometry: when it is permitted, and the motion by attitude and acceleration.
 
 It begins while the vehicle flies our commands, if the odometry that they were flown on is lost or
-contradicted, and ends as soon as odometry is usable again for RETURN_TIME, after
+contradicted, and ends once odometry has been usable again for USABLE_TIME, after
 ``relative_timeout``, or with the permission. After a takeover, too, it begins only once commands
 were flown on odometry. Time flown without odometry counts until as much was flown with it.
 
@@ -35,11 +35,11 @@ import numpy as np
 from flock_follower.geometry import Array, GRAVITY, quaternion_to_matrix
 from flock_follower.messages import OdometryState, RELATIVE
 
-#: Odometry that is usable for this long, s, is flown on again.
-RETURN_TIME: Final[float] = 1.0
-#: At its beginning the marker's estimate starts anew: for this long, s, the stream goes on level.
+#: Odometry that has been usable for this long, s, is flown on again.
+USABLE_TIME: Final[float] = 1.0
+#: At its beginning the marker's estimate restarts: for this long, s, setpoints may be level.
 GRACE: Final[float] = 1.0
-#: Time constant of the leak of the velocity, s: a tilt wrong by 1 degree errs it by 0.9 m/s.
+#: Time constant of the leak of the velocity, s: a tilt error of 1 degree adds 0.9 m/s.
 LEAK: Final[float] = 5.0
 #: Of the observer that follows the height, 1/s.
 HEIGHT_BANDWIDTH: Final[float] = 0.7
@@ -52,15 +52,15 @@ class Relative(NamedTuple):
     """The permission of a command that rests on the marker alone."""
 
     lasted: float = math.nan
-    """For how long it has flown without odometry, s; NaN: it may not."""
+    """Time flown without odometry, s; NaN: not permitted."""
     begins: bool = False
-    """Whether that has just begun, so that no command can have come yet."""
+    """Whether it has just begun, so that no command can have arrived yet."""
     marker_age: float = math.inf
     """Age of the image that the command rests on, s."""
 
 
 class Reckoning:
-    """Position and velocity (3,), m and m/s, from where and when it began."""
+    """Position and velocity (3,), m and m/s, since its beginning."""
 
     def __init__(self, height: float) -> None:
         self.position: Array = np.array([0.0, 0.0, height])
@@ -73,8 +73,8 @@ class Reckoning:
         Integrate up to a time, s.
 
         :param rotation: attitude (3, 3), FLU to ENU.
-        :param acceleration: vertically that which is flown, m/s^2; horizontally that which the
-            attitude does not show, as by wind (3,).
+        :param acceleration: (3,), m/s^2: vertically the flown one; horizontally the part that the
+            attitude does not show, such as wind.
         :param height: by barometer or rangefinder, m.
         """
         elapsed = 0.0 if self._time is None else time - self._time
@@ -88,7 +88,7 @@ class Reckoning:
         level = self.velocity[:2] + elapsed * (
             tilted + acceleration[:2] - self.velocity[:2] / LEAK)
         velocity = np.array([*level, self._climb + 2.0 * HEIGHT_BANDWIDTH * error])
-        # What is compared with the marker's motion moves as its velocity says.
+        # The position is the integral of the velocity, for the comparison with the marker.
         self.position = self.position + 0.5 * elapsed * (self.velocity + velocity)
         self.velocity = velocity
 
@@ -97,7 +97,7 @@ class RelativeFlight:
     """
     Whether commands without odometry are admitted; times are monotonic, s.
 
-    :param timeout: time for which they are, s; 0: never.
+    :param timeout: longest time for which they are admitted, s; 0: never.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -111,7 +111,7 @@ class RelativeFlight:
         self._time = -math.inf
 
     def lasts(self, now: float) -> float:
-        """Return for how long it has lasted, earlier times included, s; NaN: not permitted."""
+        """Return its duration, earlier times included, s; NaN: not permitted."""
         lasted = self._spent + min(now, self._usable_since) - self._begun
         permitted = self.reckoning is not None and 0.0 <= lasted <= self._timeout
         return lasted if permitted else math.nan
@@ -136,7 +136,7 @@ class RelativeFlight:
         self._flown = active and (self._flown or (usable and commanded))
         self._usable_since = min(self._usable_since, now) if usable else math.inf
         if self.reckoning is not None:
-            if not active or now - self._usable_since >= RETURN_TIME:
+            if not active or now - self._usable_since >= USABLE_TIME:
                 self._spent += min(now, self._usable_since) - self._begun
                 self.reckoning, self._begun = None, math.inf
         elif usable:
@@ -147,7 +147,7 @@ class RelativeFlight:
     def motion(self, quaternion: Array, rates: Array, acceleration: Array, height: float | None,
                time: float, now: float) -> OdometryState | None:
         """
-        Return the motion at an attitude, in the frame ``RELATIVE``; None if none is wanted.
+        Return the motion at an attitude, in the frame ``RELATIVE``; None if not permitted.
 
         Its stamp is 0.
 

@@ -15,8 +15,8 @@
 """
 Requests by people and by the bridge itself: arm, offboard, take off, land; one at a time.
 
-A request that would be in vain or dangerous is refused here. Otherwise the autopilot is asked, and
-the permission to send setpoints follows the request and its outcome.
+A request that cannot succeed, or is dangerous, is refused here. Otherwise it is sent to the
+autopilot, and the permission to send setpoints follows the request and its outcome.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.ranges import first_reason
 
-#: What speaks against offboard, by whether the vehicle reports to be in the air.
+#: Obstacles to offboard, by the reported landed state.
 IN_AIR: Final[dict[bool | None, str]] = {
     True: '', False: 'on the ground: arm, call takeoff, and request offboard in the air',
     None: 'the autopilot does not report whether it flies (EXTENDED_SYS_STATE), which counts as '
@@ -55,7 +55,7 @@ class Requests:
     Begins requests and steps the one whose outcome is open.
 
     :param end: end of the flight; reset by a request of an operator.
-    :param require_failsafe: whether offboard needs the parameters of ``parameter_check.RULES``.
+    :param require_failsafe: whether offboard requires the ``rules`` of the dialect.
     """
 
     def __init__(self, link: Link, gate: Gate, housekeeping: Housekeeping,
@@ -70,12 +70,12 @@ class Requests:
         self._end = end
         self._require_failsafe = require_failsafe
 
-    # Requests by people; each starts asking the autopilot, the outcome appears in the request.
+    # Requests by people; the outcome appears in the request that is returned.
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
         self._end.begin()
-        status, streaming = self._status(now), self._gate.permission.streams
+        status, streaming = self.status(now), self._gate.permission.streams
         mode = '' if status is None or status.armed else status.mode
         return self.begin(lambda dialect: commands.arm(dialect, value, mode, streaming), now)
 
@@ -108,12 +108,12 @@ class Requests:
 
     @property
     def landing(self) -> bool:
-        """Return whether the autopilot is being asked to land."""
+        """Return whether a landing is pending."""
         return self.pending is not None and self.pending.goal.name == LAND
 
     def acknowledge(self, ack: Any, now: float) -> None:
         """Take a COMMAND_ACK."""
-        # To us, not to a ground station; MAVLink 1 does not say.
+        # To us, not to a ground station. MAVLink 1 has no target.
         ours = (ack.target_system in (0, self._link.source_system)
                 and ack.target_component in (0, self._link.source_component))
         if ours and self.newest is not None and self.newest.acknowledge(
@@ -131,8 +131,8 @@ class Requests:
         """
         gate, pending, superseded = self._gate, self.pending, None
         dialect = self._link.telemetry.dialect
-        goal = make(dialect or PX4)
-        received = dialect is not None and (goal.ends_flight or self._status(now) is not None)
+        goal = make(dialect or PX4)  # without a dialect it is refused, and any will do
+        received = dialect is not None and (goal.ends_flight or self.status(now) is not None)
         obstacle = first_reason(
             (not received, NOT_RECEIVED),
             (self.stopping and not goal.ends_flight, 'the bridge is stopping'),
@@ -140,7 +140,7 @@ class Requests:
             (pending is not None and not goal.ends_flight,
              f'still waiting for {pending.goal.name if pending is not None else ""}'))
         if goal.ends_flight:
-            # From here on only braking goes out, even if the autopilot refuses.
+            # From here on setpoints only brake, even if the autopilot refuses.
             gate.permit(gate.permission.ended(why or f'{goal.name} requested'))
             if pending is not None:
                 superseded = pending.refuse(f'superseded by {goal.name}').goal
@@ -156,14 +156,14 @@ class Requests:
         """
         Send the next command of the pending request, and pass its failure to the permission.
 
-        :param streaming_for: how long setpoints have been going out without a gap, s.
+        :param streaming_for: time for which setpoints have been sent without a gap, s.
         """
         request, permission = self.pending, self._gate.permission
         if request is None:
             return
         offboard = request.goal.name == OFFBOARD
         if offboard and permission.phase not in (Phase.READY, Phase.ACTIVE):
-            request.refuse(permission.reason)  # a reboot or the pilot was quicker
+            request.refuse(permission.reason)  # a reboot, or the pilot, came first
             return
         self._ask(request, streaming_for, now)
         if request.outcome is not None and not request.outcome.success:
@@ -173,7 +173,7 @@ class Requests:
                 self._gate.permit(permission.failed(request.outcome.message))
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:
-        telemetry, status, vehicle = self._link.telemetry, self._status(now), None
+        telemetry, status, vehicle = self._link.telemetry, self.status(now), None
         if status is not None:
             vehicle = Vehicle(status, telemetry.altitude(now),
                               telemetry.shown_time(request.current.command),
@@ -186,7 +186,8 @@ class Requests:
         if confirmation is not None and (vehicle is not None or goal.ends_flight):
             self._link.send_command(goal.command, goal.params, confirmation)
 
-    def _status(self, now: float) -> VehicleStatus | None:
+    def status(self, now: float) -> VehicleStatus | None:
+        """Return the vehicle's status, None while the link is not alive."""
         return self._link.telemetry.current(now, self._gate.limits.link_timeout)
 
     # Why a request would be refused here.
@@ -195,11 +196,11 @@ class Requests:
         """
         Return why the vehicle may not fly our setpoints now, as far as it is received, or ''.
 
-        :param in_air: whether it has to be in the air, and in the envelope, by now.
+        :param in_air: whether it must be in the air, and in the envelope, now.
         """
         telemetry, gate = self._link.telemetry, self._gate
         dialect = telemetry.dialect
-        if dialect is None or self._status(now) is None:
+        if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
         reasons = [gate.permission.taken_over(now), gate.contradiction(now)]
         if gate.speed(now) is None:
@@ -215,7 +216,7 @@ class Requests:
 
     def _takeoff_obstacle(self, height: float, now: float) -> str:
         """Return why the vehicle may not climb by ``height``, m, or ''."""
-        telemetry, status, limits = self._link.telemetry, self._status(now), self._gate.limits
+        telemetry, status, limits = self._link.telemetry, self.status(now), self._gate.limits
         if status is None or telemetry.dialect is None:
             return NOT_RECEIVED
         if not status.armed:

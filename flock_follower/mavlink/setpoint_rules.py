@@ -15,14 +15,14 @@
 """
 The setpoint rules: one pure function decides which setpoint may be sent now, if any.
 
-A command passes only if it is fresh and finite, the velocity that it is judged with is fresh, and
-the autopilot is received. A command that rests on the marker alone passes only while flight
+A command passes only if it is fresh and finite, the velocity that it is checked against is fresh,
+and the autopilot is received. A command that rests on the marker alone passes only while flight
 without odometry is permitted (``relative_flight``), and with bounds of its own, because its speed
 is not known. Otherwise the setpoint brakes. A stale command is never repeated: an
 autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
 acceleration setpoints lead to, and ArduCopter obeys NaN. Each setpoint keeps these bounds, the
 most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
-planner asks for; the radius of the envelope; the rest of the command. Vectors are ENU; ``decide``
+planner requests; the radius of the envelope; the rest of the command. Vectors are ENU; ``decide``
 takes everything that it depends on as an argument.
 
 ``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint: acceleration and yaw in
@@ -48,7 +48,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location
-from flock_follower.mavlink.relative_flight import Relative
+from flock_follower.mavlink.relative_flight import LONGEST_STEP, Relative
 from flock_follower.mavlink.velocity_check import (
     finite_vector,
     fresh,
@@ -57,7 +57,7 @@ from flock_follower.mavlink.velocity_check import (
     USUAL_AGE,
     Velocity,
 )
-from flock_follower.messages import Command, FASTEST_OWN, OLDEST_MARKER, RELATIVE_MAX, SANE
+from flock_follower.messages import Command, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
     limit_command,
@@ -108,21 +108,18 @@ def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None, time_boot
 BANDWIDTH: Final[float] = 1.0
 #: From the setpoint to 63 % of the tilt, s; measured on PX4 0.23, on ArduCopter 0.27.
 RESPONSE_TIME: Final[float] = 0.25
-#: After a longer pause between two steps, s, nothing is concluded.
-LONGEST_STEP: Final[float] = 0.2
 #: Estimates are at most this long, horizontally and vertically, m/s^2.
 WIND_MAX: Final[float] = 1.0
 THRUST_ERROR_MAX: Final[float] = 3.0
-#: The share of the vertical one that setpoints offset, m/s^2; planners offset as much.
+#: The part of the vertical one that setpoints offset, m/s^2; planners offset as much.
 OFFSET_MAX: Final[float] = 1.2
 #: A horizontal velocity that differs from the expected one by this, m/s, for this long, s,
-#: contradicts the setpoints: they are not flown, so no wind is learnt from them.
+#: contradicts the setpoints: they are not flown, so the estimate of the wind is frozen.
 CONTRADICTION: Final[float] = 0.5
 CONTRADICTION_TIME: Final[float] = 1.0
-#: So long, s, the thrust has to be wrong beyond OFFSET_MAX until it is a warning, and is handed
-#: over.
+#: A thrust that is wrong beyond OFFSET_MAX for these times, s, is a warning, and a handover.
 WARNING_TIME: Final[float] = 1.0
-HANDOVER_TIME: Final[float] = 3.0
+THRUST_HANDOVER_TIME: Final[float] = 3.0
 
 
 class DisturbanceObserver:
@@ -148,10 +145,11 @@ class DisturbanceObserver:
 
     def step(self, sent: Array | None, velocity: Array | None, now: float) -> None:
         """
-        Take what has happened since the last step, until ``now``, s.
+        Update the estimate to ``now``, s.
 
-        :param sent: acceleration (3,), m/s^2, that was flown; None: none of ours, which forgets.
-        :param velocity: measured (3,), m/s; None without one, which waits.
+        :param sent: acceleration (3,), m/s^2, flown since the last step; None: none of ours, which
+            resets the estimate.
+        :param velocity: measured (3,), m/s; None without one: the estimate stays.
         """
         elapsed, self._time = now - self._time, now
         if sent is None:
@@ -164,7 +162,7 @@ class DisturbanceObserver:
         if velocity is None or self._velocity is None or not usable:
             self._velocity = velocity
             return
-        # Of finite velocities even the difference may be beyond every number.
+        # The difference of two finite velocities may overflow.
         error = (np.clip(velocity, -SANE, SANE)
                  - np.clip(self._velocity, -SANE, SANE))
         self._velocity = self._velocity + elapsed * (
@@ -201,7 +199,7 @@ class AcceptedCommand(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """What to send, and why."""
+    """The setpoint to send, and the reason."""
 
     kind: str
     """'command', 'brake', 'level' (zero acceleration) or 'none' (send nothing)."""
@@ -212,7 +210,7 @@ class Setpoint(NamedTuple):
     yaw: float | None
     """rad; None without one."""
     limited: str
-    """What limited it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
+    """The limits that changed it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
 
 
 class Held(NamedTuple):
@@ -236,19 +234,19 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     does not point upwards on the ground.
 
     :param full: the limits at start, for braking and separation; ``limits`` may be lower.
-    :param known: the vehicle's motion, as far as it is known and valid.
-    :param command: the newest command; it should have applied ``command_age`` seconds ago.
-    :param link_age: how long the autopilot has been missing, s.
+    :param known: the vehicle's motion, as far as it is known.
+    :param command: the newest command; its time is ``command_age`` seconds ago.
+    :param link_age: time since the autopilot is missing, s.
     :param armed: whether it is armed; before, setpoints are level.
-    :param airborne: whether it reports that it flies: on the ground PX4 takes any upward
+    :param airborne: whether it reports that it flies: on the ground PX4 interprets any upward
         acceleration as a request to take off.
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
-    :param place: where it is in its envelope.
-    :param unplaced: why a height that was known is not any more, or ''.
+    :param place: its location in the envelope.
+    :param unplaced: why a height that was known is unknown now, or ''.
     :param held: yaw and height to keep without a command.
     :param relative: whether a command may rest on the marker alone.
     :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
-    :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
+    :param offset: the upward acceleration, m/s^2, with which braking offsets an error of thrust.
     """
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
     if withheld:
@@ -331,7 +329,7 @@ def _relative(full: GateLimits, command: Command, against: Array, place: Locatio
     Return the setpoint of a command that rests on the marker alone.
 
     Heights go first, then the limit of the acceleration; the speed is not known. The offset of an
-    error of the thrust does not count for RELATIVE_MAX: it moves nothing.
+    error of the thrust is not limited by RELATIVE_MAX: it does not move the vehicle.
     """
     wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
     a_max = full.a_max * SENT_INSIDE
@@ -340,7 +338,7 @@ def _relative(full: GateLimits, command: Command, against: Array, place: Locatio
     margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
     height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
     assert height is not None  # else it is refused
-    # Of two offsets that differ the one counts that leads away from the bound.
+    # If the two offsets differ, the one that leads away from the bound is used.
     least, _ = envelope.vertical_range(
         full, Location(height - margin, climb), climb, max(own, bias), horizon, strongest)
     _, most = envelope.vertical_range(
@@ -389,9 +387,7 @@ def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Veloc
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
     bounds = [] if inward is None else [inward]
-    kept = inward is None or product(inward[0], flat) >= inward[1]
-    if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST_OWN or not (
-            math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
+    if least <= a[2] <= most and (inward is None or product(inward[0], flat) >= inward[1]):
         return safe
     sides = [] if axis is None else [
         (complex(float(axis[0]), float(axis[1])), float(axis[:2] @ a[:2]))]

@@ -80,18 +80,19 @@ class SetpointThread:
     def submit(self, action: Callable[[], object],
                refuse: Callable[[], object] = lambda: None) -> bool:
         """
-        Have the thread run an action at once, before the next cycle.
+        Run an action in the thread at once, before the next cycle.
 
-        Callable from any thread, and never waits. What the action raises goes to ``on_error``.
+        Callable from any thread; it never waits. An exception of the action is passed to
+        ``on_error``.
 
         :param refuse: called instead of the action if the thread ends before its turn.
-        :return: False if it will not be run: too many wait, or the thread has ended.
+        :return: False if it is not run: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False
         self._submitted.append((action, refuse))
         self._wake()
-        if self._ended.is_set():  # meanwhile, and so perhaps after it has refused the rest
+        if self._ended.is_set():  # perhaps after it has refused the rest
             self._refuse_submitted()
         return True
 
@@ -102,13 +103,13 @@ class SetpointThread:
         end = time.monotonic() + EXIT_TIMEOUT
         while not self._ended.is_set() and time.monotonic() < end:
             try:
-                # Not join(): interrupted, it takes the thread for dead.
+                # Not join(): if it is interrupted, it counts the thread as ended.
                 self._ended.wait(max(0.0, end - time.monotonic()))
             except KeyboardInterrupt:
-                continue  # a second Ctrl-C must not keep the vehicle from braking
+                continue  # a second Ctrl-C must not prevent braking
 
     def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # full: it will wake all the same
+        with contextlib.suppress(OSError):  # full: it wakes all the same
             self._wake_sender.send(b'.')
 
     def _run(self) -> None:
@@ -129,13 +130,13 @@ class SetpointThread:
         """Listen until the next cycle is due, run it, and return when the one after is."""
         wait = 0.0 if self._submitted else max(0.0, next_cycle - time.monotonic())
         if not self._guarded(lambda: self._listen(wait)):
-            # Listening that fails at once would else be tried without a pause, all the time.
+            # Otherwise listening that fails at once would be repeated without a pause.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
-        # Of a flood only so many actions that the cycle is not kept waiting.
+        # Of a flood only so many actions that the cycle is not delayed.
         if count := min(len(self._submitted), MOST_AT_ONCE):
             for _ in range(count):
                 self._guarded(self._submitted.popleft()[0])
-            # One of them may have brought odometry to send on.
+            # One of them may have brought odometry to forward.
             self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
         now = time.monotonic()
         if self._bridge.gate.new_command:

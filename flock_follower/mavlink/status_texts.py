@@ -13,19 +13,26 @@
 # limitations under the License.
 
 """
-Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
+Texts of the autopilot, and reports to the pilot's ground station.
+
+``StatusTexts`` joins STATUSTEXT messages from their chunks, and reads the EVENTs of PX4.
 
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
 with the modes concerned, between two summaries. PX4 sends them after a change, and after
 MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``config/px4_events.txt`` has
 the names and texts. Measured on 1.16.
+
+``GroundStationReport`` reports the planner's state as STATUSTEXT and the distance as a number.
+They are broadcast on the autopilot's link. ArduPilot forwards them to the ground station; PX4 does
+so if the port of the companion has MAV_n_FORWARD 1. Times are s on a monotonic clock.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+import math
 import struct
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
@@ -34,9 +41,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.files import resource
 
-#: The message; common.xml has it, no pymavlink yet.
+#: Id of EVENT: in common.xml, and not in pymavlink yet.
 MESSAGE_ID: Final[int] = 410
-#: A report that names more checks than this has lost its end.
+#: The end of a report that names more checks than this was lost.
 MOST_FAILURES: Final[int] = 100
 #: The bits of modes, as EVENTs name them: PX4's navigation states.
 _MODES: Final[Mapping[str, int]] = MappingProxyType({
@@ -46,7 +53,7 @@ _MODES: Final[Mapping[str, int]] = MappingProxyType({
 _EVERY_MODE: Final[int] = 0xFFFFFFFF
 _PILOT_MODES: Final[tuple[str, ...]] = ('MANUAL', 'ALTCTL', 'POSCTL', 'ACRO', 'STABILIZED')
 _STICKS: Final[str] = 'check_modes_manual_control'
-#: The worst level of a check that is only a remark.
+#: The worst level of a check that prevents nothing.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
 _ENTERS: Final[tuple[str, ...]] = (
@@ -110,12 +117,12 @@ class Failure(NamedTuple):
     """MAV_SEVERITY."""
 
 
-#: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
+#: ArduPilot repeats its reasons against arming with this prefix every 30 s.
 PREARM: Final[str] = 'PreArm: '
 PREARM_PERIOD: Final[float] = 35.0
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
 CHUNK: Final[int] = 50
-#: A text whose next chunk does not come within this, s, is taken as it is.
+#: A text whose next chunk does not arrive within this, s, is used as it is.
 CHUNK_TIMEOUT: Final[float] = 0.4
 
 
@@ -154,7 +161,7 @@ class StatusTexts:
             self._end()
 
     def add_event(self, message: Any, now: float) -> None:
-        """Take an EVENT; its text is used only if no STATUSTEXTs come."""
+        """Take an EVENT; its text is used only if no STATUSTEXT is received."""
         text = self._check(message)
         if text and not self._has_texts:
             self._begun = AutopilotText(now, message.log_levels & 0xF, text)
@@ -181,7 +188,7 @@ class StatusTexts:
         return ''
 
     def _end(self) -> None:
-        """Take the text that has begun as it is."""
+        """End the text that has begun."""
         if self._begun is not None:
             # PX4 ends texts with a tab if it also sends them as events.
             whole = self._begun._replace(text=self._begun.text.strip('\x00\t\n '))
@@ -193,9 +200,9 @@ class StatusTexts:
         """Return the failed checks for a mode (named as in ``dialects.PX4``) or arming in it."""
         return [failure.text for failure in self._failures
                 if mode in _MODES and failure.modes >> _MODES[mode] & 1
-                # For every mode come remarks, too, that keep it from nothing,
+                # Reports for every mode include warnings, which prevent none,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
-                     # and this one, which keeps it from the pilot's.
+                     # and this one, which prevents the pilot's modes.
                      or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
 
     def why(self, time: float, mode: str) -> list[str]:
@@ -221,3 +228,63 @@ class StatusTexts:
         texts = list(self._new)
         self._new.clear()
         return texts
+
+
+#: A state is reported once it has lasted this long, s: not COAST for one image.
+HELD: Final[float] = 1.0
+#: Least time between two texts, s, and between two distances, s.
+TEXT_PERIOD: Final[float] = 2.0
+DISTANCE_PERIOD: Final[float] = 1.0
+#: Name of the NAMED_VALUE_FLOAT, at most 10 bytes.
+DISTANCE_NAME: Final[bytes] = b'flock_dist'
+FOLLOWS: Final[tuple[str, ...]] = ('TRACK', 'COAST', 'RELATIVE')
+SEVERITIES: Final[dict[str, int]] = dict.fromkeys(
+    ('HOLD', 'RELATIVE'), mavlink.MAV_SEVERITY_WARNING)
+
+
+class GroundStationReport:
+    """The messages that are due for the ground station."""
+
+    def __init__(self) -> None:
+        self._state, self._state_time = '', -math.inf
+        self._reported = ''
+        self._handed_over: str | None = None
+        self._neighbor, self._distance, self._distance_time = '', math.nan, -math.inf
+        self._last_text = self._last_distance = -math.inf
+
+    def take_state(self, state: str, now: float) -> None:
+        """Take a state of the planner, as ``planner/state`` has it."""
+        if state != self._state:
+            self._state, self._state_time = state, now
+
+    def take_distance(self, neighbor: str, distance: float, now: float) -> None:
+        """Take the distance, m, to the neighbour that the planner faces."""
+        self._neighbor, self._distance, self._distance_time = neighbor, distance, now
+
+    def take_handover(self, reason: str) -> None:
+        """Take the reason for which the bridge ends the flight; it is the next text."""
+        self._handed_over = reason
+
+    def due(self, time_boot_ms: int, now: float) -> list[Any]:
+        """Return the STATUSTEXT and NAMED_VALUE_FLOAT to send at ``now``; at most one of each."""
+        messages = []
+        known = math.isfinite(self._distance) and now - self._distance_time <= DISTANCE_PERIOD
+        if known and now - self._last_distance >= DISTANCE_PERIOD:
+            self._last_distance = now
+            messages.append(mavlink.MAVLink_named_value_float_message(
+                time_boot_ms, DISTANCE_NAME, self._distance))
+        if now - self._last_text < TEXT_PERIOD:
+            return messages
+        if self._handed_over is not None:
+            severity, text = mavlink.MAV_SEVERITY_CRITICAL, f'hands over: {self._handed_over}'
+            self._handed_over = None
+        elif self._state != self._reported and now - self._state_time >= HELD:
+            severity = SEVERITIES.get(self._state, mavlink.MAV_SEVERITY_INFO)
+            text = self._reported = self._state
+            if known and self._state in FOLLOWS:
+                text += f' {self._neighbor} {self._distance:.1f} m'
+        else:
+            return messages
+        self._last_text = now
+        data = f'flock: {text}'.encode('ascii', 'replace')[:CHUNK]
+        return [*messages, mavlink.MAVLink_statustext_message(severity, data)]

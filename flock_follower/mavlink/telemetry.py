@@ -13,13 +13,14 @@
 # limitations under the License.
 
 """
-The newest messages of the autopilot, in ENU and FLU, with the times at which they came.
+The newest messages of the autopilot, in ENU and FLU, with their times of arrival.
 
 ``estimate`` combines its position and attitude into one odometry, at the time it was valid.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Any, Final, NamedTuple
 
@@ -80,7 +81,7 @@ class LocalPosition(NamedTuple):
     position: Array
     velocity: Array
     time_boot_ms: int
-    """Its stamp on the autopilot's clock, see ``timesync.TimeSync.age``."""
+    """Its stamp on the autopilot's clock, see ``housekeeping.TimeSync.age``."""
 
 
 class Attitude(NamedTuple):
@@ -115,12 +116,12 @@ class Telemetry:
         self.dialect: Dialect | None = None
         self.status: VehicleStatus | None = None
         self.newest: dict[str, tuple[float, Any]] = {}
-        """The newest message of each kind, and when it came, s."""
+        """The newest message of each type, and its time of arrival, s."""
         self.sensor_altitude: SensorAltitude | None = None
         self.reboots = 0
         self.heartbeat_time = -math.inf
         self.mode_time = -math.inf
-        """When the mode was last reported, by HEARTBEAT or CURRENT_MODE."""
+        """Time of the last report of the mode, by HEARTBEAT or CURRENT_MODE, s."""
         self.message_time = -math.inf
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
@@ -153,15 +154,15 @@ class Telemetry:
                 now, pressure_altitude(message.press_abs), kind)
         elif kind == 'DISTANCE_SENSOR':
             self._distance(message, now)
-        elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
-            self.estimator = estimator_status(message, now)
+        elif self.dialect is not None and message.get_msgId() == self.dialect.estimator_status:
+            self.estimator = estimator_status(message, self.dialect, now)
         elif kind == 'GPS_RAW_INT':
             self.gps = gps_fix(message, self.gps, now)
         elif kind == 'SYS_STATUS':
             self.battery = _battery(message, now)
 
     def recent(self, kind: str, oldest: float, now: float) -> Any | None:
-        """Return the newest message of a kind, None if it is older than ``oldest``, s."""
+        """Return the newest message of a type, None if it is older than ``oldest``, s."""
         time, message = self.newest.get(kind, (-math.inf, None))
         return message if now - time <= oldest else None
 
@@ -182,16 +183,16 @@ class Telemetry:
         return None
 
     def shown_time(self, command: int) -> float:
-        """Return when the vehicle last showed whether a command was obeyed, s."""
+        """Return the time of the last report that shows whether a command was obeyed, s."""
         arming = command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM  # not in CURRENT_MODE
         return self.heartbeat_time if arming else self.mode_time
 
     def silence(self, now: float) -> float:
         """
-        Return for how long messages of the autopilot have been overdue, s; 0 if none is.
+        Return the time for which messages of the autopilot have been overdue, s; 0 if none is.
 
-        Once it streams telemetry, every second without any message counts. A HEARTBEAT comes at
-        1 Hz, so it is missing from one second after the last on.
+        Once it streams telemetry, that is the time without any message. HEARTBEAT is sent at 1 Hz:
+        it is overdue from one second after the last one on.
         """
         overdue = now - self.heartbeat_time - HEARTBEAT_PERIOD
         streams = {'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION'} & self.newest.keys()
@@ -206,7 +207,7 @@ class Telemetry:
         return self.status if self.alive(now, link_timeout) else None
 
     def flying(self, now: float) -> bool | None:
-        """Return whether the vehicle reports that it is in the air; None if it reports neither."""
+        """Return whether the vehicle reports that it is in the air; None without a report."""
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)
 
@@ -233,7 +234,7 @@ class Telemetry:
         return None if home is None or above_sea is None else above_sea - home.altitude * 1e-3
 
     def _distance(self, message: Any, now: float) -> None:
-        """Take a rangefinder that looks down, as long as no barometer is reported."""
+        """Take a downward rangefinder as long as no barometer is reported."""
         known = self.sensor_altitude
         if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and (
                 message.min_distance <= message.current_distance <= message.max_distance) and (
@@ -244,7 +245,7 @@ class Telemetry:
     def _notice_reboot(self, stamp: int) -> None:
         """Compare the stamp of an attitude, ms since boot, with the newest; 0: not set."""
         fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
-        if fallen and self._fallen:  # one alone may have come late by another way
+        if fallen and self._fallen:  # a single one may have been delayed
             self.reboots += 1
             self.newest.pop('GPS_GLOBAL_ORIGIN', None)
             fallen, self._boot_time_ms = False, stamp
@@ -259,15 +260,23 @@ class Telemetry:
 
     def _attitude(self, message: Any, now: float) -> None:
         self._notice_reboot(message.time_boot_ms)
-        # MAVLink's quaternions are (w, x, y, z).
-        wxyz = [message.q1, message.q2, message.q3, message.q4]
-        rates = frd_to_flu([message.rollspeed, message.pitchspeed, message.yawspeed])
-        try:
-            quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
-        except ValueError:
-            return
-        self.attitude = Attitude(now, quaternion, np.nan_to_num(rates, posinf=0.0, neginf=0.0),
-                                 message.time_boot_ms)
+        decoded = decode_attitude([message.q1, message.q2, message.q3, message.q4],
+                                  [message.rollspeed, message.pitchspeed, message.yawspeed])
+        if decoded is not None:
+            self.attitude = Attitude(now, *decoded, message.time_boot_ms)
+
+
+def decode_attitude(wxyz: list[float], rates: Sequence[float]) -> tuple[Array, Array] | None:
+    """
+    Return attitude (x, y, z, w) and rates (3,), rad/s, FLU and ENU; None if they are invalid.
+
+    :param wxyz: MAVLink's quaternion (w, x, y, z), FRD to NED; ``rates`` FRD.
+    """
+    try:
+        quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
+    except ValueError:
+        return None
+    return quaternion, np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)
 
 
 def _battery(message: Any, now: float) -> Battery:
@@ -279,7 +288,7 @@ def _battery(message: Any, now: float) -> Battery:
                    remaining * 1e-2 if remaining >= 0 else math.nan)
 
 
-#: An attitude further than this, s, from a position is no part of the same estimate.
+#: An attitude further than this, s, from a position does not belong to it.
 ATTITUDE_TIMEOUT: Final[float] = 0.1
 
 
@@ -288,19 +297,19 @@ def estimate(position: LocalPosition, attitude: Attitude, age: float
     """
     Return the odometry, and the time of a position, s, at which it was valid.
 
-    None if no attitude belongs to the position. The stamp of the odometry is 0.
+    None if the attitude does not belong to the position. The stamp of the odometry is 0.
 
     The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
-    turned on by its rates to the time of the position, where the autopilot has stamped both.
+    extrapolated by its rates to the time of the position if the autopilot has stamped both.
 
-    :param age: of the position when it came, s; 0 if it is not known.
+    :param age: of the position at its arrival, s; 0 if it is unknown.
     """
     if abs(position.time - attitude.time) > ATTITUDE_TIMEOUT:
         return None
     between = 0.0  # s
     if position.time_boot_ms and attitude.time_boot_ms:
         between = (position.time_boot_ms - attitude.time_boot_ms) * 1e-3
-        if abs(between) > ATTITUDE_TIMEOUT:  # another clock, or one of them was held up
+        if abs(between) > ATTITUDE_TIMEOUT:  # another clock, or one of them was delayed
             between = 0.0
     quaternion = quaternion_multiply(
         attitude.quaternion, rotation_vector_to_quaternion(attitude.angular_velocity * between))

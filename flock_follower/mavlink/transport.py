@@ -41,12 +41,12 @@ from flock_follower.ranges import Range
 T = TypeVar('T')
 #: Time between two attempts to reopen a lost port, s.
 RETRY_PERIOD: Final[float] = 0.5
-#: A line is congested if what waits to be sent takes longer than this, s.
+#: A line is congested if sending the waiting bytes takes longer than this, s.
 LONGEST_BACKLOG: Final[float] = 0.02
 #: A TCP connection without traffic for this long, ms, is closed; size of its buffer, bytes.
 LONGEST_TCP_DELAY: Final[int] = 1000
 TCP_BUFFER: Final[int] = 16384
-#: It is congested if more than this is not acknowledged, bytes.
+#: It is congested if more bytes than this are not acknowledged.
 TCP_BACKLOG: Final[float] = 1000.0
 #: Bytes read at once.
 MOST_READ: Final[int] = 2048
@@ -62,7 +62,7 @@ IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
 
 class _Line:
-    """A descriptor that may be lost, and bytes that it could not take at once."""
+    """A descriptor that may be lost, and bytes that it did not accept at once."""
 
     peer: Any = 'line'
     capacity = 0.0
@@ -112,7 +112,7 @@ class _Line:
         """Yield the bytes that have arrived."""
         if self._fd < 0:
             return
-        # No more than is taken in one call; what follows waits in the kernel.
+        # Limited to one call's share; the rest waits in the kernel.
         data = self._call(lambda: os.read(self._fd, MOST_READ))
         if data:
             yield data, self.peer
@@ -120,7 +120,7 @@ class _Line:
             self._lose('closed by the other end')
 
     def write(self, data: bytes) -> bool:
-        """Send; return whether it goes out whole. What begins to go out always does."""
+        """Send; return whether it was accepted. A message that was begun is always completed."""
         if self._fd < 0 or self._waits():
             return False
         taken = self._call(lambda: os.write(self._fd, data))
@@ -135,7 +135,7 @@ class _Line:
         return bool(self._waiting)
 
     def congested(self) -> bool:
-        """Return whether what waits would delay a setpoint."""
+        """Return whether waiting data would delay a setpoint."""
         return self._waits() or self._queued() > self._backlog
 
     def _queued(self) -> int:
@@ -165,7 +165,7 @@ class SerialTransport(_Line):
         self._baud = baud
         self.capacity = baud / BITS_PER_BYTE
         self._backlog = LONGEST_BACKLOG * self.capacity
-        # Not there yet is no error: at power-on the autopilot may take longer than this computer.
+        # A missing device is no error: the autopilot may start later than this computer.
         self.reopen(-math.inf)
 
     def _open(self) -> int:
@@ -175,11 +175,11 @@ class SerialTransport(_Line):
             # TIOCEXCL below refuses the port to any program, but not to root's, nor to one that
             # opened it earlier: flock() finds those that lock it, too.
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Not TCSAFLUSH: that waits for what another program left in the driver.
+            # Not TCSAFLUSH: that waits for data that another program left in the driver.
             tty.setraw(fd, termios.TCSANOW)
             attributes = termios.tcgetattr(fd)
-            # 8N1 without flow control, however another program has left the port; and without
-            # what setraw() leaves before Python 3.12: IGNCR would take away each byte 0x0D.
+            # 8N1 without flow control, whatever another program has set; and without the flags
+            # that setraw() leaves before Python 3.12: IGNCR would remove each byte 0x0D.
             attributes[0] = 0
             attributes[2] &= ~(termios.CSTOPB | termios.CRTSCTS)
             attributes[2] |= termios.CLOCAL | termios.CREAD
@@ -211,7 +211,7 @@ class TcpTransport(_Line):
     """
 
     delivers_late = True
-    _backlog = TCP_BACKLOG  # what room is left is for setpoints
+    _backlog = TCP_BACKLOG  # the rest is for setpoints
 
     def __init__(self, url: str, address: tuple[str, int]) -> None:
         super().__init__(url)
@@ -242,11 +242,11 @@ class UdpTransport(_Line):
     """
     A UDP socket, which is never lost.
 
-    A listening one answers only the ``peer`` its owner sets, not everyone who ever sent to it:
-    a setpoint must not reach a second vehicle by accident.
+    A listening one sends only to the ``peer`` that its owner sets, not to each sender: a setpoint
+    must not reach a second vehicle by accident.
     """
 
-    _backlog = math.inf  # datagrams do not wait for one another here
+    _backlog = math.inf  # datagrams do not wait for each other here
 
     def __init__(self, url: str, *, bind: tuple[str, int] | None = None,
                  peer: tuple[str, int] | None = None) -> None:
@@ -284,7 +284,7 @@ class UdpTransport(_Line):
         try:
             self._socket.sendto(data, self.peer)
         except OSError:
-            # Unreachable for the moment: the link's watchdog says so, no exception.
+            # Unreachable now: the link reports the silence, without an exception.
             return False
         return True
 
@@ -294,12 +294,11 @@ class UdpTransport(_Line):
         self._fd = -1
 
 
-#: A non-blocking pipe. ``peer`` is the receiver of ``write``, None while unknown. ``fault`` says
-#: why nothing can pass now (unplugged, refused), '' if all is well. ``capacity`` is in bytes per
-#: second each way, 0 if it does not matter. ``delivers_late`` is whether data that cannot arrive
-#: now is kept. ``fileno`` is -1 while there is none to select on. ``reopen`` tries to open what
-#: was lost, at most every RETRY_PERIOD. ``congested`` is whether waiting data would delay a
-#: setpoint.
+#: A non-blocking pipe. ``peer`` is the receiver of ``write``, None while unknown. ``fault`` is the
+#: reason why no data can pass now (unplugged, refused), or ''. ``capacity`` is in bytes per second
+#: each way, 0 if it does not matter. ``delivers_late`` is whether data that cannot arrive now is
+#: kept. ``fileno`` is -1 without a descriptor to select on. ``reopen`` tries to open a lost port,
+#: at most every RETRY_PERIOD. ``congested`` is whether waiting data would delay a setpoint.
 Transport = UdpTransport | SerialTransport | TcpTransport
 
 

@@ -15,8 +15,8 @@
 """
 The vehicle's motion by odometry and by the autopilot, and which velocity may be used.
 
-A velocity is used while it is fresh and finite, and no other source contradicts it: braking on a
-wrong velocity accelerates the vehicle. Three comparisons find a contradiction:
+A velocity is used while it is fresh and plausible, and no other source contradicts it: braking on
+a wrong velocity accelerates the vehicle. Three comparisons find a contradiction:
 
 - yaws: whether the frames of both sources are rotated against each other;
 - velocities, averaged over AVERAGING_TIME: if they differ, neither source is known to be right;
@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
+from flock_follower.messages import FASTEST_OWN, FUTURE_TOLERANCE, POSITION_JUMP
 from flock_follower.planner.limits import limit_norm
 from flock_follower.ranges import first_reason
 
@@ -57,7 +57,7 @@ VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disag
 
 
 class Velocity(NamedTuple):
-    """A velocity that is fresh and finite."""
+    """A velocity that is fresh, finite, and at most ``FASTEST_OWN``."""
 
     vector: Array
     """(3,), m/s."""
@@ -78,10 +78,10 @@ class Motion(NamedTuple):
     """s."""
 
     def fresh_velocity(self, limits: GateLimits) -> Velocity | None:
-        """Return the velocity; None if it is not fresh, or not three finite numbers."""
+        """Return the velocity; None if it is not fresh, or not plausible."""
         if not fresh(self.velocity_age, limits.odom_timeout):
             return None
-        vector = finite_vector(self.velocity)
+        vector = plausible_velocity(self.velocity)
         margin = LATE_FACTOR * max(self.velocity_age - USUAL_AGE, 0.0)
         return None if vector is None else Velocity(vector, margin)
 
@@ -92,7 +92,7 @@ class Motion(NamedTuple):
 
 
 class KnownMotion(NamedTuple):
-    """What is known of the vehicle's motion, and which velocity may be used."""
+    """The known motion of the vehicle, and the velocity that may be used."""
 
     source: str
     """'odom' or 'autopilot': source of the velocity that is required for commands."""
@@ -103,25 +103,25 @@ class KnownMotion(NamedTuple):
     braking: Velocity | None
     """The velocity to brake with; None if none is fresh, or if two disagree."""
     contradiction: str
-    """What odom and the autopilot disagree about, or ''."""
+    """The contradiction between odom and the autopilot, or ''."""
     blind: bool
-    """Whether no valid velocity has come for too long, after one had come."""
+    """Whether every velocity has been invalid for too long, after a valid one."""
     turned: float | None
     """Yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
     difference: Array | None
-    """By what (3,), m/s, odom, being the source, is faster; None unless both are fresh."""
+    """Velocity of odom minus that of the autopilot (3,), m/s, if odom is the source and both are
+    fresh; else None."""
 
 
 def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
                  disagreeing_for: float = -math.inf,
                  distrusted_for: float = -math.inf) -> KnownMotion:
     """
-    Return what is known of the motion by both sources.
+    Return the known motion by both sources.
 
     :param source: 'odom' or 'autopilot'.
-    :param disagreeing_for: how long ago the velocities began to disagree, s; negative: they agree.
-    :param distrusted_for: for how long the autopilot has sent a velocity without a valid sensor
-        behind it, s.
+    :param disagreeing_for: time since the velocities began to disagree, s; negative: they agree.
+    :param distrusted_for: time since the velocity of the autopilot became invalid, s.
     """
     by_odom, by_autopilot = odom.fresh_velocity(limits), autopilot.fresh_velocity(limits)
     first, velocity, other = (odom, by_odom, by_autopilot) if source == ODOM else (
@@ -130,18 +130,16 @@ def known_motion(limits: GateLimits, odom: Motion, autopilot: Motion, source: st
     yaw, own = odom.fresh_yaw(limits), autopilot.fresh_yaw(limits)
     turned = None if yaw is None or own is None else wrap_angle(yaw - own)
     if turned is not None and abs(turned) > limits.yaw_disagreement:
-        # The frames are turned against one another: braking would accelerate. The autopilot's own
-        # frame is the one in which it obeys.
+        # The frames are rotated against each other: braking would accelerate. The autopilot obeys
+        # in its own frame.
         braking, contradiction = by_autopilot or by_odom, YAWS_DISAGREE
     elif disagreeing_for >= 0.0:
         # One of them is wrong: braking on that one would speed the vehicle up.
         braking, contradiction = None, VELOCITIES_DISAGREE
     difference = None
     if source == ODOM and by_odom is not None and by_autopilot is not None:
-        # Of finite velocities even the difference may be beyond every number.
-        difference = np.clip(by_odom.vector, -SANE, SANE) - np.clip(
-            by_autopilot.vector, -SANE, SANE)
-    # None was ever known where the vehicle is still on the ground.
+        difference = by_odom.vector - by_autopilot.vector
+    # On the ground no velocity may have been known yet.
     ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
     lost = bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
     unusable = disagreeing_for > LOSS_TIMEOUT or distrusted_for > LOSS_TIMEOUT
@@ -169,20 +167,26 @@ def finite_vector(value: ArrayLike | None) -> Array | None:
     return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
 
 
+def plausible_velocity(value: ArrayLike) -> Array | None:
+    """Return a velocity as an array (3,), m/s; None if not finite, or faster than FASTEST_OWN."""
+    vector = finite_vector(value)
+    return vector if vector is not None and math.hypot(*vector.tolist()) <= FASTEST_OWN else None
+
+
 #: The difference is averaged over this time, s. In flights on real autopilots' simulators single
 #: ones were up to 0.32 m/s, averaged 0.13 m/s; one wrong sample must not end a flight.
 AVERAGING_TIME: Final[float] = 0.3
-#: Samples further apart than this, s, weigh no more than this.
-LONGEST_STEP: Final[float] = 0.1
+#: Samples further apart than this, s, have the weight of this time.
+HEAVIEST_STEP: Final[float] = 0.1
 #: A difference is clipped to this many times the tolerance.
 LARGEST: Final[float] = 3.0
-#: What disagreed for this long, s, does so until it flies anew: a wrong frame shows only at speed.
-#: With 0.3 s a sound PX4 was landed twice, after 24 and 26 minutes.
+#: A disagreement of this long, s, lasts until the next flight: a wrong frame shows only at speed.
+#: With 0.3 s a healthy PX4 was landed twice, after 24 and 26 minutes.
 LATCH_TIME: Final[float] = 0.6
 
 
 class VelocityComparison:
-    """Averages the difference of two velocities, and remembers since when it is too large."""
+    """Averages the difference of two velocities, and stores since when it is too large."""
 
     def __init__(self) -> None:
         self._average: Array = np.zeros(3)
@@ -191,15 +195,15 @@ class VelocityComparison:
 
     def take(self, difference: Array | None, tolerance: float, flying: bool, now: float) -> None:
         """
-        Take what one is faster than the other at ``now``, s, as a vector (3,), m/s.
+        Take the velocity of odom minus that of the autopilot (3,), m/s, at ``now``, s.
 
         :param difference: None if one of them is not fresh.
         :param tolerance: largest average difference, m/s.
-        :param flying: whether the vehicle flies by them; else nothing is remembered.
+        :param flying: whether the vehicle flies by them; else nothing is stored.
         """
         if difference is not None:
             first = math.isinf(self._time)
-            step = 0.0 if first else min(now - self._time, LONGEST_STEP)
+            step = 0.0 if first else min(now - self._time, HEAVIEST_STEP)
             share = 1.0 - math.exp(-step / AVERAGING_TIME)
             difference = limit_norm(difference, LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
@@ -216,7 +220,7 @@ class VelocityComparison:
         return float(np.linalg.norm(self._average))
 
     def disagreeing_for(self, now: float) -> float:
-        """Return how long ago they began to disagree, s; minus infinity if they agree."""
+        """Return the time since they began to disagree, s; minus infinity if they agree."""
         return now - self._since
 
 
@@ -227,12 +231,12 @@ TOLERANCE: Final[float] = 0.5
 #: Standard deviation of the displacement by a barometer over WINDOW, m: gusts, doors, rotors.
 BAROMETER_STD: Final[float] = 0.3
 #: The vehicle is handed over after displacements have differed for this long, s.
-HANDOVER_TIME: Final[float] = 1.0
-#: Yaws of the autopilot are kept for this long, s: odometry is compared with them as it comes.
+DISPLACED_HANDOVER_TIME: Final[float] = 1.0
+#: Yaws of the autopilot are kept for this long, s: odometry arrives later.
 YAW_MEMORY: Final[float] = 1.0
 #: After a longer gap than this, s, a path begins again.
-LONGEST_GAP: Final[float] = 0.5
-#: s between two positions that are kept.
+PATH_GAP: Final[float] = 0.5
+#: Time between two positions that are kept, s.
 SPACING: Final[float] = 0.1
 
 
@@ -241,7 +245,7 @@ class Path:
 
     def __init__(self) -> None:
         self.position: Array | None = None
-        """The newest, m, in a frame that is the source's but for the jumps."""
+        """The newest, m, in the frame of the source without its jumps."""
         self._time = -math.inf
         self._shift: Array | float = 0.0
         self._kept: deque[tuple[float, Array]] = deque()
@@ -255,10 +259,10 @@ class Path:
         elapsed = now - self._time
         if elapsed <= 0.0:
             return
-        if elapsed > LONGEST_GAP:
+        if elapsed > PATH_GAP:
             self._kept.clear()
         shifted = position - self._shift
-        if self.position is not None and velocity is not None and elapsed <= LONGEST_GAP:
+        if self.position is not None and velocity is not None and elapsed <= PATH_GAP:
             surprise = shifted - self.position - velocity * elapsed
             if math.hypot(*surprise.tolist()) > POSITION_JUMP:
                 self._shift = self._shift + surprise
@@ -286,11 +290,11 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array:
     Return the displacement (3,) of ``one`` less that of ``other``, m, over the last WINDOW.
 
     :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
-    :returns: zeros if they do not overlap, or one of them is not of now.
+    :returns: zeros if they do not overlap, or one of them is not recent.
     """
     (first, last), (other_first, other_last) = one.span, other.span
     start, end = max(first, other_first, now - WINDOW), min(last, other_last)
-    if end <= start or now - end > LONGEST_GAP:
+    if end <= start or now - end > PATH_GAP:
         return np.zeros(3)
     moved = one.between(start, end)
     cos, sin = math.cos(turn), math.sin(turn)
@@ -300,7 +304,7 @@ def difference(one: Path, other: Path, turn: float, now: float) -> Array:
 
 
 class Source:
-    """The newest of what one source reports, and the times at which it was so, s."""
+    """The newest motion by one source, and its times, s."""
 
     def __init__(self) -> None:
         self.velocity: Array = np.zeros(3)
@@ -318,7 +322,7 @@ class Source:
                 self.yaws.popleft()
 
     def yaw(self, time: float = math.inf) -> tuple[float, float]:
-        """Return the yaw nearest to a time, rad, and the time at which it was so; the newest."""
+        """Return the yaw nearest to a time, s, in rad, and its own time; by default the newest."""
         yaws = tuple(self.yaws)  # a copy: diagnostics read it from another thread
         if not yaws:
             return 0.0, -math.inf
@@ -329,9 +333,9 @@ class Source:
 def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
               now: float) -> str:
     """
-    Return that odometry reports another displacement than another source, or ''.
+    Return that the displacements of odometry and of another source differ, as text, or ''.
 
-    :param autopilot: None if its estimate proves nothing about odometry.
+    :param autopilot: None if its estimate is not independent of odometry.
     :param turn: yaw of odom minus that of the autopilot, rad.
     :param height: heights by the barometer.
     """
@@ -344,7 +348,7 @@ def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
 
 
 def _apart(off: Array, std: float, other: str) -> str:
-    """Return that displacements differ by ``off``, m, with a standard deviation, m, or ''."""
+    """Return that displacements differ by ``off``, m, by their deviation, m, as text, or ''."""
     far = float(np.linalg.norm(off))
     return '' if not far > max(TOLERANCE, 3.0 * std) else (
         f'displacements of odom and of the {other} differ by {far:.1f} m in {WINDOW:g} s')

@@ -63,15 +63,15 @@ from flock_follower.nodes.support.runtime import (
     spin,
     Waiting,
 )
-from flock_follower.parameters.black_box_table import build, folder, SPECS
-from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.files import FLOWN
+from flock_follower.parameters.tables import BLACK_BOX as SPECS
+from flock_follower.parameters.tables import cameras, recordings_folder
 from flock_follower.perception.images import decode_image, encode_jpeg
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
-WRITE_PERIOD = 0.3  # s between writes: where one takes long, still less than a second
+WRITE_PERIOD = 0.3  # s between writes: still less than a second if one takes long
 ASK_PERIOD = 1.0  # s between looks for nodes whose parameters are not known
-RETRY_PERIOD = 5.0  # s until it is tried again to record where that failed
+RETRY_PERIOD = 5.0  # s until recording is tried again after a failure
 WAITING_MAX = 64_000_000  # bytes that wait for a slow disk; what comes beyond them is dropped
 NICENESS = 10
 JPEG_QUALITY = 90  # of images compressed here
@@ -102,8 +102,9 @@ class BlackBox(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('black_box', **kwargs)
-        values = self.declare(SPECS, build).values
-        self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
+        values = self.declare(SPECS, dict).values
+        self._folder = recordings_folder(
+            values, os.environ.get('ROS_HOME', ''), self.get_namespace())
         self._limits = values['disk_used'], values['disk_free']
         self._recording: FlightRecording | None = None
         # One thread takes, one writes, and the executor's notes: none needs a lock.
@@ -113,7 +114,7 @@ class BlackBox(FlockNode):
         self._bytes_taken = self._bytes_written = 0
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
-        #: Topic, handle and class of a subscription, and what changes its messages.
+        #: Topic, handle and class of a subscription, and the conversion of its messages.
         self._inputs: list[tuple[RecordedTopic, Any, Any, Callable[[bytes], bytes]]] = []
         for name, msgtype in RECORDED.items():
             self._subscribe(name, msgtype, LATCHED_QOS if name in LATCHED else QOS)

@@ -41,13 +41,13 @@ from flock_follower.mavlink.commands import (
     TAKEOFF_DELAY,
 )
 from flock_follower.nodes.support.runtime import run
-from flock_follower.parameters.mavlink_bridge_table import SPECS
+from flock_follower.parameters.tables import MAVLINK_BRIDGE
 
 POLL_PERIOD = 0.1  # s between looks for the service
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
 LONGEST = STREAM_TIMEOUT + CONFIRM_TIMEOUT + REASON_WAIT
-_HEIGHT = next(spec.range.high for spec in SPECS if spec.name == 'takeoff_height')
+_HEIGHT = next(spec.range.high for spec in MAVLINK_BRIDGE if spec.name == 'takeoff_height')
 
 
 def patience(service: str) -> float:

@@ -29,10 +29,12 @@ import math
 import re
 from typing import Final
 
+from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT, READY
+
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.
 DISCOVERY: Final[float] = 8.0
-#: Only reports received so long after an answer show what it has changed, s.
+#: Only reports received this long after an answer show its effect, s.
 SETTLING: Final[float] = 0.2
 #: The state of a node whose last report is older, s, is shown as old.
 OLD: Final[float] = 1.5
@@ -81,19 +83,19 @@ class Reports:
     @property
     def vehicle_known(self) -> bool:
         """Return whether the bridge, and its diagnostics of up to 1 s later, know the vehicle."""
-        return not self.bridge.startswith('NO_AUTOPILOT') and all(
+        return not self.bridge.startswith(NO_AUTOPILOT) and all(
             self.value('mavlink_bridge', key) for key in ('armed', 'flying'))
 
     @property
     def streams(self) -> bool:
         """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
-        return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
+        return self.bridge.removeprefix(f'{NO_AUTOPILOT}: lost, ').startswith((READY, ACTIVE))
 
     def due(self) -> str:
         """Return the first step whose result is not reported, '' while the vehicle follows."""
         reached = {'arm': self.value('mavlink_bridge', 'armed') == 'True',
                    'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
-                   'offboard': self.bridge == 'ACTIVE',
+                   'offboard': self.bridge == ACTIVE,
                    'engage': self.value('planner', 'engaged') == 'True'}
         return next((step for step, done in reached.items() if not done), '')
 
@@ -119,9 +121,10 @@ class Flight:
 
     :param confirm: whether a key confirms each step. If not, each step is requested once, and a
         refusal ends the flight.
+    :param ready: False if ``check`` forbids a flight: then it only lands or hands over.
     """
 
-    def __init__(self, now: float, confirm: bool = True) -> None:
+    def __init__(self, now: float, confirm: bool = True, ready: bool = True) -> None:
         self.code: int | None = None
         """The exit code, once the flight has ended."""
         self.lines: list[str] = []
@@ -131,13 +134,14 @@ class Flight:
         self._ending: int | None = None
         self._question: str | None = None
         self._pending: set[str] = set()
-        self._confirm, self._requested = confirm, set[str]()
+        self._confirm, self._requested, self._ready = confirm, set[str](), ready
 
     def step(self, reports: Reports, now: float) -> list[str]:
         """Ask for the key of the step that is due, or request it; end after a landing."""
         if self._pending or self._ending is not None:
             return []
-        due, missing = reports.due(), reports.missing(self._answered + SETTLING)
+        due = reports.due() if self._ready else ''
+        missing = reports.missing(self._answered + SETTLING)
         if self._landing:
             if 'mavlink_bridge' not in missing and (
                     reports.value('mavlink_bridge', 'armed') == 'False'):
@@ -157,7 +161,8 @@ class Flight:
                 return self._request(due)
             self.lines.append(
                 f'{reports.bridge}: press {due[0]} for {due}' if due else
-                'the follower flies: press l to land; Ctrl-C brakes and hands over')
+                f'{"the follower flies" if self._ready else "not ready to fly, but in the air"}: '
+                'press l to land; Ctrl-C brakes and hands over')
         return []
 
     def press(self, key: str, reports: Reports) -> list[str]:

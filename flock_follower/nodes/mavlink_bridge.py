@@ -23,14 +23,13 @@ Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's 
 ``offboard``, ``takeoff`` and ``land``.
 ``flock_follower.mavlink`` decides which setpoints are sent.
 
-Odometry is taken ODOM_RATE times a second, all that has come since: to wake for each message of a
-fast source would cost more than all else that the bridge does.
+Odometry is taken ODOM_RATE times a second, with all messages since the last time: a callback for
+each message of a fast source would cost more than the rest of the bridge.
 
-Three threads. ``SetpointThread`` owns the bridge and keeps the setpoints flowing on the monotonic
-clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's
-thread takes messages and service calls, and hands over by ``SetpointThread.submit`` what the
-bridge is to do. The publisher thread publishes and logs what
-``PublisherThread.submit`` hands it.
+Three threads. ``SetpointThread`` owns the bridge and sends the setpoints on the monotonic clock:
+it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's thread
+takes messages and service calls, and passes actions to the bridge by ``SetpointThread.submit``.
+The publisher thread publishes and logs the messages that ``PublisherThread.submit`` passes to it.
 """
 
 from __future__ import annotations
@@ -57,18 +56,14 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_thread import SetpointThread
+from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.mavlink.velocity_check import ODOM
-from flock_follower.messages import (
-    from_trajectory,
-    OdometryState,
-    stamp_age,
-)
+from flock_follower.messages import from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import (
     internal_error,
@@ -85,12 +80,13 @@ from flock_follower.nodes.support.inputs import (
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
-from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import MAVLINK_BRIDGE as SPECS
+from flock_follower.parameters.tables import origin, recommendations
 
-# Not only the newest: a second commanding node would otherwise stay undetected.
+# Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)
-ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
+ODOM_RATE = 50.0  # Hz: at most 20 ms after the arrival; higher if it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
 UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
               '/diagnostics, but does not brake')
@@ -178,7 +174,7 @@ class MavlinkBridge(FlockNode):
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
         self.create_timer(1.0 / rate, self._hand_over_odom, clock=STEADY)
-        # A group of their own: they wait for the autopilot while everything else goes on.
+        # A separate group: services wait for the autopilot while the other callbacks run.
         waiting = ReentrantCallbackGroup()
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
@@ -197,7 +193,7 @@ class MavlinkBridge(FlockNode):
         self._bridge.link.transport.close()
         super().destroy_node()
 
-    # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
+    # The executor's thread: it changes the bridge only by actions for the setpoint thread.
 
     def _on_command(self, message: MultiDOFJointTrajectory, info: Mapping[str, Any]) -> None:
         now = time.monotonic()
@@ -215,12 +211,12 @@ class MavlinkBridge(FlockNode):
             self.diagnostics.reject('command not taken', TOO_MANY)
 
     def _watch_commanders(self, info: Mapping[str, Any], now: float) -> None:
-        """Have the bridge brake if the numbers of commands show that two nodes publish them."""
+        """Brake if the sequence numbers of commands show that two nodes publish them."""
         number, received = info['publication_sequence_number'], info['received_timestamp']
         if number is None and self._numbered:
             self._numbered = False
             self.get_logger().warning(UNNUMBERED)
-        # The time of arrival: two commands may have waited that came far apart.
+        # The time of arrival: two commands that arrived far apart may both have waited.
         waited = max(time.time_ns() - received, 0) * 1e-9 if received else 0.0
         if self._sources.another(number, now - waited) and self._flying():
             topic = self.resolve_topic_name('command/trajectory')
@@ -248,7 +244,7 @@ class MavlinkBridge(FlockNode):
         self._new_odom.append((state, stamp_age(state.stamp, arrival), now))
 
     def _hand_over_odom(self) -> None:
-        """Take the odometry that waits, and hand it over; answer the services."""
+        """Pass the odometry that waits to the setpoint thread; answer the services."""
         self._answer_calls()
         self._own.poll()
         taken, self._new_odom = self._new_odom, []
@@ -256,7 +252,7 @@ class MavlinkBridge(FlockNode):
             self.diagnostics.reject('odom not taken', TOO_MANY)
 
     async def _serve(self, name: str, request: Any, response: Any) -> Any:
-        """Answer the service of a name once the autopilot shows the result."""
+        """Answer a service once the autopilot shows the result."""
         requests = self._bridge.requests
         ask: dict[str, Callable[[float], Request]] = {
             'arm': lambda now: requests.arm(request.data, now),
@@ -279,7 +275,7 @@ class MavlinkBridge(FlockNode):
                 call.answer.set_result(outcome)
         self._calls = [call for call in self._calls if not call.answer.done()]
 
-    # The setpoint thread: it publishes and logs by the publisher thread; no lock of rclpy.
+    # The setpoint thread: it publishes and logs by the publisher thread, without locks of rclpy.
 
     def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
         """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
@@ -309,7 +305,7 @@ def _open_link(values: Mapping[str, Any]) -> Link:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    never_block_output()  # the setpoints flow from this process
+    never_block_output()  # this process sends the setpoints
     avoid_shared_memory(os.environ)
     return run(MavlinkBridge, args)
 

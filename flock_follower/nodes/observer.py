@@ -61,9 +61,9 @@ from flock_follower.nodes.support.middleware import (
 )
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
-from flock_follower.odometry.cdr import read_odometry
-from flock_follower.parameters.cameras_table import alone
+from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
+from flock_follower.parameters.tables import alone
 from flock_follower.perception.markers import load
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
@@ -72,7 +72,7 @@ PROCESSORS = Path('/proc/stat')
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
-#: By which type of what relative_pose subscribes to our names are known.
+#: Our names of the topics that relative_pose subscribes to, by their types.
 BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
 
 
@@ -199,7 +199,7 @@ class Observer(Node):
 
 
 def processes() -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield name and environment of our nodes on this computer, but those of other users."""
+    """Yield name and environment of our nodes on this computer, except those of other users."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
             words = _words(folder / 'cmdline')
@@ -225,7 +225,7 @@ def _machine(idle: float | None) -> Machine:
 
 
 def _open_nodes() -> list[str]:
-    """Return our nodes on this computer that the network reaches; as check, where none is read."""
+    """Return our nodes on this computer that the network reaches; if none is known, for check."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     found = {node: environment for node, environment in processes()
              if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}

@@ -65,11 +65,12 @@ class Pilot(Node):
     Flies by keys.
 
     :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
+    :param ready: False if ``check`` forbids a flight: it only lands or hands over.
     """
 
-    def __init__(self, namespace: str, confirm: bool = True) -> None:
+    def __init__(self, namespace: str, confirm: bool, ready: bool) -> None:
         super().__init__('follow', namespace=namespace, start_parameter_services=False)
-        self._reports, self._flight = Reports(), Flight(time.monotonic(), confirm)
+        self._reports, self._flight = Reports(), Flight(time.monotonic(), confirm, ready)
         self._confirm = confirm
         self._signals: list[int] = []
         self._keyboard = True
@@ -183,7 +184,7 @@ class Pilot(Node):
         """Print; an error of the terminal must not prevent the handing over."""
         with contextlib.suppress(OSError):
             for line in self._flight.lines:
-                self._line.say(line)
+                self._line.print_above(line)
             self._flight.lines.clear()
             if self._line.due(now):
                 self._line.show(self._reports.line(now))
@@ -204,7 +205,7 @@ def _single_keys() -> Iterator[None]:
             termios.tcsetattr(0, termios.TCSANOW, before)
 
 
-def fly(namespace: str, confirm: bool = True) -> int:
+def fly(namespace: str, confirm: bool = True, ready: bool = True) -> int:
     """Run the node in a namespace, and return the exit code."""
     never_block_output()  # a stopped terminal must not prevent the handing over
-    return run(lambda: Pilot(namespace, confirm), ['follow'], Pilot.spin)
+    return run(lambda: Pilot(namespace, confirm, ready), ['follow'], Pilot.spin)

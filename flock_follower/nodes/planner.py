@@ -64,8 +64,8 @@ from flock_follower.nodes.support.inputs import (
 )
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.cameras_table import cameras
-from flock_follower.parameters.planner_table import build, SPECS
+from flock_follower.parameters.tables import cameras, planner_params
+from flock_follower.parameters.tables import PLANNER as SPECS
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import ARMED_AT_TOPIC, BridgeState, State
 from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
@@ -132,7 +132,7 @@ class Planner(FlockNode):
     def _build(self, values: dict[str, Any]) -> PlannerParams:
         """Return the parameters of the core; braking and separation keep the initial limits."""
         # A vehicle is known to others by the name of its namespace.
-        params = build(values, name=self.get_namespace().strip('/'))
+        params = planner_params(values, name=self.get_namespace().strip('/'))
         self._start = start = self._start or params
         return replace(params, a_max_start=start.a_max, v_max_start=start.v_max)
 

@@ -18,8 +18,8 @@ The perception node: images and own odometry in, the neighbours' states out.
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
-stamped like the image, and the same as NAME/duplicate of what carries the marker of NAME without
-being it, ``neighbors/frames`` for every image processed, a neighbour in it or not,
+stamped like the image, the same as NAME/duplicate for another object with the marker of NAME,
+``neighbors/frames`` for every image processed, with or without a neighbour,
 and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
 several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
 """
@@ -51,16 +51,16 @@ from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.cameras_table import cameras, CameraValues
-from flock_follower.parameters.relative_pose_table import build, SPECS
+from flock_follower.parameters.tables import cameras, CameraValues, tracker
+from flock_follower.parameters.tables import RELATIVE_POSE as SPECS
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
 
-POLL_PERIOD = 0.1  # s between two looks at odometry where no image comes
-LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
+POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
+LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
 
@@ -101,7 +101,7 @@ class RelativePose(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
-        parameters = self.declare(SPECS, build)
+        parameters = self.declare(SPECS, tracker)
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
         now = time.monotonic()
@@ -172,7 +172,7 @@ class RelativePose(FlockNode):
 
     def _use_ranges(self) -> None:
         """Publish the states of neighbours out of sight, from the ranges."""
-        for outcome in self._tracker.ranged():
+        for outcome in self._tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 state, acceleration = self._perceiver.messages(
                     make, outcome.stamp, outcome.name, outcome.estimate)
@@ -208,7 +208,7 @@ class RelativePose(FlockNode):
         return self._cameras[name].debug_images.get_subscription_count() > 0
 
     def _count(self, seen: Processed) -> None:
-        """Update the diagnostics with the result of an image, and draw it if anybody looks."""
+        """Update the diagnostics with the result of an image; draw it if a viewer subscribes."""
         image, sighting, camera = seen.image, seen.sighting, self._cameras[seen.image.camera]
         now = time.monotonic()
         age = self.get_clock().now().nanoseconds - image.stamp_ns
@@ -266,9 +266,9 @@ class RelativePose(FlockNode):
         return None
 
 
-def _key(what: str, camera: str) -> str:
-    """Return how a value of a camera is called: the only one has no name."""
-    return f'{what} {camera}' if camera else what
+def _key(value: str, camera: str) -> str:
+    """Return the key of a value of a camera; a single camera has no name."""
+    return f'{value} {camera}' if camera else value
 
 
 def main(args: list[str] | None = None) -> int:

@@ -47,7 +47,7 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 
-CLOCK_PERIOD = 0.005         # s of bag time between clock ticks, where no message is nearer
+CLOCK_PERIOD = 0.005         # s of bag time between clock ticks, if no message is nearer
 SHORTEST_CLOCK_PERIOD = 0.001  # s of wall time between them
 SERVICE_PERIOD = 0.02        # s between looks at services, parameters and the diagnostics timer
 LEAD_IN = 0.1                # s from a jump of the clock to the first message that follows it
@@ -127,7 +127,7 @@ class Replay(FlockNode):
             # Reliable subscribers receive the last messages.
             for output in self._outputs.values():
                 output.wait_for_all_acked(Duration(seconds=1.0))
-            self._line.say(
+            self._line.print_above(
                 f'replayed {self._sent.total()} messages of {len(self._outputs)} topics '
                 f'in {time.monotonic() - began:.1f} s, p99 '
                 f'{percentiles("late", self._lateness)["late_p99_ms"]} ms late')
@@ -266,7 +266,7 @@ def bag_argument(args: list[str]) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; exit code 0 at the end of the bag, 1 for what cannot be played."""
+    """Run the node; exit code 0 at the end of the bag, 1 for a bag that cannot be played."""
     args = sys.argv[1:] if args is None else args
     return run(lambda: Replay(bag_argument(args)), args, Replay.play)
 

@@ -58,7 +58,7 @@ PERIOD = 0.1  # s between two drawings
 LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
 LARGEST = 65536  # bytes of a message on /diagnostics
 
-DEGENERATE = 1e-3  # m: nothing is drawn shorter than this, viewers refuse sizes of zero
+DEGENERATE = 1e-3  # m: the shortest length drawn, viewers refuse sizes of zero
 DEVIATIONS = 2.0  # of the ellipsoids
 VELOCITY_TIME = 1.0  # s: an arrow of velocity ends where it leads in this time
 ACCELERATION_SCALE = 0.5  # m of arrow per m/s^2
@@ -96,7 +96,7 @@ class Visualizer(FlockNode):
         self._report: dict[str, str] = {}
         """The planner's newest values on /diagnostics."""
         self._polls = [
-            # Without a viewer nothing is taken, which is no silence.
+            # Without a viewer no message is taken; the topic is not silent then.
             self.poll(Odometry, 'odom', self._take_odom, best_effort(), sporadic=True),
             self.poll(Odometry, 'neighbors', self._take_neighbor, best_effort(10), required=False),
             self.poll(Odometry, 'neighbors/heard', self._take_neighbor, best_effort(10),

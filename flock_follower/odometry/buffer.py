@@ -154,7 +154,7 @@ class OdometryBuffer:
     #: d^2 is less than this times that.
     LOOKS = 30
     DRIFT = 2.5
-    #: Where the velocity is derived, a position further from where it led, m, is a correction.
+    #: If the velocity is derived, a position farther from where it led, m, is a correction.
     STEP = 0.03
 
     def __init__(self) -> None:
@@ -199,7 +199,7 @@ class OdometryBuffer:
         dt = sample.stamp - float(last[0])
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
         moved: Array = sample.position - last[_POSITION]
-        # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
+        # Velocities so far apart are of little use, and an absurd one would stay in the sum.
         # The norm is the faster test, and enough for most.
         if dt > self.MAX_GAP or not (mean.dot(mean) <= FASTEST**2 or (
                 float(np.abs(mean).max()) <= FASTEST)):
@@ -254,7 +254,7 @@ class OdometryBuffer:
         return after if isinstance(after, Missing) else None
 
     def _reaching(self, stamp: float, extrapolate: bool) -> int | Missing:
-        """Return the index of the first sample at or after a stamp; the end where none is."""
+        """Return the index of the first sample at or after a stamp; the end if there is none."""
         if not len(self):
             return Missing.EMPTY
         after = self._after(stamp, 'left')
@@ -276,7 +276,7 @@ class OdometryBuffer:
         """
         Return a state of :meth:`at` with the attitude averaged over the last ``STEADY`` seconds.
 
-        That is done only where the angular velocities take one attitude to the next: see
+        That is done only if the angular velocities take one attitude to the next: see
         :meth:`_agree`. Attitudes that are off by more than their noise do not count.
         """
         end = self._after(state.stamp, 'right')
@@ -317,7 +317,7 @@ class OdometryBuffer:
         The noise of the velocities (n, 3) is updated on the way.
 
         Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
-        apart as first and last. Where angular velocities are missing or late, the latter are
+        apart as first and last. If angular velocities are missing or late, the latter are
         farther apart, and more so than averaging would gain.
         """
         self._looks += 1
@@ -362,7 +362,7 @@ def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
 
 
 def _turned(a: Array, b: Array, span: float, part: float) -> Array:
-    """Return the attitude a part of the way between two rows, a cubic where the rates suit it."""
+    """Return the attitude a part of the way between two rows, a cubic if the rates suit it."""
     turn = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(a[_ATTITUDE]), b[_ATTITUDE]))
     start, end = span * a[_RATE] - turn, span * b[_RATE] - turn

@@ -21,8 +21,8 @@ section 6.2). The measurement noise is learnt from the innovations.
 
 Frame of a source's velocity, found by a comparison with the motion of its positions.
 
-REP-105 says the child frame. Some sources use the header's frame, others send no velocity, or a
-wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
+REP-105 specifies the child frame. Some sources use the header's frame, others send no velocity, or
+a wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
 the displacement. The evidence for one reading adds up, window by window, if the readings differ
 (with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING`` windows in a row, at
 first or later, the velocity is dropped. The velocity is used again once it agrees in as
@@ -53,9 +53,9 @@ from flock_follower.geometry import (
 )
 from flock_follower.messages import POSITION_JUMP
 
-#: After a longer gap, s, a derivation begins anew.
-LONGEST_GAP = 0.6
-#: In which time the noise follows the innovations, s.
+#: After a longer gap between two messages, s, a derivation begins anew.
+ODOMETRY_GAP = 0.6
+#: The noise follows the innovations in this time, s.
 NOISE_TIME = 2.0
 
 
@@ -152,7 +152,7 @@ class DerivedVelocity(_WhiteJerk):
     def take(self, stamp: float, position: Array) -> float:
         """Take a position; return how far it jumped, m, else 0."""
         dt = stamp - self.stamp
-        if not 0.0 < dt <= LONGEST_GAP:
+        if not 0.0 < dt <= ODOMETRY_GAP:
             self._begin(stamp, position)
             return 0.0
         if dt < self.SHORTEST:
@@ -195,7 +195,7 @@ class DerivedRates(_WhiteJerk):
     def take(self, stamp: float, quaternion: Array) -> None:
         """Take an attitude."""
         dt = stamp - self.stamp
-        if not 0.0 < dt <= LONGEST_GAP:
+        if not 0.0 < dt <= ODOMETRY_GAP:
             self._restart(stamp, quaternion)
             return
         turn = dt * self.rate + 0.5 * dt * dt * self.acceleration
@@ -229,7 +229,7 @@ SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
 #: Log of the likelihood ratio from which on a reading is used before one is found: 3 to 1.
 LIKELY: Final[float] = 1.0
-#: Readings that differ by less, m/s along any axis: REP-105's is used before the evidence speaks.
+#: Readings that differ by less, m/s along any axis: REP-105's is used before the evidence decides.
 SAME: Final[float] = 0.1
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
@@ -251,7 +251,7 @@ class TwistFrame:
     def __init__(self, wanted: str = AUTO) -> None:
         self.wanted = wanted
         self.found = ''
-        """What the positions say: one of these, or '' while they have not said."""
+        """The frame that fits the positions: one of these; '' before the evidence decides."""
         self.contradiction: float = 0.0
         """Error of the frame in use, m/s, in the window that last contradicted it."""
         self.windows: deque[Array] = deque(maxlen=600)
@@ -325,7 +325,7 @@ class TwistFrame:
 
     def _judge(self, times: Array, ways: Array, offs: Array) -> None:
         """
-        Take what a window says, by its n pieces.
+        Take the evidence of a window, by its n pieces.
 
         :param times: (n,), s.
         :param ways: (n, 3), m, by the positions.

@@ -34,7 +34,6 @@ from typing import Any, Final
 import yaml
 
 from flock_follower.odometry.reader import SourceParams
-from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
@@ -43,13 +42,13 @@ from flock_follower.parameters.spec import (
     Spec,
     specs_of,
 )
+from flock_follower.parameters.tables import MAVLINK_BRIDGE, PLANNER, RELATIVE_POSE
 
 Table = Mapping[str, Sequence[Spec]]
 #: The parameters of the nodes that a flight needs.
-TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
-                'mavlink_bridge': mavlink_bridge_table.SPECS}
-#: Parameters that must be the same in all nodes: those by which one node knows what another one
-#: does, and the reading of the odometry, as a vehicle has one.
+TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
+                'mavlink_bridge': MAVLINK_BRIDGE}
+#: Parameters that must be the same in all nodes: the cameras, and the reading of the odometry.
 COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 
 #: The section whose parameters hold for each node of a follower that has them.

@@ -17,18 +17,19 @@ A parameter as a table row: name, default, meaning and valid values.
 
 The nodes declare these tables to ROS; ``evaluate`` reads the same values from a file. Every value
 passes the same checks, and every refusal names the parameter, its value and the valid range.
+Unknown names are refused, those of launch arguments, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-import difflib
 from functools import cached_property
+from pathlib import Path
 import re
 from typing import Any, TypeVar
 
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, Range, suggestion
 
 #: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
 #: stands in the name of one; in its default that is the camera's name, too.
@@ -57,6 +58,8 @@ REMOVED = {
         'period', 'heard_timeout', 'brake_time_constant', 'response_time', 'altitude_frequency',
         'max_vertical_acceleration', 'jpeg_quality', 'file_size', 'kept'),
         'it is a constant now: remove the line')}
+#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
+END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -66,8 +69,8 @@ class Spec:
     One parameter: its name, default, meaning and valid values.
 
     The type of ``default`` is the parameter's type; integers are accepted for a float. ``valid``
-    is the range of a number, or of each of a list, or the choices of a text. A list default fixes
-    the length where ``fixed_length`` is set. A node takes new values of ``live`` parameters in
+    is the range of a number, or of each of a list, or the choices of a text. With ``fixed_length``
+    a list must be as long as its default. A node takes new values of ``live`` parameters in
     flight, of others at start only.
     """
 
@@ -178,7 +181,7 @@ def filled(params: P, values: Mapping[str, Any], prefix: str = '', **others: Any
 
 def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the value of every parameter, its default where none is given.
+    Return the value of every parameter, its default if none is given.
 
     :raises ValueError: for the first invalid value.
     """
@@ -214,7 +217,27 @@ def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> N
     for name in sorted(names):
         if name in known or name in OF_EVERY_NODE or name.startswith('qos_overrides.'):
             continue
-        near = difflib.get_close_matches(name, known, n=1)
         hint = (f'it was removed, {REMOVED[name]}' if name in REMOVED else
-                f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known)))
+                suggestion(name, known))
         raise ValueError(f'unknown parameter {name} for node {node}: {hint}')
+
+
+def refuse_arguments(command_line: Sequence[str], file: str, known: Collection[str]) -> None:
+    """
+    Refuse an argument that a launch file does not have: ROS would ignore it.
+
+    Nothing is checked unless the command line names the file: another launch file that includes
+    it may have arguments of its own.
+
+    :param command_line: ``sys.argv``.
+    :param file: path of the launch file; :param known: names of its arguments, and of those of
+        the files that it includes.
+    :raises ValueError: naming the argument, and the name that is nearest to it.
+    """
+    if not any(Path(word).name == Path(file).name for word in command_line):
+        return
+    for word in command_line:
+        name, assigned, _ = word.partition(':=')
+        if assigned and name not in known:
+            raise ValueError(f'{word}: unknown argument of {Path(file).name}: '
+                             f'{suggestion(name, known)}')

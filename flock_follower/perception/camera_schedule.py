@@ -32,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Transform
+from flock_follower.messages import MAX_JUMP
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter
@@ -44,14 +45,12 @@ SEARCH_PERIOD = 0.1
 SWEEP_PERIOD = 1.0
 #: A neighbour that a camera measured at most this time ago, s, is tracked by that camera.
 FRESH = 0.25
-#: Images not further apart than this, s, were taken at once.
+#: Images of two cameras not farther apart than this, s, were taken at once.
 TOGETHER = 1e-4
 #: For a filter, measurements of one time are this far apart, s.
 STEP = 1e-9
 #: A marker is farther away than this, m.
 NEAREST = 0.05
-#: An image older than another camera's is not used, unless it is older by more than this, s.
-LATE = 0.5
 
 
 class Sought(NamedTuple):
@@ -96,8 +95,8 @@ class CameraSchedule:
         for name, track in filters.items():
             last, seen = self._seen.get(name, (camera, -math.inf))
             age = time - seen if last is not camera else math.inf
-            if -LATE < age < 0.0:
-                continue
+            if -MAX_JUMP < age < 0.0:
+                continue  # another camera's image is newer; beyond, time jumped back
             expected, tracked = track.place(time), 0.0 <= age <= FRESH
             covered = tracked and abs(time - camera.vain.get(name, -math.inf)) < SEARCH_PERIOD
             if not covered and expected is not None and self.in_view(

@@ -70,7 +70,7 @@ _DIFFERENCE = np.array([1.0, -1.0])
 
 
 def _correlation() -> Any:
-    """Return what takes a profile (17,) to its smoothed derivative at the middle 9 samples."""
+    """Return the matrix from a profile (17,) to its smoothed derivative in the middle (9,)."""
     k = np.arange(-_HALF, _HALF + 1.0)
     kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
     kernel /= kernel @ k  # one grey level per sample gives 1
@@ -175,7 +175,7 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
 
 def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     """
-    Return where edges are without what neighbours push them by, and the blur of either axis, px.
+    Return where edges are without the shifts by their neighbours, and the blur of either axis, px.
 
     Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
     C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
@@ -227,14 +227,14 @@ MIN_INLIERS, MAX_RMS = 0.5, 0.4
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
 _FLOOR = 0.03  # px: least standard deviation of an edge's place
-#: What a step leaves out goes with its square, and against the marker's size: where the square is
+#: The error of a step grows with its square, and falls with the marker's size: if the square is
 #: more than this times the narrowest cell, px, edges are looked for again;
 _AGAIN = 0.2
-ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
+ANEW = 1.5  # px: if the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
 LONGEST_TURN = 1.0  # rad: after a longer step the edges must be found again
-_SETTLED = 2.0  # times as far as a step may go that nothing is looked for again after
+_SETTLED = 2.0  # the last step may be so many times as long: no edges are looked for after it
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
 _BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
@@ -248,7 +248,7 @@ class EdgeFit(NamedTuple):
 
     ``pose`` is ``T_camera_body``; ``center`` (3,) is in the middle of the edges, in the camera's
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
-    vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
+    vector r in R_true = exp(r) R. ``rms`` is that of the residuals, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
     share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found.
     """

@@ -36,12 +36,12 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.print_model import EdgeModel
 
 #: How much more uncertain, in variance, all unknowns together may be than each would be alone.
-#: For good fits of rendered markers it is at most 5e3; at 1e16 nothing is left but rounding.
+#: For good fits of rendered markers it is at most 5e3; at 1e16 only rounding is left.
 MAX_INFLATION = 1e8
 _CHOLESKY = cv2.DECOMP_CHOLESKY
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
-_FARTHEST = 1e4  # m: a pose beyond, or NaN, is invalid
+_DIVERGED = 1e4  # m: a fit that leads beyond, or to NaN, has diverged
 _ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
@@ -86,9 +86,9 @@ class Lines(NamedTuple):
     """
     Edges in the image as a pose has them.
 
-    ``pixels`` and ``normals`` (n, 2), px, unit, from black to white; ``design`` (n, 8): what a
-    step of ``center`` (3,), m, a turn about it, rad, and the two shifts of bloom, px, move an
-    edge by along its normal, px. ``scale`` (2,): px per m across edges of either axis.
+    ``pixels`` and ``normals`` (n, 2), px, unit, from black to white; ``design`` (n, 8): the motion
+    of each edge along its normal, px, by a step of ``center`` (3,), m, a turn about it, rad, and
+    the two shifts of bloom, px. ``scale`` (2,): px per m across edges of either axis.
     ``cells`` (c, 2), px: the middles of the markers' cells.
     """
 
@@ -123,7 +123,7 @@ def facing(model: EdgeModel, pose: Transform) -> Any:
 
 def within_reason(pose: Transform) -> bool:
     x, y, z = pose.translation.tolist()
-    return abs(x) + abs(y) + abs(z) < _FARTHEST
+    return abs(x) + abs(y) + abs(z) < _DIVERGED
 
 
 def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:

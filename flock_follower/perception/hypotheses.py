@@ -62,8 +62,8 @@ MOST = 3
 #: If the primary track was not measured for longer than this, s, every measurement outside its
 #: gate becomes a candidate.
 GAP = 0.5
-#: Images not farther apart than this, s, were taken at once.
-TOGETHER = 1e-3
+#: Measurements not farther apart than this, s, are from the same time: both bodies were in view.
+BESIDE = 1e-3
 
 
 class _Motion:
@@ -184,7 +184,7 @@ class Hypotheses:
             return Taken(UpdateOutcome.LATE, candidate)
         candidate.take(*arguments)
         last = self.primary.newest
-        if another or (last is not None and abs(time - last.stamp) < TOGETHER):
+        if another or (last is not None and abs(time - last.stamp) < BESIDE):
             candidate.beside, candidate.alone = True, 0
         if self._is_neighbor(candidate, time):
             self._exchange(candidate)
@@ -192,7 +192,7 @@ class Hypotheses:
         return Taken(UpdateOutcome.OUTLIER, candidate)
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
-                 covariance: Array) -> UpdateOutcome:
+                        covariance: Array) -> UpdateOutcome:
         """Update the primary track with a measurement, if it can be of it."""
         last, reach = self.primary.newest, self._reach(time)
         if last is not None and time > last.stamp and self.primary.place(time) is None and (
@@ -200,7 +200,7 @@ class Hypotheses:
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
         outcome = self.primary.update(time, measured, reference, covariance,
-                                       reach if surprised else 0.0)
+                                      reach if surprised else 0.0)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
         if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):

@@ -171,7 +171,7 @@ def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool
     if payload.size < needed:
         raise ValueError(f'data has {payload.size} bytes: {width}x{height} px in {encoding} with '
                          f'step {step} takes at least {needed}')
-    stride = step if height > 1 else width * size  # of a single row the step says nothing
+    stride = step if height > 1 else width * size  # the step of a single row has no meaning
     rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (stride, 1))
     if encoding == 'mono16':
         return _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
@@ -186,7 +186,7 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: if OpenCV cannot decode it, or should not, see ``image_files``.
+    :raises ValueError: if OpenCV cannot decode it, or should not, see ``file_size``.
     """
     payload = np.frombuffer(data, dtype=np.uint8)
     file_size(payload.tobytes())

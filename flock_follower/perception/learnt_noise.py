@@ -149,8 +149,9 @@ MOTION_TIME: Final = 2.0
 #: Limit of the surplus of one image; limits of the factor.
 STRONGEST: Final = 4.0
 FACTORS: Final = (0.2, 16.0)
-#: After a longer gap, s, the mean restarts, and the factor is at least 1: ``FilterParams`` holds.
-GAP: Final = 0.3
+#: After a longer gap, s, the step is not learnt: the mean restarts, and the factor is at least 1,
+#: so ``FilterParams`` holds.
+LEARNING_GAP: Final = 0.3
 
 
 class LearntMotion:
@@ -164,8 +165,8 @@ class LearntMotion:
         self._share = 0.0  # variance of the means if innovations are white, of variance 1
 
     def scale(self, dt: float) -> list[float]:
-        """Return by what to multiply the covariance that dt, s, adds, by axis."""
-        least = 0.0 if abs(dt) <= GAP else 1.0
+        """Return the factor, by axis, on the covariance that dt, s, adds."""
+        least = 0.0 if abs(dt) <= LEARNING_GAP else 1.0
         return [max(factor, least) for factor in self.factors]
 
     def take(self, dt: float, innovation: Array, expected: Array) -> None:
@@ -174,19 +175,19 @@ class LearntMotion:
 
         :param dt: time since the innovation before, s.
         """
-        if dt > GAP:
+        if dt > LEARNING_GAP:
             self._share, self._means = 0.0, [0.0] * 3
         weight = min(dt / MEAN_TIME, 0.5)
         self._share = (1.0 - weight)**2 * self._share + weight**2
         variances = expected.diagonal().tolist()
         for k, (off, variance) in enumerate(zip(innovation.tolist(), variances)):
             off = min(max(off / math.sqrt(variance), -STRONGEST), STRONGEST)
-            if dt <= GAP:
+            if dt <= LEARNING_GAP:
                 self._noises[k] += min(dt / NOISE_TIME, 1.0) * (
                     0.5 * (off - self._before[k])**2 - self._noises[k])
             self._before[k] = off
             self._means[k] += weight * (off - self._means[k])
             surplus = self._means[k]**2 / (self._share * max(self._noises[k], 0.05)) - 1.0
             factor = self.factors[k] * math.exp(
-                min(dt, GAP) / MOTION_TIME * min(surplus, STRONGEST))
+                min(dt, LEARNING_GAP) / MOTION_TIME * min(surplus, STRONGEST))
             self.factors[k] = min(max(factor, FACTORS[0]), FACTORS[1])

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One image on its way through perception: what is expected in it, and what was found.
+One image on its way through perception: the expected and the found content.
 
 ``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
 shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour
@@ -34,10 +34,10 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners, refine
-from flock_follower.perception.markers import MarkedNeighbor, Marker
+from flock_follower.perception.markers import MarkedNeighbor, Marker, marker_corners
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
+from flock_follower.perception.pose import refine
 from flock_follower.perception.time_offset import MountedCamera
 
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)

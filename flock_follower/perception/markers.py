@@ -19,7 +19,7 @@ OpenCV 4.6 (Ubuntu 24.04) has free functions and ``DetectorParameters_create()``
 ``DetectorParameters()``; 4.7 brought ``ArucoDetector`` and 5 dropped the functions.
 Pixel coordinates are OpenCV's: (0, 0) at the centre of the top-left pixel.
 
-Who flies along: the neighbours and the markers they carry, read from YAML.
+The neighbours and the markers they carry, read from YAML.
 
 A file holds the dictionary of the markers and a list of neighbours::
 
@@ -53,7 +53,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-import difflib
 from functools import lru_cache
 import math
 from pathlib import Path
@@ -66,7 +65,7 @@ import yaml
 
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
 from flock_follower.perception.images import GrayImage
-from flock_follower.ranges import Range
+from flock_follower.ranges import Range, suggestion
 
 # Any: neither version's type stubs know the other's names.
 _cv_aruco: Any = cv2.aruco
@@ -120,7 +119,7 @@ def marker_cells(name: str) -> int:
 
 def correctable_cells(name: str) -> int:
     """
-    Return how many cells of a marker may be misread and it is still nearest to its own code.
+    Return how many cells of a marker may be misread while it is still nearest to its own code.
 
     :raises ValueError: for an unknown dictionary.
     """
@@ -253,6 +252,12 @@ class NeighborConfig:
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
 
+def marker_corners(side_length: float) -> Array:
+    """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
+    return 0.5 * side_length * np.array(
+        [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
 def load(path: str | Path) -> NeighborConfig:
     """
     Read a neighbours file.
@@ -333,10 +338,8 @@ def _check_keys(where: str, entry: Any, keys: set[str],
         raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
     unknown = sorted(map(str, set(entry) - keys - {*optional}))
     if unknown:
-        known = sorted({*keys, *optional})
-        near = difflib.get_close_matches(unknown[0], known, n=1)
-        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + (
-            f'did you mean {near[0]}?' if near else f'must be one of {", ".join(known)}'))
+        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + suggestion(
+            unknown[0], {*keys, *optional}, 'must be one of'))
     for key in sorted(keys - set(entry)):
         raise ValueError(f'{where} lacks {key}')
 

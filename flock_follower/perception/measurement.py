@@ -30,13 +30,13 @@ import numpy as np
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.perception.edges import moved
 
-#: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
+#: Errors of an expected attitude, and lean of a neighbour, rad (1 sigma).
 SIGMA_HISTORY = 0.1
 SIGMA_UPRIGHT = 0.25
-#: History may not outweigh the image for ever: its say in chi^2 is capped.
+#: History may not outweigh the image for ever: its contribution to chi^2 is capped.
 MAX_HISTORY = 9.0
 #: Two attitudes closer than this, rad, are one.
-SAME = 0.02
+SAME_ATTITUDE = 0.02
 
 
 class PosePrior(NamedTuple):
@@ -70,7 +70,7 @@ class Choice(NamedTuple):
 
 def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
     """Return the likeliest of one or two poses, given their residuals and the prediction."""
-    if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME:
+    if len(poses) == 1 or angle(poses[0].pose, poses[1].pose) < SAME_ATTITUDE:
         return Choice(min(poses, key=lambda p: p.chi2), 0.0)  # both in one: soon they may part
     first, second = (p.chi2 + _surprise(p.pose, expected) for p in poses)
     chosen, other = poses if first <= second else reversed(poses)
@@ -96,8 +96,8 @@ def angle(a: Transform, b: Transform) -> float:
     return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
 
 
-#: Deviations are widened by this, because neighbouring edges share pixels, and what calibration
-#: and blur do is the same for all.
+#: Deviations are widened by this, because neighbouring edges share pixels, and the errors by
+#: calibration and blur are the same for all.
 WIDENING = 1.5
 
 

@@ -36,7 +36,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
 from flock_follower.messages import MAX_JUMP
-from flock_follower.perception.learnt_noise import GAP, LearntMotion
+from flock_follower.perception.learnt_noise import LEARNING_GAP, LearntMotion
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
     ATTITUDE,
@@ -59,7 +59,7 @@ _IDENTITY = np.eye(SIZE)
 _PLACE = _IDENTITY[POSITION]
 #: States to which the drift of the own position adds noise, (15, 15).
 _WANDERING = _PLACE.T.dot(_PLACE)
-#: Of the error state: what moves, and what turns.
+#: Of the error state: the translation, and the rotation.
 _MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
 _TURNING = np.r_[ATTITUDE, RATE]
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
@@ -77,7 +77,7 @@ _UNSCALED = [1.0] * 6  # attitude and its rate
 
 
 class UpdateOutcome(Enum):
-    """What became of a measurement."""
+    """The outcome of a measurement."""
 
     STARTED = 'track started'
     USED = 'used'
@@ -146,7 +146,7 @@ class NeighborFilter:
         return self._predicted
 
     def place(self, stamp: float) -> Transform | None:
-        """Return about where :meth:`predict` expects the body, for far less."""
+        """Return the pose that :meth:`predict` expects, approximately, at far less cost."""
         now = self.newest
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
@@ -249,7 +249,7 @@ class NeighborFilter:
         """Learn from an innovation (6,), or (3,) of the position only, dt, s, after another."""
         self._motion.take(dt, innovation[:3], covariance[:3, :3])
         before, self._before = self._before, (innovation, covariance)
-        if before is not None and dt <= GAP:
+        if before is not None and dt <= LEARNING_GAP:
             n = min(len(innovation), len(before[0]))
             self.change = Change(innovation[:n] - before[0][:n],
                                  covariance[:n, :n] + before[1][:n, :n])
@@ -333,17 +333,17 @@ class NeighborFilter:
             covariance, along, length, self.params.initial_speed))
         return UpdateOutcome.USED if factors == (1.0, 1.0) else UpdateOutcome.SURPRISING
 
-    def _again(self, what: str, innovation: Array, doubt: float) -> bool:
+    def _again(self, quantity: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""
-        before = self._surprises.pop(what, None)
+        before = self._surprises.pop(quantity, None)
         if doubt <= 1.0:
             return False
-        self._surprises[what] = innovation
+        self._surprises[quantity] = innovation
         return before is not None and float(innovation.dot(before)) > 0.0
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:
-        """Start from one measurement; where ``moving`` is given, keep its velocity."""
+        """Start from one measurement; if ``moving`` is given, keep its velocity."""
         quiet = [min(factor, 1.0) for factor in self._motion.factors]
         self.reset()
         if moving is not None:  # a high factor may come from the cause of the restart
@@ -361,7 +361,7 @@ class NeighborFilter:
                     full[row, column] = moving.covariance[row, column]
         full[RATE, RATE] = INITIAL_RATE**2 * np.eye(3)
         self.newest = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
-                                  acceleration, full)
+                               acceleration, full)
         return UpdateOutcome.STARTED
 
 
@@ -374,7 +374,7 @@ def _widened(covariance: Array, part: slice | Array, factor: float) -> Array:
 
 def _to_body(lever: Array) -> Array:
     """
-    Return what takes the errors of a point and of the attitude, (6,), to those of the body.
+    Return the matrix (6, 6) from the errors of a point and of the attitude to those of the body.
 
     The point is off the body's origin by ``lever`` (3,) in odom: p = p_point - R l, so that
     dp = dp_point + [R l]x dr.

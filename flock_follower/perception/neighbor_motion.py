@@ -41,6 +41,7 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
+from flock_follower.messages import FASTEST
 from flock_follower.ranges import Checked, parameter, Range
 
 #: Slices of the error state.
@@ -171,7 +172,7 @@ class FilterParams(Checked):
     max_rejections: int = parameter(6, Range(1, 1000, whole=True))
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
-        2.0, Range(0.0, 50.0, 'm/s'),
+        2.0, Range(0.0, FASTEST, 'm/s'),
         "a track restarts only at a place that a neighbour at this speed can reach; the planner's "
         'leader_speed_max must be the same',
         live=False)
@@ -179,7 +180,7 @@ class FilterParams(Checked):
 
 def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:
     """
-    Return what dt, s, does to (p, v, a) along an axis, (3, 3), and the noise it adds, (3, 3).
+    Return the transition of (p, v, a) along an axis in dt, s, (3, 3), and its noise, (3, 3).
 
     Singer's transition is exact. Its noise is that of white jerk of the same density, which it
     tends to for a time constant much longer than dt.
@@ -205,9 +206,9 @@ def _walk(dt: float) -> Array:
 
 def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     """
-    Return what dt, s, does: to (p, v, a), (3, 3), to the error state, (15, 15), and its noise.
+    Return the transitions of (p, v, a), (3, 3), and of the error state, (15, 15), and its noise.
 
-    See :func:`motion`.
+    See :func:`motion`; dt is in s.
     """
     linear, jerk = motion(dt, params)
     whole, noise = np.eye(SIZE), np.zeros((SIZE, SIZE))
@@ -225,9 +226,9 @@ def turned_along(covariance: Array, before: Array, now: Array) -> Array:
     """
     Return a covariance (15, 15) turned from one line to another.
 
-    A neighbour of which only the distance is known may be anywhere on a sphere. If the line to its
+    If only its distance is known, a neighbour may be anywhere on a sphere. If the line to its
     likeliest place turns, from ``before`` to ``now``, unit vectors (3,), the covariance turns with
-    it. ``before`` of zeros turns nothing.
+    that line. ``before`` of zeros turns nothing.
     """
     cross = skew(np.cross(before, now))
     turn = _EYE + cross + cross @ cross / max(1.0 + float(before.dot(now)), 0.1)

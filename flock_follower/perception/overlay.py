@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import NeighborConfig
+from flock_follower.perception.markers import marker_corners, NeighborConfig
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import Sighting
 

@@ -129,7 +129,7 @@ class Perceiver:
         return min(LONGER * max(self._waits) + MARGIN, self._max_wait)
 
     def model(self, camera: str = '') -> CameraModel | None:
-        """Return the calibration of a camera, where a usable one came."""
+        """Return the calibration of a camera; None before a usable one."""
         return self._cameras[camera].model
 
     def take_camera_info(self, message: Any, camera: str = '') -> bool:
@@ -179,7 +179,7 @@ class Perceiver:
     def take_image(self, message: Any, stamp: int, now: float,
                    camera: str = '') -> PendingImage | None:
         """
-        Take an Image or CompressedImage; return the oldest waiting one where it was dropped.
+        Take an Image or CompressedImage; return the oldest waiting one if it was dropped.
 
         :param stamp: its stamp, ns.
         """
@@ -230,7 +230,7 @@ class Perceiver:
         return True
 
     def take_range(self, measured: RangeState) -> Rejection | None:
-        """Take a range, or return why not; it is used by ``tracker.ranged``."""
+        """Take a range, or return why not; it is used by ``tracker.ranging.due``."""
         return self.tracker.ranging.take(measured, self._seconds(measured.stamp))
 
     def messages(self, make: Make, stamp: int, name: str, estimate: Estimate) -> tuple[Any, Any]:

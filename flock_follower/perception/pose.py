@@ -16,8 +16,11 @@
 From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
-and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
-is fitted as it is smeared.
+and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
+fitted as it is smeared.
+
+A square has two poses that explain its corners almost equally well, mirrored about the line of
+sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014; IPPE).
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import ippe
 from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor
+from flock_follower.perception.markers import MarkedNeighbor, marker_corners
 from flock_follower.perception.measurement import (
     angle,
     Choice,
@@ -41,7 +44,7 @@ from flock_follower.perception.measurement import (
     Hypothesis,
     Measurement,
     PosePrior,
-    SAME,
+    SAME_ATTITUDE,
     widened,
     WIDENING,
 )
@@ -56,7 +59,7 @@ from flock_follower.perception.smear_fit import (
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
-#: Where cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
+#: If cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
 #: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
 #: e times less per px in between: this share at 2 px.
 NARROW = 0.01
@@ -66,8 +69,53 @@ FOUND_INLIERS = 0.8
 SMEAR_DEGREES = 200.0
 
 
+def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
+    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
+    normalised = camera.undistort(corners)
+    if not np.all(np.isfinite(normalised)):
+        return []
+    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
+    # faces the camera upright is half a turn away from it. So it is given the square as if it
+    # lay in the image, x right and y down, whichever of its corners is on top.
+    quarters = int(np.argmin(normalised.sum(axis=1)))
+    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
+    # Undistorted coordinates and an identity matrix serve every lens model alike.
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
+        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
+    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
+    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
+            for r, t in zip(rotations, translations)
+            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
+
+
+def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
+           pose: Transform) -> tuple[Transform, Array] | None:
+    """
+    Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
+
+    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
+    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
+    """
+    for _ in range(20):
+        seen = pose.apply(points)
+        pixels, by_point = camera.linearize(seen)
+        residual = (corners - pixels).ravel()
+        middle = pose.apply(center[None])[0]
+        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
+        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
+        step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
+        if step is None or not np.all(np.isfinite(step)):
+            return None
+        if np.max(np.abs(step)) < 1e-7:
+            break
+        pose = moved(pose, middle, step)
+    return pose, jacobian
+
+
 class Target(NamedTuple):
-    """A neighbour and what its markers, in their order, look like."""
+    """A neighbour and the image models of its markers, in their order."""
 
     neighbor: MarkedNeighbor
     model: EdgeModel
@@ -75,7 +123,7 @@ class Target(NamedTuple):
 
 
 def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
-    """Return what a neighbour with markers of a dictionary looks like."""
+    """Return the image model of a neighbour with markers of a dictionary."""
     return Target(neighbor, edge_model(neighbor, dictionary),
                   tuple(smear_model(marker, dictionary) for marker in neighbor.markers))
 
@@ -171,8 +219,8 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     if len(seen.codes) == 1:
         return None
     if shown is None:  # one that is covered spoils them all
-        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
-                           spacing) for k in range(len(seen.codes))]
+        alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
+                 for k in range(len(seen.codes))]
         shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
         return None
@@ -218,7 +266,7 @@ def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
 
 
 def _scale(found: EdgeFit) -> float:
-    """Return what its variances are to be multiplied by."""
+    """Return the factor on its variances."""
     return max(found.chi2, 1.0) * WIDENING**2
 
 
@@ -229,18 +277,18 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     other = -normal + 2.0 * float(normal @ sight) * sight
     axis = np.cross(normal, other)
     sine = float(np.linalg.norm(axis))
-    if sine < SAME:
+    if sine < SAME_ATTITUDE:
         return []
     turn = axis / sine * math.atan2(sine, float(normal @ other))
     start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
     refitted = _refit(camera, found, start)
-    if refitted is None or angle(refitted[0], found.pose) < SAME:
+    if refitted is None or angle(refitted[0], found.pose) < SAME_ATTITUDE:
         return []
     return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
 
 
 def _refit(camera: CameraModel, fitted: EdgeFit,
-          start: Transform) -> tuple[Transform, float] | None:
+           start: Transform) -> tuple[Transform, float] | None:
     """
     Return another pose near ``start`` that fits the edges found already, and its chi^2.
 

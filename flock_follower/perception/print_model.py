@@ -122,7 +122,7 @@ def read(brightness: Array, seen: Windows) -> Array:
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
-#: Where else a cell is looked at, in cells from its middle.
+#: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
 _MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
@@ -174,9 +174,8 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode, tracked: bool = 
 
     Its border must be black, the quiet zone around white, and no other word of the dictionary
     nearer. Of a marker that is ``tracked``, up to ``code.errors`` cells may be covered; of any
-    other, half as many may be wrong: a mirrored print differs in few cells. Where one threshold
-    for all cells does not show that, a shadow may lie across: then each is compared with those
-    around.
+    other, half as many may be wrong: a mirrored print differs in few cells. If one threshold for
+    all cells does not show that, a shadow may lie across: then each is compared with those around.
     """
     brightness = grey_levels(image, pixels)
     inner = code.bits.size
@@ -278,8 +277,8 @@ class EdgeModel:
         # The narrowest room across either, m.
         first, second = (float(room[one].min(initial=np.inf)) for one in self.across)
         self.narrowest = first, second
-        # What the two shifts of bloom, px, do along the normals, (n, 2): normals point from black
-        # to white, white swells to black.
+        # The motion along the normals by the two shifts of bloom, px, (n, 2): normals point from
+        # black to white, white swells to black.
         self.bloom = -np.eye(2)[axis]
         # The mean of the points is this times them, (n,).
         self.shares = np.full(len(self), 1.0 / max(len(self), 1))

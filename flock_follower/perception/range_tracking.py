@@ -15,6 +15,9 @@
 """
 Tracks a neighbour that is out of sight by distances that a radio measures.
 
+One sensor measures the distances to a neighbour: all of them have one bias, one place of the own
+antenna, and stamps that only grow. A second sensor would need a series of its own.
+
 In sight, a marker measures the distance a hundred times better; then only the error of the ranges
 is learnt. Out of sight, a second filter continues from the state of the first. The second filter
 is separate: ranges do not change the update by a later sighting. Ranges bound the state along the
@@ -48,10 +51,11 @@ UNSEEN = 0.5
 LONGEST = 60.0
 #: A range is used to estimate the bias if the neighbour is seen within this time after it, s.
 LEARNT = 0.1
-#: A stamp so far ahead of the newest odometry, s, waits for it; beyond, clocks differ.
-AHEAD = 0.3
-#: A stamp older than the newest odometry by more, s, is of no use.
-OLDEST = 0.5
+#: A range stamped up to this far ahead of the newest odometry, s, waits for it; beyond, clocks
+#: differ.
+AHEAD_OF_ODOMETRY = 0.3
+#: A range older than the newest odometry by more, s, is of no use.
+OLDEST_RANGE = 0.5
 MOST_WAITING = 100  # ranges: 2 s at 50 Hz, and a bound on memory
 UNKNOWN = 'range of an unknown neighbour'
 INVALID = 'range outside its limits'
@@ -73,7 +77,7 @@ class RangingParams(Checked):
 
 
 class Ranged(NamedTuple):
-    """What a neighbour's ranges made of its state, at the stamp of the newest, ns."""
+    """A neighbour's state as estimated from its ranges, at the stamp of the newest, ns."""
 
     name: str
     stamp: int
@@ -137,7 +141,7 @@ class Ranging:
             return INVALID, f'{measured.name}, {measured.distance:.3g} m: [{low:g}, {high:g}] m'
         if newest is None:
             return UNPLACED, measured.name
-        if not max(newest - OLDEST, series.newest) < stamp <= newest + AHEAD:
+        if not max(newest - OLDEST_RANGE, series.newest) < stamp <= newest + AHEAD_OF_ODOMETRY:
             return UNTIMELY, f'{measured.name}: {stamp - newest:.2f} s after the odometry'
         series.newest = stamp
         insort(self._waiting, (stamp, measured), key=lambda waiting: waiting[0])
@@ -156,8 +160,7 @@ class Ranging:
                 continue
             body = own.smooth_pose
             variance = measured.variance or self.params.range_noise ** 2
-            placed = PlacedRange(stamp, measured.distance, variance,
-                             body.apply(self._tag))
+            placed = PlacedRange(stamp, measured.distance, variance, body.apply(self._tag))
             estimate = self._series[measured.name].take(placed, own)
             if estimate is not None:
                 yield Ranged(measured.name, measured.stamp, estimate)
@@ -178,7 +181,7 @@ class RangeSeries:
         self._since: float | None = None
 
     def take(self, measured: PlacedRange, own: OdometrySample) -> Estimate | None:
-        """Take a range; return the state by the odometry's clock, where it is not in sight."""
+        """Take a range; return the state by the odometry's clock if it is out of sight."""
         seen = self._seen.newest
         if seen is None:
             return None
@@ -207,17 +210,21 @@ class RangeSeries:
         then = self._seen.near(measured.stamp)
         if then is None or seen.stamp - measured.stamp > LEARNT:
             return
-        sight = then.position + then.rotation.dot(self._tag) - measured.antenna
-        distance = math.hypot(*sight.tolist())
-        along = sight / max(distance, SHORTEST)
+        distance, along = _measured(
+            then.position + then.rotation.dot(self._tag) - measured.antenna)
         spread = float(along.dot(then.covariance[POSITION, POSITION]).dot(along))
         self.bias.learn(measured.stamp, measured.distance - distance, measured.variance + spread)
 
     def _reported(self, now: Estimate, own: OdometrySample) -> Estimate:
         """Return a state in odom; the variance of the bias adds to that of the distance."""
-        sight = now.position - own.travel
-        along = sight / max(math.hypot(*sight.tolist()), SHORTEST)
+        _, along = _measured(now.position - own.travel)
         covariance = now.covariance.copy()
         covariance[POSITION, POSITION] += self.bias.variance(now.stamp) * np.outer(along, along)
         return now._replace(stamp=own.stamp, position=now.position + own.correction,
                             covariance=covariance)
+
+
+def _measured(sight: Array) -> tuple[float, Array]:
+    """Return length, m, and direction (3,) of a line of sight (3,), m; no direction at 0."""
+    distance = math.hypot(*sight.tolist())
+    return distance, sight / max(distance, SHORTEST)

@@ -33,7 +33,6 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
@@ -42,6 +41,7 @@ from flock_follower.perception.markers import (
     Marker,
     marker_cells,
     marker_code,
+    marker_corners,
     NO_DETECTIONS,
     outwards,
 )
@@ -51,13 +51,13 @@ from flock_follower.perception.print_model import cell_code, shows_code
 SIDE = 56.0
 #: From this width on, px, a whole image is searched at half its size.
 LARGE = 1280
-_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels: what is darker is noise
+_LOGARITHM = np.log(np.arange(256.0) + 12.0)  # of grey levels; below about 12 they are noise
 _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astype(np.uint8)
-#: Side of the window for the mean, px, and of the brush that removes what is narrower. A narrow
+#: Side of the window for the mean, px, and of the brush that removes narrower areas. A narrow
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
-_DARKER = 7  # by so much of the logarithm than the mean of the window is what is dark
+_DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
 _STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
@@ -73,7 +73,7 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
     """
     Return the markers about where a neighbour is expected (``T_camera_body``).
 
-    :param thorough: whether to look for the neighbour's own, by all means.
+    :param thorough: whether to search thoroughly, for the neighbour's own markers.
     """
     outlines = [camera.project((expected @ marker.T_body_marker).apply(
         marker_corners(marker.side_length))) for marker in neighbor.markers]

@@ -150,7 +150,7 @@ _MIN_INSIDE = 0.8  # share of the samples that must be in the image
 _BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
 _FLOOR = 1.0  # grey levels: least standard deviation of a sample
 _ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
-#: Of the pose (6), the response (3) and the smear (2), which a smear of 0 leaves open.
+#: Of the pose (6), the response (3) and the smear (2); a smear of 0 leaves the last open.
 _PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
 
 
@@ -266,7 +266,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         along = _by_point(pose, model, points, slope * by_place)
         design = np.concatenate([along, cross(points - center, along), response,
                                  slope * by_smear], axis=1)
-        # The steeper it is, the more it matters what lens and cells are really like.
+        # The steeper it is, the more the true blur of lens and cells matters.
         steep = _BLURRED**2 * (slope * slope * by_place * by_place).sum(axis=1)
         weights = weights / (variance + steep)
         weighted = design * weights[:, None]

@@ -45,7 +45,7 @@ from flock_follower.perception.neighbor_motion import FilterParams
 
 #: Initial standard deviation of an offset, s; largest offset that is applied, s.
 PRIOR: Final[float] = 0.1
-MOST: Final[float] = 0.2
+MAX_OFFSET: Final[float] = 0.2
 #: Step and half width of the grid of offsets about the initial one, s.
 STEP, FURTHEST = 0.01, 0.14
 GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)
@@ -154,7 +154,7 @@ class TimeOffset:
         if not off > max(LEAST, SIGNIFICANT[self._found] * self.deviation):
             return 0.0
         before, self._found = self.applied, True
-        self.applied = min(max(self.estimate, -MOST), MOST)
+        self.applied = min(max(self.estimate, -MAX_OFFSET), MAX_OFFSET)
         return self.applied - before
 
 

@@ -60,7 +60,7 @@ from flock_follower.perception.neighbor_filter import (
 )
 from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
-from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
+from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
@@ -147,10 +147,6 @@ class Tracker:
         if jumped:
             self._forget()
         return jumped
-
-    def ranged(self) -> Iterator[Ranged | Rejection]:
-        """Yield the result of each range that odometry has reached."""
-        return self.ranging.due()
 
     def missing(self, stamp: float, camera: str = '') -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed yet, or None."""

@@ -22,7 +22,7 @@ import math
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.messages import DUPLICATE, FASTEST, POSITION_STD_MAX
-from flock_follower.ranges import Checked, parameter, Range
+from flock_follower.ranges import A_MAX, Checked, ODOM_TIMEOUT, parameter, Range, V_MAX
 
 ROLES = LEADER, FOLLOWER, AVOID = 'leader', 'follower', 'avoid'
 RADIUS = Range(0.0, 5.0, 'm')
@@ -122,13 +122,12 @@ class PlannerParams(Checked):
         'while the bridge is ACTIVE', live=True)
     guarding: GuardParams = field(default_factory=GuardParams)
     a_max: float = parameter(
-        2.5, Range(0.1, 20.0, 'm/s^2'),
+        2.5, A_MAX,
         'largest magnitude of the acceleration; never above its initial value, and only lowered '
         'while the bridge is ACTIVE; braking and separation use the initial value',
         live=True)
     v_max: float = parameter(
-        0.5, Range(0.05, 20.0, 'm/s'), 'largest speed; the same conditions as for '
-                                       'a_max', live=True)
+        0.5, V_MAX, 'largest speed; the same conditions as for a_max', live=True)
     a_max_start: float = parameter(
         0.0, Range(0.0, 20.0, 'm/s^2'),
         'initial ``a_max``, m/s^2, if it was lowered in flight; see ``strongest``.')
@@ -148,7 +147,7 @@ class PlannerParams(Checked):
         2.0, Range(0.05, 10.0, 's'),
         'age of the last estimate up to which the vehicle coasts; then it brakes', live=True)
     odom_timeout: float = parameter(
-        0.3, Range(0.02, 2.0, 's'),
+        0.3, ODOM_TIMEOUT,
         'largest age of the odometry for commands; the planner brakes from half of it on or, if '
         'odometry is usually older, when the next message is overdue', live=True)
     perception_timeout: float = parameter(

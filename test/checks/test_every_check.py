@@ -30,7 +30,6 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
 from flock_follower.checks.observations import (
@@ -40,6 +39,7 @@ from flock_follower.checks.observations import (
     TopicEnd,
     TopicSeen,
 )
+from flock_follower.checks.recorded_system import judge_all
 from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import TYPES
 from flock_follower.geometry import (
@@ -197,7 +197,7 @@ FAULTS: list[Fault] = [
     Fault('odometry 0.4 s late', BOTH, ERROR, 'odom latency', '410 ms', 'processor time',
           delayed('odom', 0.4)),
     Fault('use_sim_time without a clock', LIVE, ERROR, 'clock',
-          'use_sim_time is true in planner, but nobody publishes /clock',
+          'use_sim_time is true in planner, but no node publishes /clock',
           'without use_sim_time',
           parameter('planner', 'use_sim_time', True)),
     Fault('stamps ahead', BOTH, ERROR, 'images latency', '80 ms in the future',
@@ -231,7 +231,7 @@ FAULTS: list[Fault] = [
     Fault('a twist that is nonsense', BOTH, WARNING, 'odom velocity', 'in either frame',
           'derived from the positions',
           columns(slice(9, 12), [1.5, 1.5, 0.0])),
-    Fault('a source that is lost', BOTH, ERROR, 'odom', '250 of 250 say nothing: quaternion = 0',
+    Fault('a source that is lost', BOTH, ERROR, 'odom', '250 of 250 are invalid: quaternion = 0',
           'publish_null_when_lost',
           columns(slice(5, 9), [0.0] * 4)),
     Fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', 'ms later',
@@ -264,11 +264,11 @@ FAULTS: list[Fault] = [
           'the bridge would refuse offboard',
           bridge('offboard would be refused', 'GUID_TIMEOUT = 3 s: ...')),
     Fault('not ready to arm', LIVE, ERROR, 'ready to arm', 'no: press the safety button',
-          'its own words',
+          'fix the reported causes',
           bridge('not ready to arm', 'press the safety button')),
     Fault('no autopilot', LIVE, ERROR, 'autopilot', 'not received (never received)', 'check cable',
           bridge('link', 'never received')),
-    Fault('an error of a node', LIVE, ERROR, 'relative_pose says', 'no image processed for 4 s',
+    Fault('an error of a node', LIVE, ERROR, 'relative_pose status', 'no image processed for 4 s',
           'see images',
           lambda seen: seen.statuses.update(relative_pose=NodeStatus(
               2, 'no image processed for 4 s: no usable camera_info'))),
@@ -321,7 +321,7 @@ FAULTS: list[Fault] = [
           together(lambda seen: seen.topics.update({'/clock': TopicSeen()}),
                    *(parameter(node, 'use_sim_time', node != 'planner') for node in OURS))),
     Fault('twist in odom, told as child', BOTH, ERROR, 'odom velocity',
-          'read in child, the positions say odom', 'odom_twist_frame:=auto',
+          'read in child, the positions fit odom', 'odom_twist_frame:=auto',
           together(positions([0, 1, 2], [1.0] * 3, True),
                    *(parameter(node, 'odom_twist_frame', 'child') for node in OURS))),
     Fault('the axes of an IMU', BOTH, ERROR, 'odom up', '-y of base_link is up',
@@ -346,7 +346,8 @@ FAULTS: list[Fault] = [
           lambda seen: vars(seen).update(nodes=[f'/drone1{node}' for node in seen.nodes])),
     # Measured as it should be, or not at all.
     Fault('an offset that relative_pose has as a parameter', LIVE, OK, 'camera time offset',
-          'as time_offset says', '', together(change(shifts=shift_rows(offset=0.05)), parameter(
+          'corrected by time_offset', '',
+          together(change(shifts=shift_rows(offset=0.05)), parameter(
               'relative_pose', 'time_offset', -0.05))),
     Fault('the pose by tf_static is used', LIVE, OK, 'odom up', 'leans', '', together(
         child_axes(*OPTICAL), change(static_child=Transform.from_quaternion(
@@ -379,7 +380,7 @@ FAULTS: list[Fault] = [
           '', together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)))),
     Fault('odometry at ten hertz', LIVE, WARNING, 'odom rate', '10.0 Hz', 'raise the output rate',
           together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)))),
-    Fault('a node without diagnostics', LIVE, UNMEASURED, 'planner says', 'nothing received', '',
+    Fault('a node without diagnostics', LIVE, UNMEASURED, 'planner status', 'nothing received', '',
           lambda seen: seen.statuses.pop('planner')),
 ]
 
@@ -394,7 +395,7 @@ def test_what_is_well_raises_no_alarm(live: bool) -> None:
     assert [finding.line for finding in findings if finding.level != OK] == []
     assert len(findings) > 15 and ready(findings)
     said = {finding.what: finding.measured for finding in findings}
-    assert said['odom positions'] == 'as the velocity says'
+    assert said['odom positions'] == 'agree with the velocity'
     assert said['odom velocity'] == 'in the child frame'
     assert said['odom ahead'] == 'turning explains 100% of it'
     assert said['camera time offset'] in ('about 0 ms', 'about 1 ms')
@@ -462,8 +463,8 @@ def test_one_cause_has_one_row() -> None:
     seen.statuses['planner'] = NodeStatus(1, 'no neighbor: relative_pose processes no image')
     left = rows(healthy()).keys() - rows(seen).keys()
     assert left == {'calibration', 'odom ahead', 'camera time offset', 'focal length',
-                    'marker size', 'camera mounting', 'relative_pose says',
-                    'planner says'}
+                    'marker size', 'camera mounting', 'relative_pose status',
+                    'planner status'}
     assert [what for what, level in rows(seen).items() if level != OK] == ['camera_info']
 
     seen = healthy()
@@ -475,6 +476,6 @@ def test_one_cause_has_one_row() -> None:
 def test_faults_of_the_recorded_nodes_do_not_spoil_a_bag_but_too_few_messages_do() -> None:
     seen = healthy(live=False)
     seen.statuses = {'planner': NodeStatus(2, 'no /odom for 4 s: no publisher')}
-    assert rows(seen)['planner says'] == WARNING and ready(seen.judged())
+    assert rows(seen)['planner status'] == WARNING and ready(seen.judged())
     kept('odom', slice(2))(seen)
     assert still_needed(seen.judged()) == ['odom rate'] and not ready(seen.judged())

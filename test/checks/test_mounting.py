@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.checks.findings import ERROR, OK, UNMEASURED, WARNING
-from flock_follower.checks.mounting import check_mounting
+from flock_follower.checks.own_motion import check_mounting
 
 
 @pytest.mark.parametrize(('turn', 'deviations', 'level', 'named', 'unknown'), [

@@ -28,7 +28,7 @@ from real_vio import fitted_corners, FOLDER, Recording
 
 from flock_follower.checks.image_motion import OwnPath
 from flock_follower.checks.marker_size import distance_ratio, Ratio, SIZE
-from flock_follower.checks.mounting import SURE
+from flock_follower.checks.own_motion import SURE
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.odometry.reader import OdometrySource
 

@@ -23,7 +23,7 @@ import pytest
 from flock_desk.external.external_motion import (
     ExternalMotion,
     JUMP,
-    LONGEST_GAP,
+    POSE_GAP,
 )
 from flock_follower.geometry import yaw_from_quaternion
 
@@ -110,7 +110,7 @@ def test_what_happened_in_a_gap_or_after_the_last_pose_is_not_known():
     assert motion.newest is None and not motion.knows(0)
     with pytest.raises(ValueError, match='no pose'):
         motion.at(0)
-    late = 100 * MS + LONGEST_GAP + 1
+    late = 100 * MS + POSE_GAP + 1
     motion = received(*((time / MS, truth('SIM_STATE')) for time in (
         0, 100 * MS, late, late + 20 * MS)))
     assert all(map(motion.knows, (0, 50 * MS, 100 * MS, late, late + 10 * MS)))

@@ -14,8 +14,10 @@
 
 """PX4 and ArduPilot behind one interface, and which of them a HEARTBEAT comes from."""
 
+from dataclasses import replace
 import math
 
+from fuzz_mavlink import FuzzedLine
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink import mavutil
@@ -23,12 +25,13 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import wrap_angle
-from flock_follower.mavlink.dialects import (
-    ARDUPILOT,
-    dialect_of,
-    DIALECTS,
-    PX4,
-)
+from flock_follower.mavlink import dialects
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.commands import NOT_RECEIVED
+from flock_follower.mavlink.dialects import ARDUPILOT, dialect_of, DIALECTS, PX4, Rule
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.parameter_check import obstacle
 from flock_follower.mavlink.setpoint_rules import encode_setpoint
 
 GENERIC = mavlink.MAV_AUTOPILOT_GENERIC
@@ -96,3 +99,32 @@ def test_what_is_not_finite_is_never_encoded(bad):
     for acceleration, yaw in (([bad, 0, 0], 0.0), ([0, 0, 0], bad)):
         with pytest.raises(ValueError, match='must be finite'):
             encode_setpoint(acceleration, yaw)
+
+
+def test_a_third_autopilot_is_one_record(monkeypatch):
+    third = replace(
+        ARDUPILOT, name='third', title='Third', firmware=mavlink.MAV_AUTOPILOT_PPZ,
+        vehicle_types=frozenset({QUADROTOR}), velocity_flags=(mavlink.ESTIMATOR_VELOCITY_HORIZ, 0),
+        estimator_status=mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, hover_thrust='THIRD_HOVER',
+        rules=(Rule('THIRD_LOSS', lambda value: value > 1.0, ' s: too long'),))
+    monkeypatch.setattr(dialects, 'DIALECTS', {**DIALECTS, 'third': third})
+    line, codec, now = FuzzedLine(), mavlink.MAVLink(None, 1, 1), 1.0
+    bridge = Bridge(Link(line), Gate(), now=0.0)
+
+    def cycle(*messages):
+        line.arrived += [(bytes(message.pack(codec)), 'vehicle') for message in messages]
+        bridge.receive(now)
+        assert bridge.cycle(now).setpoint.reason in (NOT_RECEIVED, 'offboard was not requested')
+
+    cycle(heartbeat(third.firmware, ROVER))
+    assert bridge.telemetry.dialect is None
+    cycle(heartbeat(third.firmware), mavlink.MAVLink_estimator_status_message(
+        0, mavlink.ESTIMATOR_ATTITUDE, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert bridge.telemetry.dialect is third and bridge.gate.hover_thrust == 'THIRD_HOVER'
+    assert bridge.distrusted(now) == 'is invalid according to its estimator'
+    asked = [mavlink.MAVLink(None).decode(bytearray(data)) for data in line.written]
+    assert 'THIRD_LOSS' in [m.param_id for m in asked if m.get_type() == 'PARAM_REQUEST_READ']
+    cycle(mavlink.MAVLink_param_value_message(
+        b'THIRD_LOSS', 3.0, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0))
+    assert obstacle(third, bridge.housekeeping.parameters, False) == (
+        'THIRD_LOSS = 3 s: too long (or require_failsafe:=false)')

@@ -49,7 +49,7 @@ class FlownGate:
     def __init__(self, limits, height=3.0, thrust_error=0.0):
         self.gate = Gate(limits, 'odom')
         self.gate.permit(Permission().requested(-1.0))
-        self.gate.see(FLOWN, 0.0)
+        self.gate.take_status(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
         self.response, self.error = np.zeros(3), np.array([0.0, 0.0, thrust_error])
         self.commander, self.setpoint = None, None
@@ -163,7 +163,7 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     limits = GateLimits()
     rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
     gate.permit(Permission().requested(-1.0))
-    gate.see(FLOWN, 0.0, airborne=None)
+    gate.take_status(FLOWN, 0.0, airborne=None)
     sent = []
     for k in range(400):
         now = 0.05 * k

@@ -19,6 +19,7 @@ import math
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.estimator_health import (
     distrusted,
     estimator_status,
@@ -42,27 +43,30 @@ def ardupilot(flags):
     return mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0)
 
 
-@pytest.mark.parametrize(('message', 'flags', 'has_velocity'), [
+MESSAGES = {'px4': px4, 'ardupilot': ardupilot}
+
+
+@pytest.mark.parametrize(('dialect', 'flags', 'has_velocity'), [
     # PX4 has a velocity while something carries it; the second on the ground.
-    (px4, FUSED, True), (px4, FUSED | mavlink.ESTIMATOR_CONST_POS_MODE, True),
-    (px4, UNAIDED, False), (px4, GONE, False), (px4, FUSED & ~2, False), (px4, 0, False),
+    (PX4, FUSED, True), (PX4, FUSED | mavlink.ESTIMATOR_CONST_POS_MODE, True),
+    (PX4, UNAIDED, False), (PX4, GONE, False), (PX4, FUSED & ~2, False), (PX4, 0, False),
     # ArduPilot has one unless it takes its position for constant.
-    (ardupilot, mavlink.EKF_VELOCITY_HORIZ, True), (ardupilot, 0x033f, True),
-    (ardupilot, 0, False),
-    (ardupilot, mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE, False)])
-def test_an_estimator_says_whether_it_has_a_velocity(message, flags, has_velocity):
-    assert estimator_status(message(flags), 5.0)[:2] == (5.0, has_velocity)
+    (ARDUPILOT, mavlink.EKF_VELOCITY_HORIZ, True), (ARDUPILOT, 0x033f, True),
+    (ARDUPILOT, 0, False),
+    (ARDUPILOT, mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE, False)])
+def test_an_estimator_says_whether_it_has_a_velocity(dialect, flags, has_velocity):
+    assert estimator_status(MESSAGES[dialect.name](flags), dialect, 5.0)[:2] == (5.0, has_velocity)
 
 
-@pytest.mark.parametrize('message', [px4, ardupilot])
+@pytest.mark.parametrize('dialect', [PX4, ARDUPILOT])
 @pytest.mark.parametrize(('flags', 'missing'), [
     (0x033f, ()), (FUSED, ('POS_HORIZ_ABS',)),  # no origin was told
     (UNAIDED, ('POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
     (GONE, ('VELOCITY_HORIZ', 'POS_HORIZ_REL', 'POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
     (0x03fe, ('ATTITUDE',))])
 def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
-        message, flags, missing):
-    status = estimator_status(message(flags), 5.0)
+        dialect, flags, missing):
+    status = estimator_status(MESSAGES[dialect.name](flags), dialect, 5.0)
     assert status.missing == missing
     assert explained('arm refused', status, 5.0) == (
         f'arm refused; its estimator lacks {", ".join(missing)}' if missing else 'arm refused')
@@ -79,7 +83,7 @@ def fixes(*types):
     return fix
 
 
-ODOMETRY, ESTIMATOR = 'rests on odometry that is lost', 'is none, says its estimator'
+ODOMETRY, ESTIMATOR = 'rests on odometry that is lost', 'is invalid according to its estimator'
 LOST = fixes(1, 6, 1, 1)
 
 

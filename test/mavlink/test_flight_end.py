@@ -18,6 +18,8 @@ import math
 
 from bridge_flight import BOTH, Flight
 from faulty_autopilot import Fault
+from hypothesis import given
+from hypothesis import strategies as st
 import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
@@ -25,7 +27,9 @@ from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,
     BATTERY_TIMEOUT,
     COMMAND_TIMEOUT,
+    CommandSources,
     EndParams,
+    FELL_SILENT_AFTER,
     FlightEnd,
     HOLD,
     LAND,
@@ -163,3 +167,51 @@ def test_a_low_battery_ends_the_flight_and_bars_the_next(personality, action):
     wanted = flight.modes.hold if action == HOLD else flight.modes.land
     flight.fly_until(lambda: flight.mode == wanted, 20.0)
     assert flight.mode == wanted and 'battery_low' in flight.ask('offboard', True).message
+
+
+# One node that commands, one that takes its place, and two at once.
+
+PERIOD = 0.1  # s, the planner's
+FIRST = st.one_of(st.integers(1, 40), st.integers(1, 10**6))
+"""The sequence number of the first command that is received of a publisher."""
+
+
+def noticed(commands):
+    """Return the times at which a second publisher was detected."""
+    sources = CommandSources()
+    return [time for time, number in sorted(commands) if sources.another(number, time)]
+
+
+def publisher(first, begin, late, lost=frozenset(), period=PERIOD):
+    """Return times, s, and numbers of commands with delays, without the lost ones."""
+    return [(begin + k * period + delay, first + k) for k, delay in enumerate(late)
+            if k not in lost]
+
+
+JITTER = st.lists(st.floats(0.0, 0.08), min_size=16, max_size=24)
+
+
+@given(first=FIRST, late=JITTER, lost=st.sets(st.integers(0, 40), max_size=20))
+def test_one_publisher_is_one_however_many_of_its_commands_are_lost(first, late, lost):
+    assert not noticed(publisher(first, 0.0, late, lost))
+
+
+@given(lives=st.lists(st.tuples(FIRST, JITTER, st.floats(FELL_SILENT_AFTER, 20.0)), min_size=2,
+                      max_size=4))
+def test_a_planner_that_starts_again_is_no_second_one(lives):
+    commands = []
+    for first, late, pause in lives:
+        begin = commands[-1][0] + pause + 1e-6 if commands else 0.0
+        commands += publisher(first, begin, late)
+    assert not noticed(commands)
+
+
+@given(number=FIRST, own=FIRST, late=JITTER, at=st.floats(0.1, 1.5))
+def test_a_single_command_of_a_second_node_is_noticed(number, own, late, at):
+    found = noticed([*publisher(own, 0.0, late), (at, number)])
+    assert found and at <= found[0] < at + 2 * PERIOD
+
+
+def test_where_the_middleware_does_not_number_messages_nothing_is_noticed():
+    sources = CommandSources()
+    assert not any(sources.another(None, 0.01 * k) for k in range(10))

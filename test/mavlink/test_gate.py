@@ -33,7 +33,7 @@ NOT_FLOWN = VehicleStatus(True, 'POSCTL', False)
 def fly(gate, now, status=FLOWN):
     """Permit setpoints, which the vehicle obeys unless its status says otherwise."""
     gate.permit(gate.permission.requested(now - 0.001))
-    gate.see(status, now)
+    gate.take_status(status, now)
     return gate
 
 
@@ -99,6 +99,16 @@ def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
 def test_a_command_that_rests_on_an_old_image_is_refused(source_age, reason):
     assert flying_gate().take_command(
         Command(FORWARD, 0.0), 0.0, 10.0, source_age=source_age) == reason
+
+
+@pytest.mark.parametrize(('speed', 'reason'), [
+    (100.1, 'too fast'), (1e300, 'too fast'), (math.inf, 'not finite'), (math.nan, 'not finite')])
+def test_an_implausible_velocity_is_refused_and_the_last_one_counts(speed, reason):
+    gate = fresh_gate()
+    gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
+    assert gate.update_velocity('odom', [0.0, 0.0, -speed], 0.0, 10.1) == reason
+    assert decide(gate, 10.1).kind == 'command'
+    assert decide(gate, 10.31).reason == 'velocity from odom stale'
 
 
 def test_late_odometry_brakes_more_softly_from_its_stamp_on():
@@ -171,17 +181,17 @@ def test_displacements_that_differ_brake_and_hand_the_vehicle_over(
 def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_forgotten():
     gate = Gate(LIMITS)
     assert gate.update_velocity('odom', (0.1, 0.0, 0.0), 0.0, 10.0) == ''
-    gate.see(FLOWN, 10.0)
+    gate.take_status(FLOWN, 10.0)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
     assert gate.decide(10.0)[0].kind == 'none'
     gate.permit(gate.permission.requested(10.0))
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
-    gate.see(FLOWN, 10.01)
+    gate.take_status(FLOWN, 10.01)
     assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
     assert gate.decide(10.03)[0].kind == 'command'
     gate.permit(gate.permission.ended('hold'))
     gate.permit(gate.permission.requested(10.04))
-    gate.see(FLOWN, 10.05)
+    gate.take_status(FLOWN, 10.05)
     assert gate.permission.phase.name == 'ACTIVE'
     assert gate.decide(10.06)[0].kind == 'brake'
     gate.decide(13.0)  # without any velocity since

@@ -48,7 +48,7 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
             control.update_height(50.0, now)
             if k == 0:
                 control.heights.refer(height, now)
-        control.see(OURS, now, airborne=k < 20)
+        control.take_status(OURS, now, airborne=k < 20)
         ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
     assert control.permission == Permission(reason='on the ground')

@@ -142,7 +142,7 @@ class Flown:
     def cycle(self, relative, status=OFFBOARD, command=True):
         self.now += 0.05
         gate, now = self.gate, self.now
-        gate.see(status, now)
+        gate.take_status(status, now)
         gate.update_height(2.0, now)
         if self.odometry:
             gate.update_velocity('odom', (0.1, 0.0, 0.0), 0.0, now)

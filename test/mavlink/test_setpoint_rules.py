@@ -40,7 +40,8 @@ from flock_follower.mavlink.velocity_check import (
     Motion,
     ODOM,
 )
-from flock_follower.messages import Command
+from flock_follower.messages import Command, FASTEST_OWN
+from flock_follower.ranges import A_MAX
 
 LIMITS = GateLimits()
 UNKNOWN = Motion()
@@ -90,6 +91,7 @@ BRAKING = (-0.1 / 0.3, 0.0, 0.0)
     ({'odom': SLOW._replace(velocity_age=-0.101)}, 'velocity from odom stale'),
     ({'odom': SLOW._replace(velocity_age=math.nan)}, 'velocity from odom stale'),
     ({'odom': SLOW._replace(velocity=(0.1, math.nan, 0.0))}, 'velocity from odom stale'),
+    ({'odom': SLOW._replace(velocity=(0.0, 100.1, 0.0))}, 'velocity from odom stale'),
     ({'source': AUTOPILOT, 'autopilot': UNKNOWN}, 'no velocity from autopilot'),
     ({'command': None}, 'no command'),
     ({'command': FORWARD._replace(acceleration=(1.0, math.nan, 0.0))}, 'command not finite'),
@@ -101,6 +103,41 @@ BRAKING = (-0.1 / 0.3, 0.0, 0.0)
     ({'command_age': math.nan}, 'command stale')])
 def test_each_obstacle_brakes_with_its_reason(change, reason):
     same(judge(**change), BRAKE, reason, BRAKING)
+
+
+TOO_LOW_AND_FAR = Location(0.3, 0.0, np.array([50.5, 0.0]))
+
+
+@pytest.mark.parametrize('command', [FORWARD, None])
+@pytest.mark.parametrize('speed', [0.1, 99.0, 100.1, 1e200])
+def test_no_velocity_however_wrong_removes_a_bound_of_the_envelope(command, speed):
+    odom = SLOW._replace(velocity=(0.0, speed, 0.0))
+    setpoint = judge(command=command, odom=odom, place=TOO_LOW_AND_FAR)
+    assert setpoint.kind == (BRAKE if command is None or speed > 100.0 else COMMAND)
+    assert setpoint.acceleration[2] > 0.2 and 'envelope' in setpoint.limited
+    if not 1.0 < speed < 100.0:  # else braking takes all that the heights leave of a_max
+        assert setpoint.acceleration[0] < -0.2
+
+
+def test_an_implausible_velocity_alone_is_none():
+    fast = SLOW._replace(velocity=(0.0, 0.0, -101.0))
+    same(judge(odom=fast, autopilot=UNKNOWN), LEVEL, 'velocity from odom stale')
+
+
+@pytest.mark.parametrize('command', [FORWARD, None])
+@pytest.mark.parametrize('place', [
+    Location(None, 0.0, np.array([51.0, 0.0])),
+    Location(math.nan, 0.0, np.array([51.0, 0.0])),
+    Location(5.0, math.inf, np.array([51.0, 0.0]))])
+def test_without_a_height_the_radius_still_bounds(command, place):
+    setpoint = judge(command=command, place=place)
+    assert setpoint.acceleration[0] < -0.3 and setpoint.acceleration[2] == 0.0
+
+
+@pytest.mark.parametrize('offset', [(math.nan, 0.0), (math.inf, 0.0), (1.7e308, 1.7e308)])
+def test_without_a_place_the_heights_still_bound(offset):
+    setpoint = judge(place=Location(0.3, 0.0, np.array(offset)))
+    assert setpoint.acceleration[2] > 0.2
 
 
 def test_a_healthy_situation_passes_the_command_bit_for_bit():
@@ -233,7 +270,7 @@ def norm_on_wire(setpoint):
 
 def usable(motion):
     fresh = -FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
-    return fresh and len(motion.velocity) == 3 and all(map(math.isfinite, motion.velocity))
+    return fresh and len(motion.velocity) == 3 and math.hypot(*motion.velocity) <= FASTEST_OWN
 
 
 @pytest.mark.slow
@@ -279,7 +316,7 @@ SHORT = st.floats(0.0, 3e-7) | st.floats(-1.0, 1.0)  # by this share a vector mi
 @settings(max_examples=500)
 @given(a_max=st.floats(0.1, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
        v_max=st.sampled_from([0.5, 20.0]), direction=DIRECTION, short=SHORT,
-       velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 5.0]),
+       velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 4.9]),
        commanded=st.sampled_from([True, True, False]), axis=st.none() | DIRECTION,
        airborne=st.sampled_from([True, True, False]), bias=st.sampled_from([0.0, 0.5, -1.0]),
        wind=st.just((0.0, 0.0, 0.0)) | DIRECTION, offset=st.sampled_from([0.0, 1.0, -1.0]),
@@ -289,7 +326,7 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
         a_max, lower, v_max, direction, short, velocity, speed, commanded, axis, airborne, bias,
         wind, offset, height, climb_rate, out):
     full = GateLimits(a_max=a_max, v_max=v_max)
-    limits = GateLimits(a_max=lower * a_max, v_max=v_max)
+    limits = GateLimits(a_max=max(lower * a_max, A_MAX.low), v_max=v_max)
     wanted = (1.0 - short) * limits.a_max * np.array(direction) / np.linalg.norm(direction)
     motion = Motion(tuple(speed * v_max * np.array(velocity) / np.linalg.norm(velocity)), 0.02)
     unit = None if axis is None else np.array(axis) / np.linalg.norm(axis)

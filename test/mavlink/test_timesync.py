@@ -37,7 +37,7 @@ class Clocks:
         return self.speed * (time - self.boot)
 
     def ask(self, time, up=0.004, down=0.004):
-        question = self.sync.question(round(time * 1e9))
+        question = self.sync.request(round(time * 1e9))
         written = round(self.theirs(time + up) * 1e9)
         assert self.sync.take(mavlink.MAVLink_timesync_message(written, question.ts1),
                               round((time + up + down) * 1e9)) is None

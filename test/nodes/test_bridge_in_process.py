@@ -26,7 +26,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from driven import DEADLINE, Driven, overrides
+from driven import DEADLINE, Driven, overrides, to_odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -39,7 +39,7 @@ from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
-from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'update_velocity', 'forward',
          'receive', 'cycle', 'stop')
@@ -339,7 +339,7 @@ def test_a_slow_link_heights_that_differ_and_a_landing_by_the_bridge_are_reporte
         return all(part in found for part in (
             'LOCAL_POSITION_NED comes at 0 Hz of 50 requested',
             'nothing came from the autopilot for 0.',
-            'height above home as 5.0 m, the barometer says 2.0 m',
+            'height above home as 5.0 m, the barometer measures 2.0 m',
             'the bridge requests land: no valid velocity'))
     bench.wait(reported)
     bench.beat(armed=False)

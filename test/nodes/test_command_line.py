@@ -25,8 +25,7 @@ from unittest import mock
 
 import pytest
 
-from flock_desk.parameter_tables import NODES
-from flock_desk.program import PROGRAMS
+from flock_desk.program import NODES, PROGRAMS
 from flock_follower.files import resource
 from flock_follower.nodes.support.runtime import FlockNode
 

@@ -168,6 +168,17 @@ def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None
     assert desk.end() == ['disengage']  # the landing goes on
 
 
+def test_in_the_air_with_a_finding_of_check_it_only_lands_or_hands_over() -> None:
+    """A second `follow` in flight had ended at the findings, without the key that lands."""
+    desk = Desk(AIR, HOVER, False)
+    desk.flight = Flight(desk.now, ready=False)
+    assert desk.report(AIR, HOVER).startswith('not ready to fly, but in the air: press l')
+    assert desk.press('atoe') == [] and desk.press('l') == ['disengage', 'land']
+    desk.flight = Flight(desk.now, ready=False)
+    desk.report(AIR, 'ACTIVE', True)
+    assert desk.end() == ['disengage', 'hand over']
+
+
 def test_a_missing_node_ends_it_and_without_the_autopilot_nothing_is_due() -> None:
     desk = Desk()
     assert desk.report(AIR, 'NO_AUTOPILOT: lost, ACTIVE before') == ''

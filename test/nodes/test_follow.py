@@ -29,6 +29,8 @@ import pytest
 
 from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import claim_domain, free_udp_port, private_environment, Processes
+from flock_follower import follow
+from flock_follower.checks.observations import NodeStatus, Observations
 
 pytestmark = pytest.mark.slow
 DEADLINE = 60.0  # s for what takes a few
@@ -85,3 +87,17 @@ def test_a_flight_by_keys_that_a_closed_terminal_ends(desk: Processes) -> None:
     assert flight.process.wait(DEADLINE) != 0
     desk.wait_for_log('mavlink_bridge', 'state: INACTIVE: given back (hold requested)')
     desk.wait_for_log('planner', 'disengaged: no more commands')
+
+
+@pytest.mark.parametrize(('flying', 'arguments', 'flown'), [
+    ('True', [], [('', True, False)]), ('False', [], []), ('', [], []), ('True', ['--yes'], [])])
+def test_findings_end_it_unless_the_vehicle_is_in_the_air(
+        monkeypatch: pytest.MonkeyPatch, flying: str, arguments: list[str],
+        flown: list[tuple[str, bool, bool]]) -> None:
+    from flock_follower.nodes import observer, pilot
+    flights: list[tuple[str, bool, bool]] = []
+    seen = Observations(statuses={'mavlink_bridge': NodeStatus(0, '', {'flying': flying})})
+    monkeypatch.setattr(observer, 'observe', lambda *_: seen)
+    monkeypatch.setattr(pilot, 'fly', lambda *given: flights.append(given) or 0)
+    assert follow.main(arguments) == (0 if flown else 1)
+    assert flights == flown

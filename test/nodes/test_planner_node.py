@@ -21,7 +21,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from driven import Driven, overrides, START
+from driven import Driven, overrides, START, to_odometry
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import MOTION_TOPIC, RELATIVE, stamp_to_nanoseconds, to_array
 from flock_follower.nodes.planner import Planner
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 
 STEP = 20_000_000  # ns
 AHEAD = (2.0, 0.0, 2.0)  # m: where the leader is

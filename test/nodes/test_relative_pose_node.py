@@ -22,7 +22,7 @@ import re
 from types import SimpleNamespace
 from typing import Any
 
-from driven import Driven, overrides, START
+from driven import Driven, overrides, START, to_odometry
 from geometry_msgs.msg import TransformStamped
 from marker_images import make_camera, render
 import numpy as np
@@ -46,7 +46,7 @@ from flock_follower.messages import (
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
 

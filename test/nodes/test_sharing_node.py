@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import math
 
-from driven import Driven, overrides
+from driven import Driven, overrides, to_odometry
 import numpy as np
 import pytest
 
@@ -27,7 +27,7 @@ from flock_follower.flock.alignment import turned
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.messages import to_array
 from flock_follower.nodes.flock import SHARED_TOPIC, SharingNode
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 
 STEP = 50_000_000  # ns
 #: How the odometry of each is turned, rad, and where it begins, m.

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from driven import Driven, overrides, START
+from driven import Driven, overrides, START, to_odometry
 from hypothesis import given, strategies
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -30,7 +30,7 @@ from visualization_msgs.msg import Marker
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_to_matrix
 from flock_follower.messages import Command, to_array, trajectory
-from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.visualizer import (
     ACCELERATION_SCALE,
     COMMAND,

@@ -24,7 +24,7 @@ import pytest
 from flock_follower.bags.message_types import empty, typestore
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.messages import from_odometry, ODOMETRY, odometry
-from flock_follower.odometry.cdr import read_odometry
+from flock_follower.odometry.reader import read_odometry
 
 STAMP = 1_700_000_000_123_456_789  # ns
 

@@ -33,7 +33,7 @@ from flock_follower.parameters.files import (
     TABLE,
     unheeded,
 )
-from flock_follower.parameters.planner_table import build
+from flock_follower.parameters.tables import planner_params
 from flock_follower.perception import markers as neighbors
 from flock_follower.planner.params import Member, RADIUS, ROLES
 
@@ -158,15 +158,15 @@ def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Pa
     path = tmp_path / 'neighbors.yaml'
     path.write_text(yaml.safe_dump(document))
     values = parse_parameters(of('/**', neighbors_file=str(path), radius=0.2), TABLE)['planner']
-    params = build(values)
+    params = planner_params(values)
     assert params.vehicles == {'leader': Member(), 'tower': Member('avoid', 0.5)}
     assert params.radius == 0.2
-    assert build(values, 'tower').vehicles == {'leader': Member()}  # all but oneself
+    assert planner_params(values, 'tower').vehicles == {'leader': Member()}  # all but oneself
     path.unlink()  # a parameter that is set in flight does not read it again
-    assert build({**values, 'v_max': 0.3}).vehicles == params.vehicles
-    assert build({**values, 'neighbors_file': ''}).vehicles == {}
+    assert planner_params({**values, 'v_max': 0.3}).vehicles == params.vehicles
+    assert planner_params({**values, 'neighbors_file': ''}).vehicles == {}
     with pytest.raises(FileNotFoundError):
-        build({**values, 'neighbors_file': '/nowhere.yaml'})
+        planner_params({**values, 'neighbors_file': '/nowhere.yaml'})
 
 
 def test_planner_and_neighbours_file_know_the_same_roles_and_radii() -> None:

@@ -12,18 +12,70 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The tables of the black box and of the bridge."""
+"""The tables of the nodes: one camera or several, the folder of the black box, the gate."""
 
 from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from flock_follower.files import resource
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.parameters import black_box_table, mavlink_bridge_table
+from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.parameters.spec import check_values
+from flock_follower.parameters.tables import (
+    BLACK_BOX,
+    cameras,
+    MAVLINK_BRIDGE,
+    planner_params,
+    recordings_folder,
+    tracker,
+)
+
+BUILT = {'relative_pose': tracker, 'planner': planner_params}
+
+
+def values(**parameters: Any) -> dict[str, dict[str, Any]]:
+    return parse_parameters({'/**': {'ros__parameters': parameters}}, TABLE)
+
+
+def two(**left: Any) -> dict[str, Any]:
+    return {'cameras': ['front', 'left'],
+            'camera': {'left': {'rpy': [0.0, 0.0, 1.0], **left}}}
+
+
+def test_one_camera_needs_no_name() -> None:
+    for node in BUILT:
+        (one,) = cameras(values(camera_rpy=[0.0, 0.1, 0.0])[node])
+        assert (one.name, one.image, one.camera_info) == ('', 'image_raw', 'camera_info')
+        assert one.rpy == [0.0, 0.1, 0.0]
+
+
+def test_several_have_parameters_of_their_own_in_both_nodes() -> None:
+    reported = values(**two(image='/left/mono', time_offset=0.01))
+    for node in BUILT:
+        front, left = cameras(reported[node])
+        assert (front.name, front.image, front.camera_info) == (
+            'front', 'front/image_raw', 'front/camera_info')
+        assert (left.image, left.images('compressed')) == ('/left/mono', '/left/mono/compressed')
+        assert (left.rpy, left.position, left.time_offset) == (
+            [0.0, 0.0, 1.0], [0.1, 0.0, 0.0], 0.01)
+    mounted = tracker(reported['relative_pose']).cameras
+    assert list(mounted) == ['front', 'left']
+    assert mounted['left'].time_offset.applied == 0.01
+    # What it looks at, and the right of its image, are so on the body.
+    assert mounted['left'].T_body_camera.rotation[:, 2] == pytest.approx(
+        [0.5403, 0.8415, 0.0], abs=1e-4)
+
+
+def test_the_example_is_taken_and_holds_all_that_a_camera_has() -> None:
+    reported = read_parameters(resource('config/two_cameras.yaml'), TABLE)
+    for node, build in BUILT.items():
+        build(reported[node])
+        assert [camera.name for camera in cameras(reported[node])] == ['front', 'left']
 
 
 @pytest.mark.parametrize(('folder', 'home', 'namespace', 'expected'), [
@@ -32,12 +84,11 @@ from flock_follower.parameters.spec import check_values
     ('~/mine', '/ros', '/drone1', Path.home() / 'mine')])
 def test_recordings_go_to_the_given_folder_or_that_of_ros(
         folder: str, home: str, namespace: str, expected: Path) -> None:
-    values = black_box_table.build(
-        check_values(black_box_table.SPECS, {'record_folder': folder}))
-    assert black_box_table.folder(values, home, namespace) == expected
+    given = check_values(BLACK_BOX, {'record_folder': folder})
+    assert recordings_folder(given, home, namespace) == expected
 
 
 def test_constants_of_the_gate_are_no_parameters() -> None:
     missing = {field.name for field in fields(GateLimits)} - {
-        spec.name for spec in mavlink_bridge_table.SPECS}
+        spec.name for spec in MAVLINK_BRIDGE}
     assert missing == {'brake_time', 'speed_horizon', 'blind_timeout'}

@@ -41,9 +41,8 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker
+from flock_follower.perception.markers import MarkedNeighbor, Marker, marker_corners
 from flock_follower.perception.measurement import (
     choose,
     Hypothesis,

@@ -35,9 +35,8 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import decode_compressed, GrayImage
-from flock_follower.perception.markers import parse
+from flock_follower.perception.markers import marker_corners, parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'real'

@@ -32,8 +32,8 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker

@@ -33,8 +33,8 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.tracker import camera_mounting, Sighting
 
 pytestmark = pytest.mark.slow

@@ -27,9 +27,8 @@ import numpy as np
 import pytest
 
 from flock_follower import check
-from flock_follower.bags.description import MARK
-from flock_follower.check import main
-from flock_follower.checks.bug_report import newest_recording
+from flock_follower.bags.mcap_file import MARK
+from flock_follower.check import main, newest_recording
 from flock_follower.checks.observations import NodeStatus, Observations
 from flock_follower.files import resource
 
@@ -109,7 +108,7 @@ def lost(message: Any) -> None:
 FAULTS: dict[str, tuple[Change, tuple[str, str, str, str]]] = {
     'no images': (of(IMAGES, unreadable), ('error', 'images', '', 'mono8')),
     'a lost source': (of('/odom', lost), (
-        'error', 'odom', 'say nothing: quaternion = 0', 'initialised'))}
+        'error', 'odom', 'are invalid: quaternion = 0', 'initialised'))}
 
 
 def assert_told(found: dict[str, Any], row: tuple[str, str, str, str]) -> None:

@@ -74,10 +74,10 @@ def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
         code, found = check(processes.environment, '--seconds', '4')
         errors = amiss(found, 'error')
         assert set(errors) <= OF_THE_MACHINE and code == bool(errors), found
-        assert set(amiss(found, 'warning')) <= OF_THE_MACHINE, found.get('mavlink_bridge says')
+        assert set(amiss(found, 'warning')) <= OF_THE_MACHINE, found.get('mavlink_bridge status')
         measured = {what: findings[0]['measured'] for what, findings in found.items()}
         assert measured['autopilot'].startswith('PX4')
-        assert measured['ready for offboard'] == 'nothing speaks against it'
+        assert measured['ready for offboard'] == 'no obstacle'
         assert 'px wide, in 100%' in measured['marker']
 
 
@@ -96,8 +96,8 @@ def test_nodes_that_are_started_wrongly_are_reported_with_the_remedy(tmp_path: P
     for what, measured, advice in (
             ('nodes', 'twice: planner', 'end one of each'),
             ('command/trajectory', '2 publishers on /command/trajectory: /planner', 'end'),
-            ('clock', 'use_sim_time is true in mavlink_bridge, but nobody', 'without'),
-            ('odom', 'nobody publishes /odom', 'start its driver')):
+            ('clock', 'use_sim_time is true in mavlink_bridge, but no node', 'without'),
+            ('odom', 'no node publishes /odom', 'start its driver')):
         assert any(measured in f['measured'] and advice in f['advice'] and f['level'] == 'error'
                    for f in found.get(what, [])), (what, found.get(what, sorted(found)))
 

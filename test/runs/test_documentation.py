@@ -33,7 +33,7 @@ ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
 @pytest.mark.ros
 def test_the_parameter_page_is_that_of_the_nodes():
-    from flock_desk.parameter_tables import markdown
+    from flock_desk.program import markdown
     assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown()
 
 

@@ -39,37 +39,44 @@ from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
-from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
+from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
 from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.telemetry import Battery, estimate
-from flock_follower.messages import from_state, MOTION_TOPIC, OdometryState, set_vector
+from flock_follower.messages import (
+    from_state,
+    MOTION_TOPIC,
+    OdometryState,
+    set_vector,
+    to_nanoseconds,
+)
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
-STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
+STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so the state is repeated
 PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
-HEIGHTS_DIFFER = 1.0  # m between barometer and estimate that are reported
-#: Limits that planner and bridge are to have alike.
+HEIGHTS_DIFFER = 1.0  # m: a larger difference of barometer and estimate is reported
+#: Limits that should be equal in planner and bridge.
 LIMITS = ('a_max', 'v_max')
 
 
 class BridgeReport:
-    """Publishes and reports what the bridge does."""
+    """Publishes the data of the bridge, and reports its problems."""
 
     def __init__(self, node: FlockNode, bridge: Bridge, publisher: PublisherThread) -> None:
         self._node, self._diagnostics = node, node.diagnostics
         self._bridge, self._publisher = bridge, publisher
         self._start = time.monotonic()
         self.place: tuple[OdometryState, float] | None = None
-        """The newest odometry, and when it came by the monotonic clock, s."""
+        """The newest odometry, and its time of arrival on the monotonic clock, s."""
         self.planner = RemoteParameters(node, 'planner')
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._last: Cycle | None = None
@@ -83,9 +90,8 @@ class BridgeReport:
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
             bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = node.create_publisher(String, 'mavlink_bridge/state', LATCHED_QOS)
-        self._armed_at = node.create_publisher(
-            PointStamped, 'mavlink_bridge/armed_at', LATCHED_QOS)
+        self._states = node.create_publisher(String, modes.TOPIC, LATCHED_QOS)
+        self._armed_at = node.create_publisher(PointStamped, modes.ARMED_AT_TOPIC, LATCHED_QOS)
         node.create_timer(PLANNER_PERIOD, self.planner.ask)
         self._diagnostics.sources += [
             self._vehicle_values, self._gate_values, self._link_values]
@@ -123,13 +129,13 @@ class BridgeReport:
         self._announce(now)
 
     def on_messages(self, messages: list[Any], now: float) -> None:
-        """Publish what has just arrived from the autopilot."""
+        """Publish the data of messages that have just arrived from the autopilot."""
         self._announce(now)
         bridge, telemetry = self._bridge, self._bridge.telemetry
         position, attitude, battery = (
             telemetry.local_position, telemetry.attitude, telemetry.battery)
         if position is not None and position.time == now and attitude is not None:
-            age = bridge.housekeeping.timesync.age(position.time_boot_ms, round(now * 1e9))
+            age = bridge.housekeeping.timesync.age(position.time_boot_ms, to_nanoseconds(now))
             if distrusted := bridge.distrusted(now):
                 self.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
@@ -171,7 +177,7 @@ class BridgeReport:
         self._publish(self._odometry, lambda: self._odometry_message(state, valid))
 
     def _publish(self, publisher: Publisher, make: Callable[[], Any]) -> None:
-        """Have the publisher thread make a message and publish it; odometry if subscribed."""
+        """Make a message in the publisher thread and publish it; odometry if subscribed."""
         def publish() -> None:
             if self._node.context.ok() and (
                     publisher is not self._odometry or publisher.get_subscription_count()):
@@ -187,9 +193,9 @@ class BridgeReport:
         self._node.get_logger().warning(text)
 
     def _odometry_message(self, state: OdometryState, valid: float) -> Any:
-        """Return the message of a state of a time, s, on the monotonic clock."""
+        """Return the message of a state that was valid at a time, s, on the monotonic clock."""
         system, monotonic = self._node.read_clocks()
-        waited = max(0, round((monotonic - valid) * 1e9))
+        waited = max(0, to_nanoseconds(monotonic - valid))
         return from_state(make, state._replace(stamp=max(0, system - waited)))
 
     def _battery_message(self, battery: Battery) -> BatteryState:
@@ -204,7 +210,7 @@ class BridgeReport:
     # The executor's thread.
 
     def _collect(self, now: float) -> Problem | None:
-        """Run the events; log once which parameters differ from the recommended ones."""
+        """Run the events; log once each parameter that differs from its recommended value."""
         while self._events:
             self._events.popleft()()
         result = self._bridge.housekeeping.parameters.result()
@@ -220,7 +226,7 @@ class BridgeReport:
         return None
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
-        """Return the state of autopilot and flight; why offboard, and arming, would be refused."""
+        """Return the state of autopilot and flight, and reasons against offboard and arming."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
         status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
         result = bridge.housekeeping.parameters.result()
@@ -318,15 +324,15 @@ class BridgeReport:
                 abs(height - estimate) <= HEIGHTS_DIFFER):
             return ''
         return (f'the autopilot estimates its height above home as {estimate:.1f} m, the '
-                f'barometer says {height:.1f} m')
+                f'barometer measures {height:.1f} m')
 
     def _battery_unknown(self, now: float) -> str:
         status = self._bridge.status(now)
-        return 'the autopilot does not know its battery: battery_low cannot act' if (
+        return 'the autopilot reports no battery charge: battery_low cannot act' if (
             status and status.armed and self._bridge.end.battery_unknown(now)) else ''
 
     def _planner_differs(self, now: float) -> str:
-        """Return which limits of the planner are others, or ''."""
+        """Return the limits that differ from those of the planner as text, or ''."""
         values, limits = self.planner.values or {}, self._bridge.gate.limits
         return '; '.join(
             f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
@@ -337,7 +343,7 @@ class BridgeReport:
         forwarder = self._bridge.forwarder
         silence = 0.0 if forwarder is None else forwarder.silence(now)
         return f'forward_odometry: none sent for {silence:.1f} s' if (
-            silence > LONGEST_GAP and self._bridge.alive(now)) else ''
+            silence > FORWARDING_GAP and self._bridge.alive(now)) else ''
 
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:

@@ -21,10 +21,8 @@ from importlib import import_module
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike
 
-from flock_follower.messages import NANOSECONDS, odometry, stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS
 
 
 @cache
@@ -53,13 +51,3 @@ def make(msgtype: str) -> Any:
 def nanoseconds_to_stamp(nanoseconds: int) -> Time:
     """Return a stamp message of integer nanoseconds."""
     return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
-
-
-def to_odometry(stamp: Time, frame: str, child: str, position: ArrayLike, quaternion: ArrayLike,
-                velocity_child: ArrayLike, angular_velocity_child: ArrayLike = (0.0, 0.0, 0.0),
-                pose_covariance: Any = None, twist_covariance: Any = None) -> Odometry:
-    """Return an Odometry message, see ``messages.odometry``."""
-    message: Odometry = odometry(
-        make, stamp_to_nanoseconds(stamp), frame, child, position, quaternion, velocity_child,
-        angular_velocity_child, pose_covariance, twist_covariance)
-    return message

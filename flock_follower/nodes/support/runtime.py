@@ -47,7 +47,7 @@ from rclpy.timer import Timer
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
-from flock_follower.odometry.cdr import read_odometry
+from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.files import files_in, shared, unheeded
 from flock_follower.parameters.spec import Spec
 
