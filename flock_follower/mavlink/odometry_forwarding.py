@@ -40,6 +40,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
+from flock_follower.mavlink.velocity_check import plausible_velocity
 from flock_follower.messages import (
     FUTURE_TOLERANCE,
     ODOMETRY_STD,
@@ -83,6 +84,8 @@ class OdometryForwarder:
             return 'too old to forward'
         if time - now > FUTURE_TOLERANCE:
             return 'from the future, not forwarded'
+        if plausible_velocity(state.velocity) is None:
+            return 'not plausible, not forwarded'
         last, self._last = self._last, (state, time)
         if last is not None and jumped(*last, state, time):
             self.reset_counter = (self.reset_counter + 1) % 256

@@ -105,7 +105,7 @@ def test_jumps_raise_the_reset_counter_of_every_message_after():
     assert counters == [0, 0, 1, 1, 2] and forwarder.counters['jumps'] == 2
 
 
-def test_what_is_too_old_or_from_the_future_is_not_sent_and_counted():
+def test_odometry_too_old_from_the_future_or_too_fast_is_not_sent_and_counted():
     forwarder = OdometryForwarder(rate=30.0)
     assert forwarder.silence(1.0) == math.inf
     for sent in (True, False):
@@ -113,6 +113,8 @@ def test_what_is_too_old_or_from_the_future_is_not_sent_and_counted():
     assert forwarder.silence(1.5) == 0.5 and forwarder.counters == {'sent': 1, 'not sent': 1}
     assert forwarder.take(*sample(10.0), 10.31) == 'too old to forward'
     assert forwarder.take(*sample(10.0), 9.8) == 'from the future, not forwarded'
+    fast = sample(10.0, velocity=(101.0, 0.0, 0.0))
+    assert forwarder.take(*fast, 10.0) == 'not plausible, not forwarded'
     assert forwarder.messages(PX4, 9.8) == []
     for time in (20.0, 20.1, 20.2):
         forwarder.take(*sample(time, (0.4 * (time - 20.0), 0.0, 0.0)), time)
