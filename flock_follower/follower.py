@@ -33,7 +33,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
@@ -134,6 +135,10 @@ class Listener:
 LONGEST_SILENCE = 10 * NANOSECONDS
 
 
+#: One camera that looks ahead, and whose images are not rectified.
+AHEAD: Final = MappingProxyType({'': ((0.0, 0.0, 0.0), False)})
+
+
 class Follower:
     """
     Perception, planner and setpoint control on one clock; every time is in ns.
@@ -145,8 +150,8 @@ class Follower:
     :param perceiver: None if neighbors come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: time from the planner's tick to the next cycle, s.
-    :param camera_rpy: roll, pitch and yaw of the camera on the body, rad, for the planner; of
-        several cameras, each by its name.
+    :param cameras: for the planner, of each camera by its name, '' of a single one: roll, pitch
+        and yaw on the body, rad, and whether its images are rectified.
     :param sharing: messages to and from other followers; None without them.
     :param autopilot_velocity: whether odometry replaces the autopilot's own estimate, too.
     :param cpu_time: a clock of CPU time, s; only the reported times depend on it.
@@ -157,13 +162,13 @@ class Follower:
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
                  sharing: Sharing | None = None,
-                 camera_rpy: Sequence[float] | Mapping[str, Sequence[float]] = (0.0, 0.0, 0.0),
+                 cameras: Mapping[str, tuple[Sequence[float], bool]] = AHEAD,
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.sharing = sharing
         self._control = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
-        self._rpy = camera_rpy if isinstance(camera_rpy, Mapping) else {'': camera_rpy}
+        self._cameras = cameras
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -261,7 +266,8 @@ class Follower:
         """
         self.advance(time)
         if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
-            self.planner.take_camera_info(message, self._rpy[camera], camera)
+            rpy, rectified = self._cameras[camera]
+            self.planner.take_camera_info(message, rpy, camera, rectified)
         self._process_due()
 
     def image(self, time: int, message: Any, stamp: int, camera: str = '') -> None:

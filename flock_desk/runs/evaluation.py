@@ -161,7 +161,8 @@ class Evaluation(Listener):
                 filled(GateLimits(), bridge), bridge['velocity_source']),
             self, empty, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
-            camera_rpy={camera.name: camera.rpy for camera in cameras(values['planner'])},
+            cameras={camera.name: (camera.rpy, camera.rectified)
+                     for camera in cameras(values['planner'])},
             cpu_time=time.process_time)
         self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
         self.own: OwnMotion | None = None

@@ -131,7 +131,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
     """Report parameters of odometry and cameras that differ between our nodes."""
-    shared = (*COMMON, 'camera_rpy')
+    shared = (*COMMON, 'camera_rpy', 'rectified')
     for name in sorted({name for own in seen.parameters.values() for name in own
                         if name in shared or name.startswith('camera.')}):
         values = {node: own[name] for node, own in seen.parameters.items() if name in own}

@@ -85,7 +85,7 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
          'another resolution', calibrate),
         (straight and np.any(camera.distortion), ERROR,
          f'{measured}, distorted, but the topic is marked as rectified',
-         'start relative_pose with rectified:=true'),
+         'start relative_pose and planner with rectified:=true'),
         (True, OK, measured, ''))
 
 

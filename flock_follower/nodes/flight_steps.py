@@ -121,7 +121,8 @@ class Flight:
 
     :param confirm: whether a key confirms each step. If not, each step is requested once, and a
         refusal ends the flight.
-    :param ready: False if ``check`` forbids a flight: then it only lands or hands over.
+    :param ready: False if ``check`` forbids a flight: then it only lands or hands over, for which
+        the bridge alone is needed.
     """
 
     def __init__(self, now: float, confirm: bool = True, ready: bool = True) -> None:
@@ -141,7 +142,8 @@ class Flight:
         if self._pending or self._ending is not None:
             return []
         due = reports.due() if self._ready else ''
-        missing = reports.missing(self._answered + SETTLING)
+        missing = [node for node in reports.missing(self._answered + SETTLING)
+                   if self._ready or node == 'mavlink_bridge']
         if self._landing:
             if 'mavlink_bridge' not in missing and (
                     reports.value('mavlink_bridge', 'armed') == 'False'):

@@ -87,7 +87,7 @@ class Planner(FlockNode):
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
         configured = cameras(values)
-        self._rpy = {camera.name: camera.rpy for camera in configured}
+        self._cameras = {camera.name: camera for camera in configured}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._decision = Decision(State.IDLE, reason='not engaged')
         self._reported: tuple[State, bool] | None = None
@@ -175,10 +175,12 @@ class Planner(FlockNode):
         return time.monotonic() - self._bridge_received
 
     def _take_camera_info(self, message: CameraInfo, _: int, camera: str) -> None:
-        calibration = message.width, message.height, tuple(message.k), message.distortion_model
+        calibration = (message.width, message.height, tuple(message.k), tuple(message.p),
+                       message.distortion_model)
         if calibration != self._calibrations.get(camera):
             self._calibrations[camera] = calibration
-            self._loop.take_camera_info(message, self._rpy[camera], camera)
+            values = self._cameras[camera]
+            self._loop.take_camera_info(message, values.rpy, camera, values.rectified)
 
     def _take_armed_at(self, message: PointStamped) -> None:
         if math.isfinite(message.point.z):

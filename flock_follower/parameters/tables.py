@@ -116,6 +116,8 @@ PLANNER = [
     Spec('camera_rpy', list(AHEAD),
          'roll, pitch, yaw of the camera on the body, the same as for relative_pose',
          Range(unit='rad'), fixed_length=True),
+    Spec('rectified', False,
+         'the images are undistorted already, the same as for relative_pose'),
     *CAMERA_SPECS,
     *specs_of(SourceParams(), 'odom_'),
 ]

@@ -162,14 +162,16 @@ class PlannerLoop:
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append((neighbor, received))
 
-    def take_camera_info(self, info: Any, rpy: ArrayLike, camera: str = '') -> None:
+    def take_camera_info(self, info: Any, rpy: ArrayLike, camera: str = '',
+                         rectified: bool = False) -> None:
         """
         Take a CameraInfo of a camera, by its name if there are several.
 
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
+        :param rectified: whether its images are undistorted already.
         :raises ValueError: if that camera cannot keep a neighbor in sight.
         """
-        self._fields[camera] = FieldOfView.of_camera(info, rpy, bool(camera))
+        self._fields[camera] = FieldOfView.of_camera(info, rpy, bool(camera), rectified)
         self.view = tuple(self._fields.values())
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:

@@ -53,26 +53,29 @@ class FieldOfView(NamedTuple):
     """Anticlockwise angle of its axis, if it is one of several, rad; the others count from it."""
 
     @classmethod
-    def of_camera(cls, info: Any, rpy: ArrayLike, several: bool = False) -> FieldOfView:
+    def of_camera(cls, info: Any, rpy: ArrayLike, several: bool = False,
+                  rectified: bool = False) -> FieldOfView:
         """
         Return the field of view of a camera.
 
         :param info: its CameraInfo.
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
         :param several: it is one of several, which may look to any side.
-        :raises ValueError: if it looks neither ahead nor to a side, or K is invalid.
+        :param rectified: its images are undistorted already: P is that of a pinhole camera.
+        :raises ValueError: if it looks neither ahead nor to a side, or K or P is invalid.
         """
         angles, width, height = np.asarray(rpy, dtype=float).tolist(), info.width, info.height
         mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
         heading = math.atan2(mounting[1, 0], mounting[0, 0]) if several else 0.0
-        fx, _, cx, _, fy, cy, *_ = np.asarray(info.k, dtype=float).ravel().tolist()
+        matrix = np.reshape(info.p, (3, 4)) if rectified else np.reshape(info.k, (3, 3))
+        (fx, _, cx, *_), (_, fy, cy, *_) = matrix[:2].tolist()
         if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
             raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
                              'must all be above 0')
         # The middles of the four sides of the image: forward, left, up of the camera.
         sides = np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
                           [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
-        fisheye = info.distortion_model == 'equidistant'
+        fisheye = info.distortion_model == 'equidistant' and not rectified
         if fisheye:
             sides[:, 1:] = np.tan(np.clip(sides[:, 1:], -WIDEST, WIDEST))
         ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting

@@ -80,6 +80,10 @@ def test_a_fisheye_sees_as_far_as_its_model_says(several: bool) -> None:
     assert (lowered.up, lowered.down) == pytest.approx((240.0 / 190.0 - 0.2, WIDEST))
     # A leader at 60 degrees that is not found is occluded: it has not left the image.
     assert occlusion(None, leader(0.7, 1.0, 1.7), ME, frames(0.8, 0.9, 1.0), (lowered,), 0.0)
+    undistorted = info(wide, 'equidistant')
+    undistorted.p = [300.0, 0.0, 320.0, 0.0, 0.0, 300.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    pinhole = FieldOfView.of_camera(undistorted, [0.0, 0.0, 0.0], several, True)
+    assert (pinhole.left, pinhole.up) == pytest.approx((math.atan(32 / 30), math.atan(24 / 30)))
 
 
 def test_a_camera_that_looks_down_sees_more_below() -> None:
