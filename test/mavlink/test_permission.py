@@ -24,6 +24,7 @@ import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import (
+    FELL_SILENT,
     LONGEST_SILENCE,
     NOT_REQUESTED,
     Permission,
@@ -106,6 +107,20 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
     ((ASKED, seen(OURS), seen(PILOT), ('requested', 3.0)), False)])
 def test_it_flies_from_when_the_mode_is_seen_until_it_streams_no_more(events, flies):
     assert after(*events).flies is flies
+
+
+@pytest.mark.parametrize('received', [0.5, 1.0])
+def test_a_heartbeat_from_before_the_request_has_no_effect(received):
+    assert after(ASKED, seen(OURS, received)) == after(ASKED, seen(HOLD, received)) == after(ASKED)
+
+
+def test_a_refused_request_ends_and_without_a_velocity_the_stream_falls_silent():
+    assert after(ASKED, ('failed', 'refused')).announced() == 'INACTIVE: refused'
+    silent = after(ASKED, seen(OURS), ('blinded', 'no velocity'))
+    assert silent.announced() == f'INACTIVE: {FELL_SILENT}: no velocity'
+    for idle in (after(), after(ASKED, seen(OURS), seen(PILOT))):
+        assert next_permission(idle, ('failed', 'refused')) is idle
+        assert next_permission(idle, ('blinded', 'no velocity')) is idle
 
 
 def test_a_late_refusal_ends_nothing_that_the_vehicle_obeys_already():
