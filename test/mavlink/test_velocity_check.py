@@ -149,7 +149,7 @@ def test_what_disagreed_for_long_does_so_until_it_no_longer_flies(samples, latch
     comparison, now = compared([0.7] * samples)
     assert (comparison.disagreeing_for(now) > LATCH_TIME) == latched
     for _ in range(100):
-        now += 0.05
+        now += 0.07
         comparison.take(np.zeros(3), 0.25, True, now)
     comparison.take(None, 0.25, True, now)  # nothing to compare either
     assert (comparison.disagreeing_for(now) > 5.0) == latched
