@@ -104,7 +104,7 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
         spans = np.ptp(x, axis=(0, 1))
         axis.margins(0.12)
         if spans.max() > SLIM * spans.min():  # at one scale the panel would be empty
-            axis.text(0.98, 0.02, 'scales differ', fontsize=7, ha='right',
+            axis.text(1.03, 0.5, 'scales differ', fontsize=7, rotation=90, va='center',
                       transform=axis.transAxes)
         else:
             axis.set_aspect('equal', adjustable='datalim')
