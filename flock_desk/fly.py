@@ -45,7 +45,8 @@ from flock_desk.runs.console import guarded, within
 from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
 from flock_desk.runs.judge import FigureBound
-from flock_desk.runs.plots import moving_picture, scenario_chapters
+from flock_desk.runs.moving_picture import moving_picture
+from flock_desk.runs.plots import scenario_chapters
 from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import (

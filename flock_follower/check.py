@@ -54,7 +54,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag, judge_all
-from flock_follower.checks.topic_names import full_name, parse_remaps
+from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.files import resource, whole_file
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
 from flock_follower.parameters.tables import recordings_folder
@@ -137,7 +137,7 @@ def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
 def _report(options: argparse.Namespace, seen: Observations,
             findings: Sequence[Finding]) -> None:
     """Write the file for a bug report, with the newest recording, and print its size."""
-    recorder = seen.statuses.get(full_name('black_box', options.namespace).lstrip('/'))
+    recorder = seen.status('black_box')
     running = Path(recorder.values.get('recording', '')) if recorder else Path()
     home = os.environ.get('ROS_HOME', '')
     recording = options.bag or (running if running.name and running.exists() else newest_recording(

@@ -34,7 +34,6 @@ import sys
 from flock_follower.check import SECONDS, table
 from flock_follower.checks.findings import ready
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.topic_names import full_name
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -63,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> int:
     findings = judge_all(seen)
     print(table(seen, findings))
     flyable = ready(findings)
-    bridge = seen.statuses.get(full_name('mavlink_bridge', options.namespace).lstrip('/'))
+    bridge = seen.status('mavlink_bridge')
     flying = bridge is not None and bridge.values.get('flying') == 'True'
     if not flyable and (options.yes or not flying):
         return 1

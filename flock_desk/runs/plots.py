@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""The pictures of a flight: those of the reports, and a moving one."""
+"""The pictures of the reports: flights, errors and their deviations, columns of followers."""
 
 from __future__ import annotations
 
@@ -23,19 +23,15 @@ import io
 import cv2
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
-from PIL import Image
 
-from flock_desk.camera.renderer import T_BODY_OPTICAL
-from flock_desk.closed_loop.real_time_flight import real_time_camera
 from flock_desk.runs.evaluation import Evaluation
 from flock_desk.runs.frame_errors import Table
 from flock_desk.runs.record import Flight, LiveFlight, REPLAYED
 from flock_desk.runs.report import Chapter, Illustration
 from flock_desk.runs.summary import consistency, norms, sight_figures
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Array
 
 matplotlib.use('Agg')
 matplotlib.rcParams.update({
@@ -51,8 +47,6 @@ LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are
 PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
 NARROWEST = 0.35  # of its length, of a map
 TIME = 'time [s]'
-#: Of the moving picture: pictures per s, and s of the flight that are shown.
-PICTURE_RATE, LONGEST_MOVING = 8.0, 15.0
 
 
 def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
@@ -254,44 +248,3 @@ def _illustration(figure: Figure, description: str) -> Illustration:
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png')
     return Illustration(buffer.getvalue(), description)
-
-
-def moving_picture(flight: LiveFlight) -> bytes:
-    """
-    Return the first seconds of a flight as an animated WebP.
-
-    The camera's images are rendered again from the recorded true poses.
-    """
-    times, log = flight.table['time'], flight.log
-    ticks = np.arange(times[0], min(float(times[-1]), LONGEST_MOVING), 1.0 / PICTURE_RATE)
-    camera = real_time_camera(0, flight.scenario.prints)
-    figure = Figure(figsize=(9, 4.6), dpi=100, layout='constrained')
-    axes: dict[str, Axes] = figure.subplot_mosaic(
-        [['seen', 'above'], ['distance', 'distance']],
-        width_ratios=[1.2, 1.0], height_ratios=[1.9, 1.0])
-    shown = axes['seen'].imshow(np.zeros((camera.camera.height, camera.camera.width)),
-                                cmap='gray', vmin=0, vmax=255)
-    axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
-    draw_above(axes['above'], flight)
-    draw_distance(axes['distance'], flight)
-    axes['distance'].set(xlim=(0.0, ticks[-1]), xlabel=TIME)
-    now = axes['distance'].axvline(0.0, color='black', linewidth=1.2)
-    places = [(path, axes['above'].plot([], [], 'o', color=colour, markersize=9)[0])
-              for path, colour in zip(flight.paths.values(), (LEADER, FOLLOWER))]
-    canvas, pictures = FigureCanvasAgg(figure), []
-    for row in np.minimum(np.searchsorted(times, ticks), len(times) - 1):
-        follower, leader = (Transform.from_quaternion(
-            log[f'{name}_position'][row], log[f'{name}_quaternion'][row])
-            for name in ('follower', 'leader'))
-        visible = [leader] if flight.table['visible'][row] else []
-        shown.set_data(camera.image(int(row), [follower @ T_BODY_OPTICAL], visible))
-        for path, place in places:
-            place.set_data(path[row:row + 1, 0], path[row:row + 1, 1])
-        now.set_xdata([times[row]] * 2)
-        canvas.draw()
-        figure.set_layout_engine('none')  # as in the first picture: the axes stand still
-        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
-    buffer = io.BytesIO()
-    pictures[0].save(buffer, format='WEBP', save_all=True, append_images=pictures[1:],
-                     duration=round(1e3 / PICTURE_RATE), loop=0, quality=55, method=2)
-    return buffer.getvalue()

@@ -24,7 +24,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
+from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
@@ -178,6 +178,10 @@ class Observations:
     """Why a bag was never finished."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
+
+    def status(self, node: str) -> NodeStatus | None:
+        """Return the newest status of a node of ours, by its plain name, or None."""
+        return self.statuses.get(full_name(node, self.namespace).lstrip('/'))
 
     def topic(self, name: str) -> TopicSeen:
         """Return the observation of a topic of ours; an empty one if there is none."""

@@ -47,6 +47,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
 from flock_follower.parameters.files import COMMON
+from flock_follower.parameters.tables import ALONE
 
 #: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02
@@ -131,7 +132,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
     """Report parameters of odometry and cameras that differ between our nodes."""
-    shared = (*COMMON, 'camera_rpy', 'rectified')
+    shared = (*COMMON, *ALONE)
     for name in sorted({name for own in seen.parameters.values() for name in own
                         if name in shared or name.startswith('camera.')}):
         values = {node: own[name] for node, own in seen.parameters.items() if name in own}

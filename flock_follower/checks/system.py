@@ -125,10 +125,9 @@ def idle_share(before: str, after: str) -> float | None:
 def check_diagnostics(seen: Observations) -> Iterator[Finding]:
     """Report the status of our nodes and of the autopilot."""
     for node in OURS:
-        full = full_name(node, seen.namespace)
-        status = seen.statuses.get(full.lstrip('/'))
+        status = seen.status(node)
         if status is None:
-            if full in seen.nodes:
+            if full_name(node, seen.namespace) in seen.nodes:
                 yield Finding(UNMEASURED, f'{node} status', 'nothing received on /diagnostics',
                               'running')
             continue

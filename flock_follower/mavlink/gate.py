@@ -185,10 +185,9 @@ class Gate:
         :param position: of the same message (3,), m, and its standard deviation ``std``, m.
         """
         v, known = plausible_velocity(velocity), self._sources[source]
-        refused = first_reason(
-            (finite_vector(velocity) is None, 'not finite'), (v is None, 'too fast'),
-        ) or refusal(age, self.limits.odom_timeout)
-        if v is not None and not refused:
+        if v is None:
+            return 'not finite' if finite_vector(velocity) is None else 'too fast'
+        if not (refused := refusal(age, self.limits.odom_timeout)):
             known.velocity, known.velocity_time = v, now - max(age, 0.0)
             known.take_yaw(yaw, known.velocity_time)
             self.update_position(source, position, known.velocity_time, std)

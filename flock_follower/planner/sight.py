@@ -162,8 +162,7 @@ def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
     missed = sum(stamp > n.stamp + _SAME for stamp in frames)
     if before is None:
         offset = at(n, me.stamp).position - me.position
-        lost = missed >= IMAGES and visible(view, offset, me.yaw, forward,
-                                           OCCLUSION_MARGIN)
+        lost = missed >= IMAGES and visible(view, offset, me.yaw, forward, OCCLUSION_MARGIN)
         return Occlusion(n.stamp) if lost else None
     if missed >= IMAGES:
         return Occlusion(n.stamp)

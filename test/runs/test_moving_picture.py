@@ -23,7 +23,7 @@ import pytest
 pytest.importorskip('matplotlib')
 from PIL import Image
 
-from flock_desk.runs.plots import moving_picture
+from flock_desk.runs.moving_picture import moving_picture
 
 
 def test_it_has_eight_pictures_each_second_also_without_an_estimate():
