@@ -75,9 +75,9 @@ def test_the_newest_recording_is_the_one_of_the_largest_number(tmp_path: Path) -
 
 def test_a_report_of_a_running_system_holds_the_recording_of_its_black_box(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen = Observations(statuses={
-        'a/black_box': NodeStatus(0, '', {'recording': str(SAMPLE)})})
-    monkeypatch.setattr(check, '_observe', lambda options: (seen, []))
+    statuses = {'a/black_box': NodeStatus(0, '', {'recording': str(SAMPLE)})}
+    monkeypatch.setattr(check, '_observe', lambda options: (
+        Observations(namespace=options.namespace, statuses=statuses), []))
     monkeypatch.setenv('ROS_HOME', str(tmp_path))  # without a recording in the default folder
     for namespace, there in (('a', True), ('b', False)):
         main(['--report', str(tmp_path / namespace), '--namespace', namespace])
