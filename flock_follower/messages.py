@@ -48,7 +48,7 @@ RANGE = 'sensor_msgs/msg/Range'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: The names of further joints of a command, see :func:`trajectory`; both are on the wire.
-SEPARATION_JOINT, THRUST_BIAS_JOINT = 'separation', 'lift'
+SEPARATION_JOINT, ALTITUDE_JOINT = 'separation', 'altitude'
 #: Frame of the motion without odometry: axes ENU by the autopilot's attitude, height by its
 #: barometer. Horizontally only differences of positions, and of velocities, have a meaning.
 RELATIVE = 'flock_relative'
@@ -342,8 +342,8 @@ class Command(NamedTuple):
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
-    thrust_bias: float = 0.0
-    """The part of its vertical acceleration, m/s^2, that offsets a wrong hover thrust."""
+    altitude: float = math.nan
+    """The altitude that it leads to, m, in the frame ``frame``; NaN if it leads to none."""
     relative: bool = False
     """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
 
@@ -358,7 +358,7 @@ def trajectory(make: Make, command: Command) -> Any:
     Return a command as a MultiDOFJointTrajectory of one point.
 
     Position and velocity are NaN: they are not commanded. The acceleration of a joint 'separation'
-    is ``separation_axis``, that of a joint 'lift' is ``thrust_bias`` upwards. A receiver of only
+    is ``separation_axis``, the height of a joint 'altitude' is ``altitude``. A receiver of only
     the first joint ignores both.
     """
     message = make(TRAJECTORY)
@@ -367,15 +367,19 @@ def trajectory(make: Make, command: Command) -> Any:
     joints = {'base_link': command.acceleration}
     if command.separation_axis is not None:
         joints[SEPARATION_JOINT] = command.separation_axis
-    if command.thrust_bias:
-        joints[THRUST_BIAS_JOINT] = [0.0, 0.0, command.thrust_bias]
+    if math.isfinite(command.altitude):
+        joints[ALTITUDE_JOINT] = np.zeros(3)
     message.joint_names = list(joints)
-    transform, velocity = make('geometry_msgs/msg/Transform'), _twist(make, [math.nan] * 3)
-    set_vector(transform.translation, [math.nan] * 3)
-    set_quaternion(transform.rotation, quaternion_from_yaw(command.yaw))
+    velocity = _twist(make, [math.nan] * 3)
     velocity.angular.z = float(command.yaw_rate)
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
-    point.transforms, point.velocities = [transform] * len(joints), [velocity] * len(joints)
+    for name in joints:
+        transform = make('geometry_msgs/msg/Transform')
+        set_vector(transform.translation, [math.nan] * 2 + [
+            command.altitude if name == ALTITUDE_JOINT else math.nan])
+        set_quaternion(transform.rotation, quaternion_from_yaw(command.yaw))
+        point.transforms.append(transform)
+    point.velocities = [velocity] * len(joints)
     point.accelerations = [_twist(make, vector) for vector in joints.values()]
     set_stamp(point.time_from_start, command.ahead)
     message.points = [point]
@@ -406,12 +410,13 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     more = {name: to_array(beside.linear) for name, beside in zip(
         message.joint_names[1:], point.accelerations[1:])}
     separation_axis = _direction(more.get(SEPARATION_JOINT, np.zeros(3)))
-    thrust_bias = float(more.get(THRUST_BIAS_JOINT, np.zeros(3))[2])
+    heights = [float(beside.translation.z) for name, beside in zip(
+        message.joint_names[1:], point.transforms[1:]) if name == ALTITUDE_JOINT]
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, separation_axis, frame,
         read_stamp(message.header.stamp), read_stamp(point.time_from_start),
-        thrust_bias if math.isfinite(thrust_bias) else 0.0, frame == RELATIVE)
+        heights[0] if heights else math.nan, frame == RELATIVE)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -68,8 +68,10 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
+#: Largest error of the hover thrust that the gate offsets, m/s^2.
+THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.
-A_MAX = Range(0.1, 20.0, 'm/s^2')
+A_MAX = Range(1.5, 20.0, 'm/s^2')
 V_MAX = Range(0.05, 20.0, 'm/s')
 ODOM_TIMEOUT = Range(0.05, 1.0, 's')
 

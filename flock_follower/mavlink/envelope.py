@@ -116,7 +116,7 @@ class GateLimits(Checked):
                                                  DISAGREEMENT_LEAST)
 
 
-#: The share of ``a_max`` that a stop at a bound is planned with: the rest is for errors of thrust.
+#: The share of ``a_max`` that a stop at a bound is planned with; see ``_deceleration``.
 BRAKING_SHARE: Final[float] = 0.4
 #: Time from a decision to the commanded acceleration, s: attitude, sending, velocity.
 REACTION_TIME: Final[float] = 0.4
@@ -154,13 +154,12 @@ def approach_speed(distance: float, deceleration: float) -> float:
     return math.sqrt(lost * lost + 2.0 * deceleration * distance) - lost
 
 
-def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offset: float,
-                   horizon: float, a_max: float) -> tuple[float, float]:
+def vertical_range(limits: GateLimits, place: Location, climb_rate: float, horizon: float,
+                   a_max: float) -> tuple[float, float]:
     """
     Return the least and the greatest vertical acceleration, m/s^2, by the heights.
 
     :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
-    :param offset: upward acceleration, m/s^2, by which setpoints offset an error of the thrust.
     :param horizon: time in which the speed is to be reached, s.
     :param a_max: largest magnitude of the acceleration, m/s^2.
     """
@@ -170,7 +169,7 @@ def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offse
     falling = approach_speed(place.height - limits.height_min, braking)
     rising = approach_speed(limits.height_max - place.height, braking)
     lowest, highest = sorted((climb_rate, place.climb_rate))
-    return ((-falling - lowest) / horizon + offset, (rising - highest) / horizon + offset)
+    return (-falling - lowest) / horizon, (rising - highest) / horizon
 
 
 def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float) -> Side | None:

@@ -28,14 +28,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.mavlink import envelope, setpoint_rules, velocity_check
+from flock_follower.mavlink import disturbance, envelope, setpoint_rules, velocity_check
 from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
 from flock_follower.mavlink.permission import Permission, Phase
 from flock_follower.mavlink.relative_flight import RelativeFlight
 from flock_follower.mavlink.setpoint_rules import (
     AcceptedCommand,
-    DisturbanceObserver,
     Held,
     Setpoint,
 )
@@ -56,7 +56,7 @@ from flock_follower.mavlink.velocity_check import (
     YAWS_DISAGREE,
 )
 from flock_follower.messages import Command, OdometryState, SANE
-from flock_follower.ranges import first_reason
+from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -116,6 +116,7 @@ class Gate:
         self._displaced = ''
         self._heightless_since = math.inf
         self._disturbance = DisturbanceObserver()
+        self._height_watch = HeightWatch()
         self._flown: Array | None = None
         self._held: Held | None = None
         self._commanded = False  # whether the last setpoint was a command
@@ -199,6 +200,7 @@ class Gate:
         known, p = self._sources[source], finite_vector(position)
         if p is not None and np.all(np.abs(p) < SANE):
             fresh = time - known.velocity_time <= self.limits.odom_timeout
+            known.position = p
             known.path.take(p, known.velocity if fresh else None, time)
             known.std = std if math.isfinite(std) else 0.0
 
@@ -249,13 +251,18 @@ class Gate:
     @property
     def wind(self) -> float:
         """Return the acceleration by the wind that setpoints offset, m/s^2."""
-        return float(np.linalg.norm(self._wind))
+        return float(np.linalg.norm(self._disturbance.offset(self.compensates_wind)[:2]))
 
-    def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
+    @property
+    def thrust_offset(self) -> float:
+        """Return the upward acceleration, m/s^2, that offsets the error of the hover thrust."""
+        return float(self._disturbance.offset(False)[2])
+
+    def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
         return '' if now - self._disturbance.excess_since <= longer else (
             f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
-            f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
+            f'more than setpoints offset ({THRUST_OFFSET_MAX:g}): check the load, the '
             f'battery, and {self.hover_thrust}')
 
     def speed(self, now: float) -> float | None:
@@ -279,8 +286,8 @@ class Gate:
         return first_reason(
             (displaced and math.isnan(self.relative.lasts(now)), self._displaced),
             (now - self._heightless_since > HEIGHT_HANDOVER_TIME, 'no height from the autopilot'),
-        ) or envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
-            now, setpoint_rules.THRUST_HANDOVER_TIME)
+        ) or envelope.exceeded(self.limits, self.place(now)) or (
+            self._height_watch.reason) or self.thrust_error(now, disturbance.THRUST_HANDOVER_TIME)
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
@@ -325,10 +332,12 @@ class Gate:
                 '' if command is not None and command.command.relative else self._displaced),
             held=self._held or Held(), relative=self.relative.permission(
                 -math.inf if command is None else command.source_time, now),
-            wind=self._wind, offset=self._disturbance.offset)
+            offset=self._disturbance.offset(self.compensates_wind))
         sends = setpoint.kind != setpoint_rules.NONE
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
         self._commanded = setpoint.kind == setpoint_rules.COMMAND
+        self._height_watch.step(place.height, self._commanded_height(setpoint, place, now)
+                                if active and engaged else None)
         if not sends and not withheld and known.blind:
             self.permit(self.permission.blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:
@@ -350,10 +359,17 @@ class Gate:
         # rests on that odometry, and drifts metres without it.
         return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
 
-    @property
-    def _wind(self) -> Array:
-        return self._disturbance.acceleration * [1.0, 1.0, 0.0] if self.compensates_wind else (
-            np.zeros(3))
+    def _commanded_height(self, setpoint: Setpoint, place: Location, now: float) -> float | None:
+        """Return the height, m, that a setpoint leads to, as far as it is known."""
+        if setpoint.kind == setpoint_rules.BRAKE and self._held is not None:
+            return self._held.height
+        odom = self._sources[ODOM]
+        if setpoint.kind != setpoint_rules.COMMAND or self._command is None or (
+                place.height is None or odom.position is None):
+            return None
+        altitude = float(odom.position[2] + odom.velocity[2] * (now - odom.velocity_time))
+        height = place.height + self._command.command.altitude - altitude
+        return min(max(height, self.limits.height_min), self.limits.height_max)
 
     def _known(self, now: float) -> KnownMotion:
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]

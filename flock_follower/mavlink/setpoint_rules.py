@@ -20,20 +20,15 @@ and the autopilot is received. A command that rests on the marker alone passes o
 without odometry is permitted (``relative_flight``), and with bounds of its own, because its speed
 is not known. Otherwise the setpoint brakes. A stale command is never repeated: an
 autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
-acceleration setpoints lead to, and ArduCopter obeys NaN. Each setpoint keeps these bounds, the
+acceleration setpoints lead to, and ArduCopter obeys NaN. Each command keeps these bounds, the
 most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
-planner requests; the radius of the envelope; the rest of the command. Vectors are ENU; ``decide``
+planner requests; the radius of the envelope; the rest of the command. The setpoint is that command
+plus the offset of the disturbance (``disturbance``), which does not move the vehicle: ``v_max``
+and the envelope bound the command alone, ``a_max`` bounds the sum. Vectors are ENU; ``decide``
 takes everything that it depends on as an argument.
 
 ``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint: acceleration and yaw in
 MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter both obey.
-
-``DisturbanceObserver`` estimates wind and hover thrust error. An autopilot flies an acceleration
-setpoint by a tilt and a thrust that depend on the setpoint alone. PX4 does not compare the result
-with the setpoint: in wind the vehicle drifts, and with a wrong hover thrust it sinks or climbs.
-ArduPilot closes the horizontal loop itself if GUID_OPTIONS is 0; there the estimate stays small.
-The observer is a Luenberger observer with the states velocity and disturbance, both poles at
--BANDWIDTH: v' = response + d + 2 w (v_measured - v), d' = w^2 (v_measured - v).
 """
 
 from __future__ import annotations
@@ -48,7 +43,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location
-from flock_follower.mavlink.relative_flight import LONGEST_STEP, Relative
+from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.velocity_check import (
     finite_vector,
     fresh,
@@ -60,6 +55,7 @@ from flock_follower.mavlink.velocity_check import (
 from flock_follower.messages import Command, OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
+    INSIDE,
     limit_command,
     limit_level,
     limit_norm,
@@ -67,7 +63,7 @@ from flock_follower.planner.limits import (
     SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
-from flock_follower.ranges import first_reason
+from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
 
 #: Acceleration only, 0xC3F: for as long as no yaw is known.
 ACCELERATION: Final[int] = (
@@ -104,84 +100,13 @@ def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None, time_boot
         north, east, down, heading, 0.0)
 
 
-#: 1/s: slower than the loops that it acts in (braking: 3 1/s).
-BANDWIDTH: Final[float] = 1.0
-#: From the setpoint to 63 % of the tilt, s; measured on PX4 0.23, on ArduCopter 0.27.
-RESPONSE_TIME: Final[float] = 0.25
-#: Estimates are at most this long, horizontally and vertically, m/s^2.
-WIND_MAX: Final[float] = 1.0
-THRUST_ERROR_MAX: Final[float] = 3.0
-#: The part of the vertical one that setpoints offset, m/s^2; planners offset as much.
-OFFSET_MAX: Final[float] = 1.2
-#: A horizontal velocity that differs from the expected one by this, m/s, for this long, s,
-#: contradicts the setpoints: they are not flown, so the estimate of the wind is frozen.
-CONTRADICTION: Final[float] = 0.5
-CONTRADICTION_TIME: Final[float] = 1.0
-#: A thrust that is wrong beyond OFFSET_MAX for these times, s, is a warning, and a handover.
-WARNING_TIME: Final[float] = 1.0
-THRUST_HANDOVER_TIME: Final[float] = 3.0
-
-
-class DisturbanceObserver:
-    """Estimates a disturbance from the setpoints sent and the velocity measured."""
-
-    def __init__(self) -> None:
-        self._time = -math.inf
-        self._forget()
-
-    def _forget(self) -> None:
-        self.acceleration: Array = np.zeros(3)
-        """The estimate (3,), m/s^2, ENU."""
-        self.excess_since = math.inf
-        """Since when the error of the thrust exceeds OFFSET_MAX, s; infinite: it does not."""
-        self._velocity: Array | None = None
-        self._response: Array = np.zeros(3)
-        self._contradicted_since = math.inf
-
-    @property
-    def offset(self) -> float:
-        """Return the upward acceleration, m/s^2, that offsets the error of the thrust."""
-        return min(max(-float(self.acceleration[2]), -OFFSET_MAX), OFFSET_MAX)
-
-    def step(self, sent: Array | None, velocity: Array | None, now: float) -> None:
-        """
-        Update the estimate to ``now``, s.
-
-        :param sent: acceleration (3,), m/s^2, flown since the last step; None: none of ours, which
-            resets the estimate.
-        :param velocity: measured (3,), m/s; None without one: the estimate stays.
-        """
-        elapsed, self._time = now - self._time, now
-        if sent is None:
-            self._forget()
-            return
-        usable = 0.0 < elapsed <= LONGEST_STEP
-        if usable:
-            self._response = self._response + (sent - self._response) * -math.expm1(
-                -elapsed / RESPONSE_TIME)
-        if velocity is None or self._velocity is None or not usable:
-            self._velocity = velocity
-            return
-        # The difference of two finite velocities may overflow.
-        error = (np.clip(velocity, -SANE, SANE)
-                 - np.clip(self._velocity, -SANE, SANE))
-        self._velocity = self._velocity + elapsed * (
-            self._response + self.acceleration + 2.0 * BANDWIDTH * error)
-        estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
-        contradicted = math.hypot(*error[:2].tolist()) > CONTRADICTION
-        self._contradicted_since = min(self._contradicted_since, now) if contradicted else math.inf
-        frozen = now - self._contradicted_since >= CONTRADICTION_TIME
-        wind = self.acceleration[:2] if frozen else limit_norm(estimate[:2], WIND_MAX)
-        up = min(max(float(estimate[2]), -THRUST_ERROR_MAX), THRUST_ERROR_MAX)
-        self.acceleration = np.array([*wind, up])
-        self.excess_since = min(self.excess_since, now) if abs(up) > OFFSET_MAX else math.inf
-
-
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
 ENVELOPE: Final[str] = 'envelope'
 #: Without odometry only a slow barometer shows the climb: heights are kept from so far inside, m.
 HEIGHT_MARGIN: Final[float] = 0.5
+#: Above this multiple of ``v_max`` no disturbance is offset along the velocity.
+OVERSPEED: Final[float] = 1.1
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
@@ -224,14 +149,14 @@ class Held(NamedTuple):
 
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, armed: bool, airborne: bool, withheld: str,
-           place: Location, unplaced: str, held: Held, relative: Relative, wind: ArrayLike,
-           offset: float) -> Setpoint:
+           place: Location, unplaced: str, held: Held, relative: Relative,
+           offset: ArrayLike) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
-    acceleration is finite, at most ``a_max`` long, never leads to a speed above ``v_max``, and
-    does not point upwards on the ground.
+    acceleration is finite, at most ``a_max`` long, and does not point upwards on the ground; less
+    the offset it never leads to a speed above ``v_max``.
 
     :param full: the limits at start, for braking and separation; ``limits`` may be lower.
     :param known: the vehicle's motion, as far as it is known.
@@ -245,33 +170,32 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param unplaced: why a height that was known is unknown now, or ''.
     :param held: yaw and height to keep without a command.
     :param relative: whether a command may rest on the marker alone.
-    :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
-    :param offset: the upward acceleration, m/s^2, with which braking offsets an error of thrust.
+    :param offset: the acceleration (3,), m/s^2, that offsets the disturbance.
     """
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
     if withheld:
         return Setpoint(NONE, withheld, np.zeros(3), yaw, '')
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
-    against = finite_vector(wind)
-    against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
+    offset = _sane_offset(offset)
     reason = _refusal(limits, known, command, command_age, link_age, unplaced, relative, place,
                       airborne)
     if not reason and command is not None and command.relative:
-        return _relative(full, command, against, place, offset)
+        return _relative(full, command, offset, place)
     velocity = known.velocity
     if not reason and command is not None and velocity is not None:
-        bias = np.array([0.0, 0.0, _bounded(command.thrust_bias)])
         axis = _direction(command.separation_axis)
-        safe = _limited(limits if axis is None else full,
-                        np.asarray(command.acceleration) - bias, against + bias, velocity, place,
-                        axis, offset)
-        return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
-                        safe.reason)
+        safe = _limited(limits if axis is None else full, np.asarray(command.acceleration),
+                        offset, velocity, place, axis)
+        return Setpoint(COMMAND, '', _grounded(safe.acceleration, airborne),
+                        wrap_angle(command.yaw), safe.reason)
     estimated = known.braking
     if estimated is None:
-        kind = NONE if known.blind and not relative.begins else LEVEL
-        return Setpoint(kind, reason, np.zeros(3), yaw, '')
+        if known.blind and not relative.begins:
+            return Setpoint(NONE, reason, np.zeros(3), yaw, '')
+        # Without the offset of the thrust a level vehicle sinks or climbs.
+        level = _with_offset(np.zeros(3), offset * [0.0, 0.0, float(airborne)], full.a_max, None)
+        return Setpoint(LEVEL, reason, _grounded(level, airborne), yaw, '')
     nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         # A late rate makes the height swing, unless 1 / (2 w) is at least e times its age.
@@ -279,9 +203,17 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         climb = frequency * (frequency * (held.height - place.height) - 2.0 * place.climb_rate)
         if math.isfinite(climb):
             nominal[2] = climb
-            against = against + np.array([0.0, 0.0, _bounded(offset)])
-    safe = _limited(full, nominal, against, estimated, place, None, offset)
-    return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
+    safe = _limited(full, nominal, offset, estimated, place, None)
+    return Setpoint(BRAKE, reason, _grounded(safe.acceleration, airborne), yaw, safe.reason)
+
+
+def _sane_offset(offset: ArrayLike) -> Array:
+    """Return an offset (3,), m/s^2, with its vertical part bounded; zeros if not finite."""
+    vector = finite_vector(offset)
+    if vector is None:
+        return np.zeros(3)
+    vector[2] = min(max(float(vector[2]), -THRUST_OFFSET_MAX), THRUST_OFFSET_MAX)
+    return limit_norm(vector, SANE)
 
 
 def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
@@ -323,41 +255,57 @@ def _marker_refusal(limits: GateLimits, relative: Relative, place: Location,
         (not airborne, 'on the ground'))
 
 
-def _relative(full: GateLimits, command: Command, against: Array, place: Location,
-              offset: float) -> Setpoint:
+def _relative(full: GateLimits, command: Command, offset: Array, place: Location) -> Setpoint:
     """
     Return the setpoint of a command that rests on the marker alone.
 
-    Heights go first, then the limit of the acceleration; the speed is not known. The offset of an
-    error of the thrust is not limited by RELATIVE_MAX: it does not move the vehicle.
+    Heights go first, then the limit of the acceleration; the speed is not known.
     """
-    wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE) + against
-    a_max = full.a_max * SENT_INSIDE
-    strongest = min(RELATIVE_MAX, full.a_max) * SENT_INSIDE
-    own, bias = _bounded(offset), _bounded(command.thrust_bias)
+    wanted = np.clip(np.asarray(command.acceleration, dtype=float), -SANE, SANE)
+    strongest = RELATIVE_MAX * SENT_INSIDE
     margin = min(HEIGHT_MARGIN, 0.25 * (full.height_max - full.height_min))
     height, climb, horizon = place.height, place.climb_rate, full.speed_horizon
     assert height is not None  # else it is refused
-    # If the two offsets differ, the one that leads away from the bound is used.
     least, _ = envelope.vertical_range(
-        full, Location(height - margin, climb), climb, max(own, bias), horizon, strongest)
+        full, Location(height - margin, climb), climb, horizon, strongest)
     _, most = envelope.vertical_range(
-        full, Location(height + margin, climb), climb, min(own, bias), horizon, strongest)
+        full, Location(height + margin, climb), climb, horizon, strongest)
     within = min(max(float(wanted[2]), least), most)
-    lowest, highest = min(bias, 0.0) - strongest, max(bias, 0.0) + strongest
-    up = min(max(within, lowest, -a_max), highest, a_max)
-    rest = min(strongest ** 2 - (up - bias) ** 2, a_max ** 2 - up ** 2)
-    level = limit_norm(wanted[:2], math.sqrt(max(rest, 0.0)))
-    limits = ['a_max'] if up != within or level.tolist() != wanted[:2].tolist() else []
+    up = min(max(within, -strongest), strongest)
+    level = limit_norm(wanted[:2], math.sqrt(max(strongest ** 2 - up ** 2, 0.0)))
+    acceleration = np.array([*level, up])
+    total = _with_offset(acceleration, offset, full.a_max, None)
+    shortened = up != within or level.tolist() != wanted[:2].tolist()
+    limits = ['a_max'] if shortened or not _is_sum(total, acceleration, offset) else []
     if within != wanted[2]:
         limits.append(ENVELOPE)
-    return Setpoint(COMMAND, '', np.array([*level, up]), wrap_angle(command.yaw),
-                    ', '.join(limits))
+    return Setpoint(COMMAND, '', total, wrap_angle(command.yaw), ', '.join(limits))
 
 
-def _bounded(offset: float) -> float:
-    """Return the part of an upward acceleration, m/s^2, that setpoints may offset."""
-    return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
+def _with_offset(acceleration: Array, offset: Array, a_max: float, axis: Array | None) -> Array:
+    """
+    Return the sum of a command and an offset (3,), m/s^2, shortened to ``a_max``.
+
+    The height goes first, then the part along ``axis``, a horizontal unit vector, then the rest.
+    """
+    strongest = a_max * SENT_INSIDE
+    total = acceleration + offset
+    if math.hypot(*total.tolist()) <= strongest * INSIDE:
+        return total
+    up = min(max(float(total[2]), -strongest), strongest)
+    rest = math.sqrt(max(strongest ** 2 - up ** 2, 0.0))
+    level = total[:2]
+    if axis is None or not float(axis[:2] @ level) > 0.0:
+        return np.array([*limit_norm(level, rest), up])
+    along = min(float(axis[:2] @ level), rest)
+    across = limit_norm(level - float(axis[:2] @ level) * axis[:2],
+                        math.sqrt(max(rest ** 2 - along ** 2, 0.0)))
+    return np.array([*limit_norm(along * axis[:2] + across, rest), up])
+
+
+def _is_sum(total: Array, acceleration: Array, offset: Array) -> bool:
+    """Return whether a sum was not shortened."""
+    return bool(total.tolist() == (acceleration + offset).tolist())
 
 
 def _direction(axis: ArrayLike | None) -> Array | None:
@@ -367,37 +315,39 @@ def _direction(axis: ArrayLike | None) -> Array | None:
     return vector if unit else None
 
 
-def _limited(limits: GateLimits, nominal: Array, against: Array, velocity: Velocity,
-             place: Location, axis: Array | None, offset: float) -> LimitedCommand:
+def _limited(limits: GateLimits, nominal: Array, offset: Array, velocity: Velocity,
+             place: Location, axis: Array | None) -> LimitedCommand:
     """
-    Return the acceleration within limits and envelope that is nearest to ``nominal + against``.
+    Return the acceleration within limits and envelope that is nearest to ``nominal``, and offset.
 
-    ``against`` offsets a disturbance. The limits hold for ``nominal``, which is how the vehicle
-    accelerates if the disturbance is as estimated, and for the sum, if there is none.
+    The offset compensates a disturbance: the vehicle accelerates by the rest. Along a velocity
+    above OVERSPEED times ``v_max`` nothing is offset: the estimate may be wrong.
     """
     horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
     safe = limit_command(nominal, v, limits.a_max, limits.v_max, horizon, axis)
-    if against.any():
-        total = limit_command(safe.acceleration + against, v, limits.a_max, limits.v_max, horizon,
-                              axis)
-        safe = total._replace(reason=safe.reason or total.reason)
-    a = safe.acceleration
-    least, most = envelope.vertical_range(
-        limits, place, float(v[2]), _bounded(offset), horizon, limits.a_max)
+    a, reasons = safe.acceleration, [safe.reason]
+    least, most = envelope.vertical_range(limits, place, float(v[2]), horizon, limits.a_max)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
-    bounds = [] if inward is None else [inward]
-    if least <= a[2] <= most and (inward is None or product(inward[0], flat) >= inward[1]):
-        return safe
-    sides = [] if axis is None else [
-        (complex(float(axis[0]), float(axis[1])), float(axis[:2] @ a[:2]))]
-    point = limit_level(a, min(max(float(a[2]), least), most), sides + bounds, v,
+    if not (least <= a[2] <= most and (
+            inward is None or product(inward[0], flat) >= inward[1])):
+        sides = [] if axis is None else [
+            (complex(float(axis[0]), float(axis[1])), float(axis[:2] @ a[:2]))]
+        sides += [] if inward is None else [inward]
+        a = limit_level(a, min(max(float(a[2]), least), most), sides, v,
                         limits.a_max, limits.v_max, horizon)
-    return LimitedCommand(point, ', '.join(filter(None, [safe.reason, ENVELOPE])))
+        reasons.append(ENVELOPE)
+    speed = math.hypot(*v.tolist())
+    if speed > OVERSPEED * limits.v_max:
+        offset = offset - max(float(offset @ v), 0.0) / speed ** 2 * v
+    total = _with_offset(a, offset, limits.a_max, axis)
+    if not _is_sum(total, a, offset) and 'a_max' not in safe.reason:
+        reasons.insert(0, 'a_max')
+    return LimitedCommand(total, ', '.join(filter(None, reasons)))
 
 
-def _grounded(safe: LimitedCommand, airborne: bool) -> Array:
+def _grounded(acceleration: Array, airborne: bool) -> Array:
     """Return the acceleration, on the ground without its upward part."""
     if airborne:
-        return safe.acceleration
-    return np.array([*safe.acceleration[:2], min(float(safe.acceleration[2]), 0.0)])
+        return acceleration
+    return np.array([*acceleration[:2], min(float(acceleration[2]), 0.0)])

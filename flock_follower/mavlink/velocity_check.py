@@ -309,6 +309,8 @@ class Source:
     def __init__(self) -> None:
         self.velocity: Array = np.zeros(3)
         self.velocity_time = -math.inf
+        self.position: Array | None = None
+        """The newest, m, in the frame of the source."""
         self.yaws: deque[tuple[float, float]] = deque()
         self.path = Path()
         self.std = 0.0

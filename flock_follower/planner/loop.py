@@ -245,7 +245,7 @@ class PlannerLoop:
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.separation_axis,
-            self._frame, stamp, nanoseconds - stamp, decision.thrust_bias,
+            self._frame, stamp, nanoseconds - stamp, decision.altitude,
             decision.state is State.RELATIVE)
 
 

@@ -168,9 +168,7 @@ class Memory(NamedTuple):
 
     def in_frame_of(self, own: OwnState, now: float, params: PlannerParams) -> Memory:
         """Return the memory for another odometry frame, without positions of the old frame."""
-        altitude = self.altitude
-        if altitude is not None:
-            altitude = Altitude.begun(own, None, params)._replace(thrust_bias=altitude.thrust_bias)
+        altitude = None if self.altitude is None else Altitude.begun(own, None, params)
         return Memory(
             now=self.now, own=own, faced=self.faced, followed=self.followed, begun=self.begun,
             given_up=self.given_up, altitude=altitude, yaw=self.yaw, command=self.command,

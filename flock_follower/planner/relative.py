@@ -42,9 +42,9 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.scene import Decision
-from flock_follower.planner.vertical_yaw import Altitude, facing, THRUST_BIAS_MAX, turning
+from flock_follower.planner.vertical_yaw import Altitude, facing, turning
 
-#: Largest vertical acceleration, m/s^2, besides the offset of an error of the thrust: the altitude
+#: Largest vertical acceleration, m/s^2, besides the offset of the disturbance: the altitude
 #: leaves the rest of ``RELATIVE_MAX`` to the distance.
 VERTICAL_MAX = 0.6
 #: Largest change of the command from one tick to the next, m/s^2: when the frame changes, too.
@@ -85,10 +85,9 @@ class Disturbance(NamedTuple):
             -elapsed / response_time)
         error = velocity - self.velocity
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
-        up = min(max(float(estimate[2]), -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
         return Disturbance(
             self.velocity + elapsed * (response + self.acceleration + 2.0 * BANDWIDTH * error),
-            response, np.array([*limit_norm(estimate[:2], OFFSET_MAX), up]))
+            response, limit_norm(estimate, OFFSET_MAX))
 
 
 def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
@@ -112,17 +111,15 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     if params.altitude_mode == 'follow':
         altitude = altitude._replace(held=float(there.position[2]) + params.altitude_offset)
         rising = me.velocity - [0.0, 0.0, there.velocity[2]]
-    before = memory.disturbance or Disturbance(
-        acceleration=np.array([0.0, 0.0, -altitude.thrust_bias]))
-    disturbance = before.observed(
+    disturbance = (memory.disturbance or Disturbance()).observed(
         me.velocity - there.velocity, memory.command, elapsed, params.response_time)
     bias = -disturbance.acceleration
-    up = float(bias[2])
-    altitude, vertical = altitude._replace(climb=0.0, thrust_bias=up).controlled(
-        me._replace(velocity=rising), params, elapsed)
+    altitude, vertical = altitude._replace(climb=0.0).controlled(
+        me._replace(velocity=rising), params)
     others = [n for n in seen.values() if n is not leader]
-    command = limited(level(me, memory.pending, leader, others, params) + bias[:2],
-                      min(max(vertical - up, -VERTICAL_MAX), VERTICAL_MAX), up, memory.command)
+    command = limited(
+        level(me, memory.pending, leader, others, params) + bias[:2],
+        min(max(vertical, -VERTICAL_MAX), VERTICAL_MAX) + float(bias[2]), memory.command)
     last = me.yaw if memory.yaw is None else memory.yaw
     yaw = facing(last, me, there, params, elapsed) if params.yaw_mode == 'leader' else last
     left = math.exp(-elapsed / params.response_time)
@@ -131,7 +128,7 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
         disturbance=disturbance,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (command - bias),
     ), Decision(State.RELATIVE, 'no odometry: flies by the marker alone', command, yaw,
-                turning(last, yaw, me, params, elapsed), stamp=leader.stamp, thrust_bias=up)
+                turning(last, yaw, me, params, elapsed), stamp=leader.stamp)
 
 
 def _held(memory: Memory, reason: str) -> tuple[Memory, Decision]:
@@ -175,18 +172,15 @@ def _gap(place: Array, me: OwnState, n: Neighbor, params: PlannerParams) -> tupl
     return distance - params.radius - n.member.radius, towards
 
 
-def limited(horizontal: Array, vertical: float, thrust_bias: float, last: Array | None) -> Array:
+def limited(horizontal: Array, vertical: float, last: Array | None) -> Array:
     """
     Return the acceleration (3,), m/s^2: within the limit, the vertical first, and without steps.
 
-    :param thrust_bias: upward acceleration, m/s^2, that offsets an error of the thrust: it is
-        added beyond the limit, because it moves nothing.
     :param last: acceleration of the tick before (3,), m/s^2; None if there was none.
     """
     up = min(max(vertical, -RELATIVE_MAX), RELATIVE_MAX)
     flat = limit_norm(horizontal, math.sqrt(RELATIVE_MAX ** 2 - up * up))
-    return without_step(np.array([*flat, up + thrust_bias]),
-                        np.array([0.0, 0.0, thrust_bias]) if last is None else last)
+    return without_step(np.array([*flat, up]), last)
 
 
 def without_step(acceleration: Array, last: Array | None) -> Array:

@@ -67,8 +67,8 @@ class Decision(NamedTuple):
     rejected: tuple[Rejection, ...] = ()
     warnings: tuple[str, ...] = ()
     """Neighbors that it cannot follow, and its reaction to lost ones."""
-    thrust_bias: float = 0.0
-    """The part of the vertical acceleration that only offsets a wrong hover thrust, m/s^2."""
+    altitude: float = math.nan
+    """The altitude that the acceleration leads to, m; NaN if it leads to none."""
     edges: tuple[str, ...] = ()
     """The neighbors at the ends of its edges; others are only kept clear of."""
 

@@ -44,8 +44,6 @@ from flock_follower.planner.scene import awaited, Decision, Scene, survey
 from flock_follower.planner.sight import Occlusion, occlusion, View
 from flock_follower.planner.vertical_yaw import Altitude, facing, searching, turning
 
-UP = np.array([0.0, 0.0, 1.0])
-
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          estimates: Iterable[Neighbor], params: PlannerParams, looked: float | None = None,
@@ -83,8 +81,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     memory, scene = survey(memory, me, state, bool(blinded), params, elapsed)
     neighbors = scene.neighbors
     altitude, vertical = _altitude(memory, scene, ground, float(coming[2]), params, elapsed)
-    bias = altitude.thrust_bias  # corrects a wrong hover thrust: it does not move the vehicle
-    velocity = me.velocity + coming - bias * params.period * UP
+    velocity = me.velocity + coming
     unlimited, fading = nominal(memory, state, me, velocity, neighbors, params)
     command = constrain(unlimited, vertical, altitude.climb, memory, scene, velocity, view, params)
     if me.stamp - memory.switched < relative.SETTLING:
@@ -102,11 +99,11 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         leader=last_known(memory, neighbors), looking=scene.leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=left * memory.pending + (1.0 - left) * params.response_time * (
-            command.acceleration - bias * UP))
+            command.acceleration))
     return memory, Decision(
         state, reason, command.acceleration, yaw,
         turning(last_yaw, yaw, me, params, elapsed), command.separation_axis, stamp,
-        command.reason, rejected, _warnings(memory, scene, reason, params), bias,
+        command.reason, rejected, _warnings(memory, scene, reason, params), altitude.commanded,
         tuple(sorted(neighbors.edges)))
 
 
@@ -170,7 +167,7 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, coming: float,
     altitude = altitude.following(
         level if params.altitude_mode == 'follow' else None, params, elapsed)
     if not params.guard:
-        return altitude.controlled(me, params, elapsed, coming=coming)
+        return altitude.controlled(me, params, coming=coming)
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
                                if me.stamp - n.stamp <= params.coast_timeout]
     raised = -math.inf
@@ -178,7 +175,7 @@ def _altitude(memory: Memory, scene: Scene, ground: float | None, coming: float,
         # The climb lasts as long as the loss: the next one begins at the altitude held before.
         raised = min(overflight(memory.lost, me.position, altitude.held, params), altitude.highest)
     return altitude.controlled(
-        me, params, elapsed, *climb_range(near, me, params), coming, raised)
+        me, params, *climb_range(near, me, params), coming, raised)
 
 
 def _yaw(last: float, memory: Memory, scene: Scene, params: PlannerParams,

@@ -17,13 +17,11 @@ Altitude and yaw control: the altitude to hold, the vertical acceleration and th
 
 The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
 loses one that climbs or descends. The altitude is controlled with the characteristic polynomial
-s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, with an integral that corrects errors of
-the autopilot's hover thrust.
+(s + w)^2, critically damped. The gate offsets an error of the hover thrust.
 
 The vehicle stops in time before the lowest and the highest altitude: the nearer they are when a
 command acts, the slower it may approach them. A target that ends there is not enough: the vehicle
-overshot it by 0.25 m, because of the target's climb, of commands not yet flown, and of a wound-up
-integral.
+overshot it by 0.25 m, because of the target's climb and of commands not yet flown.
 
 The neighbour's vertical velocity is smoothed, without lag if its acceleration is known. A
 velocity v as small as its noise counts as v / (1 + (CLIMB_NOISE / v)^4). A height difference, as
@@ -41,11 +39,7 @@ from flock_follower.geometry import wrap_angle
 from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams
 
-THRUST_BIAS_MAX = 1.2  # m/s^2: the measured error of PX4's hover thrust estimate was 1
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
-INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, as the thrust errs for 10 s
-INTEGRAL_SHARE_BEYOND = 0.6  # likewise if an error of the thrust presses it beyond a bound:
-BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
 CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
 CLIMB_GAIN = 0.3  # share of a change in it that is used at once if its acceleration is known
 HEIGHT_GAIN = 0.5  # likewise of a change in its height
@@ -67,8 +61,8 @@ class Altitude(NamedTuple):
     """m."""
     climb: float = 0.0
     """Rate of ``held``, m/s."""
-    thrust_bias: float = 0.0
-    """The integral, m/s^2."""
+    commanded: float = math.nan
+    """The altitude that the command leads to, m; NaN while neighbors limit the climb."""
     neighbor_climb: float | None = None
     """Vertical velocity of the neighbour that is followed, m/s; None without one."""
 
@@ -112,9 +106,9 @@ class Altitude(NamedTuple):
                     max(self.climb, significant) + faster)
         return self._replace(held=held, climb=climb, neighbor_climb=neighbor_climb)
 
-    def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
-                   least: float = -math.inf, most: float = math.inf, coming: float = 0.0,
-                   raised: float = -math.inf) -> tuple[Altitude, float]:
+    def controlled(self, me: OwnState, params: PlannerParams, least: float = -math.inf,
+                   most: float = math.inf, coming: float = 0.0, raised: float = -math.inf
+                   ) -> tuple[Altitude, float]:
         """
         Return the next altitude, and the vertical acceleration, m/s^2, for the next period.
 
@@ -126,18 +120,15 @@ class Altitude(NamedTuple):
         w = params.altitude_frequency
         strongest = min(params.max_vertical_acceleration, params.a_max)
         z, rate = float(me.position[2]), float(me.velocity[2])
-        error = max(self.held, raised) - z
-        speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
+        goal = max(self.held, raised)
+        speed, fastest = self.climb + 0.5 * w * (goal - z), SPEED_SHARE * params.v_max
         # Until a command acts the vehicle keeps its velocity.
         reached = z + rate * params.response_time
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
         clear = max(min(speed, most), least)
-        if clear != speed:  # then only the speed can show an error of the thrust
-            error = 2.0 * (min(max(clear, -down), up) - rate) / w
-        nominal, within = (2.0 * w * (each - rate)
-                          for each in (clear, min(max(clear, -down), up)))
-        vertical = acceptable = min(max(within, -strongest), strongest)
+        nominal = 2.0 * w * (min(max(clear, -down), up) - rate)
+        vertical = min(max(nominal, -strongest), strongest)
         # An overshoot of the climb would be taken from backing off, which shares v_max with it.
         if most < math.inf:
             high = min(max(most, -down), up) - rate - coming
@@ -145,19 +136,7 @@ class Altitude(NamedTuple):
         if least > -math.inf:
             low = max(min(least, up), -down) - rate - coming
             vertical = max(vertical, min(low / params.guarding.T_g, strongest))
-        # Somewhat beyond a bound, and not returning: the thrust is wrong.
-        below, above = self.lowest - z, z - self.highest
-        pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
-            BEYOND < above < FAR_BEYOND and rate > -RETURNING)
-        share = INTEGRAL_SHARE_BEYOND if pressed or clear != speed else INTEGRAL_SHARE
-        bias = self.thrust_bias + share * w ** 3 * error * elapsed
-        # Anti-windup: a limited acceleration does not increase the integral.
-        if (acceptable - nominal) * (bias - self.thrust_bias) < 0.0 and (
-                abs(bias) > abs(self.thrust_bias)):
-            bias = self.thrust_bias
-        bias = min(max(bias, -THRUST_BIAS_MAX), THRUST_BIAS_MAX)
-        total = min(max(vertical + self.thrust_bias, -params.a_max), params.a_max)
-        return self._replace(thrust_bias=bias if math.isfinite(bias) else 0.0), total
+        return self._replace(commanded=goal if clear == speed else math.nan), vertical
 
 
 def _stopped_within(gap: float, gain: float) -> float:

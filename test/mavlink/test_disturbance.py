@@ -21,7 +21,7 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.setpoint_rules import (
+from flock_follower.mavlink.disturbance import (
     CONTRADICTION_TIME,
     DisturbanceObserver,
     THRUST_ERROR_MAX,

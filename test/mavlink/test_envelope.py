@@ -151,9 +151,9 @@ def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleratio
 def test_the_bounds_are_those_of_the_approach_speeds():
     limits, place = GateLimits(), Location(1.0, -0.2, np.array([0.0, 40.0]))
     braking = 0.4 * limits.a_max
-    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5, limits.a_max)
-    assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5 + 0.3)
-    assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5 + 0.3)
+    least, most = vertical_range(limits, place, 0.1, 0.5, limits.a_max)
+    assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5)
+    assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5)
     normal, bound = inward(limits, place, np.array([0.0, 0.5, 0.0]), 0.5)
     assert normal == -1j
     assert bound == pytest.approx((0.5 - approach_speed(10.0, braking)) / 0.5)
@@ -177,7 +177,7 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
                            command_age=0.0, link_age=0.0, armed=True, airborne=False,
                            place=gate.place(now), withheld='', unplaced='', held=Held(),
-                           relative=Relative(), wind=np.zeros(3), offset=0.0))
+                           relative=Relative(), offset=np.zeros(3)))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
 

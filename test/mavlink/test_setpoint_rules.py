@@ -41,14 +41,14 @@ from flock_follower.mavlink.velocity_check import (
     ODOM,
 )
 from flock_follower.messages import Command, FASTEST_OWN
-from flock_follower.ranges import A_MAX
+from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX
 
 LIMITS = GateLimits()
 UNKNOWN = Motion()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 USUAL = {'airborne': True, 'withheld': '', 'place': Location(), 'unplaced': '',
-         'relative': Relative(), 'wind': (0.0, 0.0, 0.0), 'offset': 0.0}
+         'relative': Relative(), 'offset': (0.0, 0.0, 0.0)}
 """The arguments of a vehicle in the air of which nothing else is known."""
 KNOWN = ('odom', 'autopilot', 'source', 'disagreeing_for')
 
@@ -182,8 +182,8 @@ def test_braking_is_limited_to_a_max_as_a_vector():
     fast = SLOW._replace(velocity=(3.0, 4.0, 0.0))
     setpoint = judge(command=None, odom=fast, autopilot=fast)
     same(setpoint, BRAKE, 'no command', (-1.5, -2.0, 0.0), limited='v_max')
-    same(judge(GateLimits(a_max=1.0), command=None, odom=fast, autopilot=fast), BRAKE,
-         'no command', (-0.6, -0.8, 0.0), limited='v_max')
+    same(judge(GateLimits(a_max=1.5), command=None, odom=fast, autopilot=fast), BRAKE,
+         'no command', (-0.9, -1.2, 0.0), limited='v_max')
 
 
 @pytest.mark.parametrize(('age', 'more'), [
@@ -245,7 +245,7 @@ MOTION = st.builds(Motion, VECTOR, AGE, NUMBER, AGE)
 BOTH_MOTIONS = st.fixed_dictionaries({
     'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT])})
 LIMIT_SETS = st.builds(
-    GateLimits, a_max=st.floats(0.1, 20.0), v_max=st.floats(0.05, 20.0),
+    GateLimits, a_max=st.floats(A_MAX.low, 20.0), v_max=st.floats(0.05, 20.0),
     speed_horizon=st.floats(0.02, 2.0),
     brake_time=st.floats(0.05, 2.0))
 ARGUMENTS = st.fixed_dictionaries({
@@ -258,7 +258,10 @@ ARGUMENTS = st.fixed_dictionaries({
                        st.none() | st.tuples(NUMBER, NUMBER).map(np.array)),
     'unplaced': st.sampled_from(['', '', '', 'height stale']),
     'held': st.builds(Held, st.none() | NUMBER, st.none() | NUMBER),
-    'wind': VECTOR, 'offset': NUMBER})
+    'offset': VECTOR})
+
+
+DIRECTION = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 def norm_on_wire(setpoint):
@@ -277,9 +280,9 @@ def usable(motion):
 @settings(max_examples=500)
 @given(LIMIT_SETS, BOTH_MOTIONS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments):
-    setpoint, again = (
+    setpoint, again, still = (
         decide(limits, full=limits, known=known_motion(limits, **both), relative=Relative(),
-               **arguments) for _ in range(2))
+               **arguments | change) for change in ({}, {}, {'offset': np.zeros(3)}))
     command = arguments['command']
     # It is a pure function.
     assert again._replace(acceleration=None) == setpoint._replace(acceleration=None)
@@ -287,6 +290,8 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
     assert norm_on_wire(setpoint) <= limits.a_max
+    # A disturbance changes neither whether nor why something is sent.
+    assert setpoint[:2] == still[:2]
     assert setpoint.yaw is None or math.isfinite(setpoint.yaw)
     assert bool(setpoint.reason) == (setpoint.kind != COMMAND)
     if arguments.get('withheld'):
@@ -299,32 +304,57 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
     if not arguments['airborne']:
         assert setpoint.acceleration[2] <= 0.0
     elif setpoint.kind in (COMMAND, BRAKE):
-        step = setpoint.acceleration * limits.speed_horizon
+        step = still.acceleration * limits.speed_horizon
         velocities = [np.array(m.velocity) for m in (both[ODOM], both[AUTOPILOT])
                       if usable(m)]
         with np.errstate(over='ignore'):  # velocities of 1e200 m/s are among the tries
             assert any(np.linalg.norm(v + step) <= max(limits.v_max, np.linalg.norm(v))
                        * (1 + 1e-9) for v in velocities)
     else:
-        assert not setpoint.acceleration.any()
+        assert not setpoint.acceleration[:2].any() and not still.acceleration.any()
+        assert abs(setpoint.acceleration[2]) <= THRUST_OFFSET_MAX
 
 
-DIRECTION = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+@settings(max_examples=500)
+@given(st.floats(1.5, 20.0), st.floats(0.05, 2.0), DIRECTION, st.floats(0.0, 3.0),
+       st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.tuples(*[st.floats(-2.0, 2.0)] * 3),
+       st.none() | st.floats(-math.pi, math.pi), st.sampled_from([True, False]))
+def test_the_offset_is_added_to_the_command_except_along_too_fast_a_velocity(
+        a_max, v_max, direction, speed, wanted, offset, axis, commanded):
+    limits = GateLimits(a_max=a_max, v_max=v_max)
+    v = speed * v_max * np.array(direction) / np.linalg.norm(direction)
+    motion = Motion(tuple(v), 0.02)
+    unit = None if axis is None else np.array([math.cos(axis), math.sin(axis), 0.0])
+    known = known_motion(limits, motion, motion, ODOM)
+    still, sent = (decide(
+        limits, full=limits, known=known, command_age=0.05, link_age=0.1, armed=True,
+        command=Command(wanted, 0.5, 0.0, unit) if commanded else None, held=Held(),
+        **USUAL | {'offset': each}).acceleration for each in (np.zeros(3), offset))
+    expected = np.clip(offset, (-9.0, -9.0, -THRUST_OFFSET_MAX), (9.0, 9.0, THRUST_OFFSET_MAX))
+    if speed > 1.1:
+        expected = expected - max(expected @ v, 0.0) / (v @ v) * v
+    if np.linalg.norm(still + expected) < a_max * (1.0 - 1e-6):
+        np.testing.assert_allclose(sent, still + expected, atol=1e-9)
+    else:  # the height goes first
+        assert sent[2] == pytest.approx(np.clip((still + expected)[2], -a_max, a_max), rel=1e-6)
+        assert a_max * (1.0 - 1e-6) <= np.linalg.norm(sent) <= a_max
+
+
 SHORT = st.floats(0.0, 3e-7) | st.floats(-1.0, 1.0)  # by this share a vector misses a limit
 
 
 @settings(max_examples=500)
-@given(a_max=st.floats(0.1, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
+@given(a_max=st.floats(A_MAX.low, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
        v_max=st.sampled_from([0.5, 20.0]), direction=DIRECTION, short=SHORT,
        velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 4.9]),
        commanded=st.sampled_from([True, True, False]), axis=st.none() | DIRECTION,
-       airborne=st.sampled_from([True, True, False]), bias=st.sampled_from([0.0, 0.5, -1.0]),
+       airborne=st.sampled_from([True, True, False]),
        wind=st.just((0.0, 0.0, 0.0)) | DIRECTION, offset=st.sampled_from([0.0, 1.0, -1.0]),
        height=st.sampled_from([0.4, 0.6, 5.0, 9.9, 11.0]), climb_rate=st.floats(-1.0, 1.0),
        out=st.sampled_from([0.0, 49.9, 51.0]))
 def test_single_precision_of_the_wire_does_not_exceed_a_max(
-        a_max, lower, v_max, direction, short, velocity, speed, commanded, axis, airborne, bias,
-        wind, offset, height, climb_rate, out):
+        a_max, lower, v_max, direction, short, velocity, speed, commanded, axis, airborne, wind,
+        offset, height, climb_rate, out):
     full = GateLimits(a_max=a_max, v_max=v_max)
     limits = GateLimits(a_max=max(lower * a_max, A_MAX.low), v_max=v_max)
     wanted = (1.0 - short) * limits.a_max * np.array(direction) / np.linalg.norm(direction)
@@ -333,8 +363,8 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
     setpoint = decide(
         limits, full=full, known=known_motion(limits, motion, motion, ODOM),
         link_age=0.1, armed=True, command_age=0.05,
-        command=Command(wanted, 0.5, bias, unit) if commanded else None,
-        airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset, withheld='',
+        command=Command(wanted, 0.5, 0.0, unit) if commanded else None,
+        airborne=airborne, held=Held(0.5, 2.0), offset=(*wind[:2], offset), withheld='',
         unplaced='', relative=Relative(),
         place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
@@ -346,7 +376,7 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
                                   (0.0, 0.0, 0.0)])
 def test_a_direction_that_is_none_changes_nothing(axis):
     known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
-    evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.0)
+    evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.5)
     np.testing.assert_array_equal(
         judge(lowered, command=evade._replace(separation_axis=axis), odom=known,
               full=LIMITS).acceleration,

@@ -64,7 +64,7 @@ def refused(capfd: pytest.CaptureFixture[str], node: str, *arguments: str) -> st
     ('planner', '-p v_max:=1.0', '-p: must come after --ros-args, as'),
     ('planner', 'v_max:=1.0', 'v_max:=1.0: must come after --ros-args, as'),
     ('planner', '--params-file mine.yaml --ros-args', '--params-file: must come after'),
-    ('planner', '--ros-args -p a_max:=-1.0', 'a_max = -1.0: must be a number in [0.1, 20] m/s^2'),
+    ('planner', '--ros-args -p a_max:=-1.0', 'a_max = -1.0: must be a number in [1.5, 20] m/s^2'),
     ('relative_pose', '--ros-args -p neighbors_file:=/nowhere.yaml', '/nowhere.yaml'),
     ('relative_pose', '--ros-args -p neighbours_file:=x', 'unknown parameter neighbours_file'),
     ('mavlink_bridge', '--ros-args -p connection:=udp:nowhere', "connection = 'udp:nowhere'"),

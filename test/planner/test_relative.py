@@ -83,8 +83,8 @@ def test_an_error_of_the_tilt_is_offset(tilted):
     assert distances[-1] == pytest.approx(math.sqrt(4.5), abs=0.1)
 
 
-@pytest.mark.parametrize('error', [1.1, -1.1])
-def test_an_error_of_the_thrust_is_offset_beyond_the_limit_of_the_acceleration(error):
+@pytest.mark.parametrize('error', [0.6, -0.6])
+def test_an_error_of_the_thrust_that_grows_without_odometry_is_offset(error):
     memory, z, v, a, offs = Memory(), 0.0, 0.0, 0.0, []
     for k in range(150):
         now = 0.1 * k
@@ -94,15 +94,14 @@ def test_an_error_of_the_thrust_is_offset_beyond_the_limit_of_the_acceleration(e
                                 position=(0.0, 0.0, z))
         a += 0.3 * (decision.acceleration[2] - a)
         offs.append(abs(z))
-    assert max(offs) < 0.8 and offs[-1] < 0.1
-    assert decision.thrust_bias == pytest.approx(-error, abs=0.1)
+    assert max(offs) < 0.5 and offs[-1] < 0.1
 
 
 def test_the_altitude_leaves_acceleration_for_the_distance():
     memory = Memory()
-    for k in range(10):
+    for k in range(4):
         memory, decision = tick(memory, 0.1 * k, [leader(0.1 * k, (2.1, 0.0, 4.0))])
-    assert decision.acceleration[2] - decision.thrust_bias == pytest.approx(0.6)
+    assert decision.acceleration[2] == pytest.approx(0.6, abs=0.05)
 
 
 def test_a_leader_that_stops_is_not_run_into():
@@ -111,12 +110,11 @@ def test_a_leader_that_stops_is_not_run_into():
 
 @settings(max_examples=300)
 @given(st.tuples(*[st.floats(-100.0, 100.0)] * 2), st.floats(-100.0, 100.0),
-       st.floats(-1.2, 1.2), st.none() | st.tuples(*[st.floats(-0.5, 0.5)] * 3))
-def test_the_command_is_short_and_changes_slowly(level, vertical, bias, last):
-    offset = np.array([0.0, 0.0, bias])
-    before = offset if last is None else offset + last
-    command = limited(np.array(level), vertical, bias, None if last is None else before)
-    assert np.linalg.norm(command - offset) <= RELATIVE_MAX + 1e-9
+       st.none() | st.tuples(*[st.floats(-0.5, 0.5)] * 3))
+def test_the_command_is_short_and_changes_slowly(level, vertical, last):
+    before = np.zeros(3) if last is None else np.array(last)
+    command = limited(np.array(level), vertical, last if last is None else before)
+    assert np.linalg.norm(command) <= RELATIVE_MAX + 1e-9
     assert np.linalg.norm(command - before) <= STEP_MAX + 1e-9
 
 

@@ -1,0 +1,153 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The disturbance: the acceleration that nobody commanded, by a wrong hover thrust and by wind.
+
+An autopilot flies an acceleration setpoint by a tilt and a thrust that depend on the setpoint
+alone. PX4 does not compare the result with the setpoint: in wind the vehicle drifts, and with a
+wrong hover thrust it sinks or climbs. ArduPilot closes these loops itself; there the estimate
+stays small. The gate alone offsets the disturbance, beside the command.
+
+``DisturbanceObserver`` is a Luenberger observer with the states velocity and disturbance, both
+poles of an axis at -w (BANDWIDTH): v' = response + d + 2 w (v_measured - v),
+d' = w^2 (v_measured - v).
+``HeightWatch`` finds a height that leaves the commanded one, whatever the estimate is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.mavlink.relative_flight import LONGEST_STEP
+from flock_follower.messages import SANE
+from flock_follower.planner.limits import limit_norm
+from flock_follower.ranges import THRUST_OFFSET_MAX
+
+#: East, north, up, 1/s. Vertically faster: a thrust that changes by 1 m/s^2 within a moment moves
+#: the vehicle by 0.3 m. With 2.5 the height sways if the odometry is 0.15 s late.
+BANDWIDTH: Final[Array] = np.array([1.0, 1.0, 2.0])
+#: From the setpoint to 63 % of the tilt, s; measured on PX4 0.23, on ArduCopter 0.27.
+RESPONSE_TIME: Final[float] = 0.25
+#: Largest horizontal estimate, m/s^2.
+WIND_MAX: Final[float] = 1.0
+#: Largest vertical estimate, m/s^2.
+THRUST_ERROR_MAX: Final[float] = 3.0
+#: An estimate that exceeds THRUST_OFFSET_MAX by more than its noise, m/s^2, is excessive.
+ESTIMATE_NOISE: Final[float] = 0.1
+#: A horizontal velocity that differs from the expected one by this, m/s, contradicts the
+#: setpoints: they are not flown.
+CONTRADICTION: Final[float] = 0.5
+#: The estimate of the wind is frozen after a contradiction of this duration, s.
+CONTRADICTION_TIME: Final[float] = 1.0
+#: An excessive error of the thrust is a warning after this time, s.
+WARNING_TIME: Final[float] = 1.0
+#: It hands the vehicle over after this time, s.
+THRUST_HANDOVER_TIME: Final[float] = 3.0
+
+
+class DisturbanceObserver:
+    """Estimates the disturbance from the setpoints sent and the velocity measured."""
+
+    def __init__(self) -> None:
+        self._time = -math.inf
+        self._forget()
+
+    def _forget(self) -> None:
+        self.acceleration: Array = np.zeros(3)
+        """The estimate (3,), m/s^2, ENU."""
+        self.excess_since = math.inf
+        """Since when the error of the thrust is excessive, s; infinite: it is not."""
+        self._velocity: Array | None = None
+        self._response: Array = np.zeros(3)
+        self._contradicted_since = math.inf
+
+    def offset(self, wind: bool) -> Array:
+        """
+        Return the acceleration (3,), m/s^2, that offsets the disturbance.
+
+        :param wind: whether the horizontal part is offset, too.
+        """
+        east, north, up = (0.0 - self.acceleration).tolist()
+        up = min(max(up, -THRUST_OFFSET_MAX), THRUST_OFFSET_MAX)
+        return np.array([east, north, up] if wind else [0.0, 0.0, up])
+
+    def step(self, sent: Array | None, velocity: Array | None, now: float) -> None:
+        """
+        Update the estimate to ``now``, s.
+
+        :param sent: acceleration (3,), m/s^2, flown since the last step; None: none of ours, which
+            resets the estimate.
+        :param velocity: measured (3,), m/s; None without one: the estimate stays.
+        """
+        elapsed, self._time = now - self._time, now
+        if sent is None:
+            self._forget()
+            return
+        usable = 0.0 < elapsed <= LONGEST_STEP
+        if usable:
+            self._response = self._response + (sent - self._response) * -math.expm1(
+                -elapsed / RESPONSE_TIME)
+        if velocity is None or self._velocity is None or not usable:
+            self._velocity = velocity
+            return
+        # The difference of two finite velocities may overflow.
+        error = (np.clip(velocity, -SANE, SANE)
+                 - np.clip(self._velocity, -SANE, SANE))
+        self._velocity = self._velocity + elapsed * (
+            self._response + self.acceleration + 2.0 * BANDWIDTH * error)
+        estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
+        contradicted = math.hypot(*error[:2].tolist()) > CONTRADICTION
+        self._contradicted_since = min(self._contradicted_since, now) if contradicted else math.inf
+        frozen = now - self._contradicted_since >= CONTRADICTION_TIME
+        wind = self.acceleration[:2] if frozen else limit_norm(estimate[:2], WIND_MAX)
+        up = min(max(float(estimate[2]), -THRUST_ERROR_MAX), THRUST_ERROR_MAX)
+        self.acceleration = np.array([*wind, up])
+        excessive = abs(up) > THRUST_OFFSET_MAX + ESTIMATE_NOISE
+        self.excess_since = min(self.excess_since, now) if excessive else math.inf
+
+
+#: Up to this difference, m, the vehicle counts as at the commanded height.
+HEIGHT_KEPT: Final[float] = 0.6
+#: A vehicle that moves on by this, m, away from the commanded height leaves it.
+HEIGHT_LEFT: Final[float] = 0.2
+
+
+class HeightWatch:
+    """Finds a height that leaves the commanded one: a thrust that the estimate does not show."""
+
+    def __init__(self) -> None:
+        self.reason = ''
+        """Why the vehicle must be handed over, or ''."""
+        self._kept: float | None = None  # height when it was last at the commanded one, m
+
+    def step(self, height: float | None, commanded: float | None) -> None:
+        """
+        Compare the height with the commanded one, m; None if either is unknown.
+
+        A commanded height that moves away from the vehicle is no fault of the vehicle.
+        """
+        self.reason = ''
+        if height is None or commanded is None or not math.isfinite(height - commanded):
+            self._kept = None
+            return
+        error = height - commanded
+        if self._kept is None or abs(error) <= HEIGHT_KEPT:
+            self._kept = height
+        elif math.copysign(1.0, error) * (height - self._kept) > HEIGHT_LEFT:
+            self.reason = f'height {height:.2f} m, {error:+.1f} m off the commanded one'
