@@ -72,8 +72,8 @@ class Range:
 THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.
 A_MAX = Range(1.5, 20.0, 'm/s^2')
-V_MAX = Range(0.05, 20.0, 'm/s')
-ODOM_TIMEOUT = Range(0.05, 1.0, 's')
+V_MAX = Range(0.05, 5.0, 'm/s')
+ODOM_TIMEOUT = Range(0.1, 1.0, 's')
 
 
 def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,

@@ -53,7 +53,6 @@ from flock_follower.checks.topic_names import (
 from flock_follower.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
 from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
@@ -68,7 +67,13 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
 from flock_follower.parameters.spec import filled
-from flock_follower.parameters.tables import cameras, CameraValues, planner_params, tracker
+from flock_follower.parameters.tables import (
+    cameras,
+    CameraValues,
+    gate_limits,
+    planner_params,
+    tracker,
+)
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
@@ -158,7 +163,7 @@ class Evaluation(Listener):
         # Other inputs of the planner, such as require_bridge, are as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.params, Gate(
-                filled(GateLimits(), bridge), bridge['velocity_source']),
+                gate_limits(bridge), bridge['velocity_source']),
             self, empty, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             cameras={camera.name: (camera.rpy, camera.rectified)

@@ -30,6 +30,7 @@ from flock_desk.scenarios.flock import Flock, Part
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import parameter, Range
+from flock_follower.settings import refuse
 
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
@@ -295,6 +296,7 @@ class FlightParams(Part):
 
     def __post_init__(self) -> None:
         self.planner(True)
+        refuse(vars(self))
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,7 @@ PX4: Final = Profile(
         'MIS_TAKEOFF_ALT': (FLOAT, 2.5),      # m
         'MPC_LAND_SPEED': (FLOAT, 0.7),       # m/s
         'MPC_THR_HOVER': (FLOAT, 0.5),
+        'MPC_USE_HTE': (INT32, 1),            # 1: the hover thrust is estimated in flight
         'MPC_TKO_RAMP_T': (FLOAT, 3.0),       # s in which the climb rate of a take-off rises
         'MPC_XY_VEL_MAX': (FLOAT, 12.0),      # not applied to acceleration setpoints
         'NAV_DLL_ACT': (INT32, 0),            # without a ground station; 0: nothing

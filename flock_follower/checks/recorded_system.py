@@ -23,6 +23,7 @@ from typing import Any, Final
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.findings import Finding, without_consequences
+from flock_follower.checks.flight_settings import check_settings
 from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
 from flock_follower.checks.own_motion import check_own_motion
 from flock_follower.checks.pictures import check_pictures
@@ -62,7 +63,8 @@ def judge_all(seen: Observations) -> list[Finding]:
     if seen.live and not seen.nodes:
         return [check_nodes(seen)]
     return without_consequences(finding for check in (
-        check_topics, check_pictures, check_own_motion, check_machine, check_diagnostics)
+        check_topics, check_pictures, check_own_motion, check_settings, check_machine,
+        check_diagnostics)
         for finding in check(seen))
 
 

@@ -53,7 +53,6 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
@@ -81,8 +80,8 @@ from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.spec import filled
+from flock_follower.parameters.tables import gate_limits, origin, recommendations
 from flock_follower.parameters.tables import MAVLINK_BRIDGE as SPECS
-from flock_follower.parameters.tables import origin, recommendations
 
 # Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)
@@ -125,7 +124,7 @@ class MavlinkBridge(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('mavlink_bridge', **kwargs)
-        self._settings = self.declare(SPECS, partial(filled, GateLimits()), self._flying)
+        self._settings = self.declare(SPECS, gate_limits, self._flying)
         values = self._settings.values
         if values['forward_odometry'] and (
                 self.resolve_topic_name('odom') == self.resolve_topic_name('mavlink/odom')):

@@ -71,6 +71,7 @@ from flock_follower.planner.modes import ARMED_AT_TOPIC, BridgeState, State
 from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
+from flock_follower.settings import judge
 
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node reports it
 
@@ -83,6 +84,8 @@ class Planner(FlockNode):
         self._start: PlannerParams | None = None
         self._settings = self.declare(SPECS, self._build, self._flying)
         values = self._settings.values
+        for judgement in judge(values):
+            self.get_logger().warning(str(judgement))
         self._loop = PlannerLoop(values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf

@@ -45,6 +45,7 @@ from flock_follower.perception.time_offset import MAX_OFFSET, MountedCamera, Tim
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.ranges import Range
+from flock_follower.settings import refuse
 
 #: Default pose of a camera: in front of the middle of the vehicle, looking ahead.
 POSITION: Final = (0.10, 0.0, 0.0)
@@ -278,12 +279,23 @@ def planner_params(values: Mapping[str, Any], name: str = '') -> PlannerParams:
     Return the parameters of the planner's core.
 
     :param name: of this vehicle; the neighbours' file may contain it, too.
-    :raises ValueError: if they do not fit together, or the neighbours' file is wrong.
+    :raises ValueError: if they do not fit together, cannot fly, or the neighbours' file is wrong.
     :raises OSError: if it cannot be read.
     """
     cameras(values)
+    refuse(values)
     return filled(PlannerParams(), values, vehicles={
         other: who for other, who in _vehicles(values['neighbors_file']).items() if other != name})
+
+
+def gate_limits(values: Mapping[str, Any]) -> GateLimits:
+    """
+    Return the limits of the gate in the values of mavlink_bridge.
+
+    :raises ValueError: if they do not fit together, or cannot fly.
+    """
+    refuse(values)
+    return filled(GateLimits(), values)
 
 
 @lru_cache

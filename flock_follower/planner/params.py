@@ -138,20 +138,20 @@ class PlannerParams(Checked):
         0.1, Range(0.02, 1.0, 's'),
         'time between commands')
     predict_timeout: float = parameter(
-        0.5, Range(0.05, 2.0, 's'),
+        0.5, Range(0.2, 2.0, 's'),
         'age up to which a neighbor is extrapolated and followed', live=True)
     heard_timeout: float = parameter(
         1.0, Range(0.05, 5.0, 's'),
         'age up to which a state received from another vehicle is used')
     coast_timeout: float = parameter(
-        2.0, Range(0.05, 10.0, 's'),
+        2.0, Range(0.2, 10.0, 's'),
         'age of the last estimate up to which the vehicle coasts; then it brakes', live=True)
     odom_timeout: float = parameter(
         0.3, ODOM_TIMEOUT,
         'largest age of the odometry for commands; the planner brakes from half of it on or, if '
         'odometry is usually older, when the next message is overdue', live=True)
     perception_timeout: float = parameter(
-        0.2, Range(0.05, 2.0, 's'),
+        0.2, Range(0.1, 1.0, 's'),
         'time without an image processed by relative_pose after which the planner brakes; at '
         'least 2 periods of the camera', live=True)
     max_position_std: float = parameter(
@@ -173,7 +173,7 @@ class PlannerParams(Checked):
         'follow the altitude of the leader, or of the nearest neighbor with an edge, or hold the '
         'one at which it became active', live=True)
     altitude_offset: float = parameter(
-        0.0, Range(-10.0, 10.0, 'm'),
+        0.0, Range(-2.0, 2.0, 'm'),
         'height above the followed neighbor', live=True)
     altitude_min: float = parameter(
         1.0, Range(-1000.0, 1000.0, 'm'),
@@ -196,7 +196,7 @@ class PlannerParams(Checked):
         2.0, Range(0.0, FASTEST, 'm/s'),
         'largest assumed speed of a neighbor out of sight', live=True)
     leader_acceleration_max: float = parameter(
-        1.0, Range(0.0, 20.0, 'm/s^2'),
+        1.0, Range(0.0, 5.0, 'm/s^2'),
         'largest assumed acceleration of a neighbor out of sight; with more the vehicle retreats '
         'earlier', live=True)
     retreat_max: float = parameter(
@@ -212,7 +212,7 @@ class PlannerParams(Checked):
         'face the leader, or the nearest neighbor with an edge, or hold the yaw at which it '
         'became active', live=True)
     yaw_rate_max: float = parameter(
-        1.0, Range(0.05, 6.0, 'rad/s'),
+        1.0, Range(0.2, 6.0, 'rad/s'),
         'largest rate of the commanded yaw, and of the turn to it', live=True)
     scan_rate: float = parameter(
         1.0, Range(0.0, 3.0, 'rad/s'),

@@ -14,6 +14,8 @@
 
 """What disturbs the vehicle is found from what was sent and what became of it."""
 
+import math
+
 from bridge_flight import Flight
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,6 +26,7 @@ import pytest
 from flock_follower.mavlink.disturbance import (
     CONTRADICTION_TIME,
     DisturbanceObserver,
+    HeightWatch,
     THRUST_ERROR_MAX,
     WIND_MAX,
 )
@@ -78,3 +81,28 @@ def test_the_wind_is_set_against(compensation, planner, least, most):
     for _ in range(10):
         flight.fly(0.1)
         assert least < flight.vehicle.velocity[0] < most and abs(flight.vehicle.velocity[1]) < 0.03
+
+
+def watched(heights, commanded):
+    """Return the first height at which the watch hands the vehicle over; None if at none."""
+    watch = HeightWatch()
+    for height, wanted in zip(heights, commanded):
+        watch.step(height, wanted)
+        if watch.reason:
+            return height
+    return None
+
+
+RUNAWAY = [3.0 + 0.01 * k for k in range(200)]
+
+
+@pytest.mark.parametrize(('heights', 'commanded', 'expected'), [
+    (RUNAWAY, [3.0] * 200, 3.81),
+    ([6.0 - height for height in RUNAWAY], [3.0] * 200, 2.19),
+    ([3.0] * 200, RUNAWAY, None),  # the commanded height leaves the vehicle
+    (RUNAWAY, [height + 1.5 for height in RUNAWAY], None),
+    (RUNAWAY, [None] * 200, None), (RUNAWAY, [math.nan] * 200, None),
+    ([4.5 - 0.01 * k for k in range(200)], [3.0] * 200, None)])  # it returns
+def test_a_height_that_leaves_the_commanded_one_is_handed_over(heights, commanded, expected):
+    assert watched(heights, commanded) == (
+        None if expected is None else pytest.approx(expected, abs=0.03))

@@ -56,7 +56,8 @@ def followed(altitude: Altitude, it: Neighbor | None, seconds: float,
 
 
 def flown(seconds: float, leads: Callable[[float], tuple[float, float]] = lambda t: (2.0, 0.0),
-          params: PlannerParams = PARAMS, first: float = 2.0, late: int = 0) -> Iterator[tuple[Altitude, float, float]]:
+          params: PlannerParams = PARAMS, first: float = 2.0, late: int = 0
+          ) -> Iterator[tuple[Altitude, float, float]]:
     """
     Yield the altitude held, the own height and climb at every tick.
 

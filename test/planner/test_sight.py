@@ -39,7 +39,7 @@ from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
 
-PARAMS = PlannerParams(v_max=20.0)
+PARAMS = PlannerParams(v_max=5.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
 
 

@@ -255,6 +255,7 @@ class BridgeReport:
             'limited_by': setpoint.limited if setpoint else '',
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'wind_m_s2': f'{gate.wind:.2f}',
+            'thrust_offset_m_s2': f'{gate.thrust_offset:.2f}',
             'height_m': 'unknown' if place.height is None else f'{place.height:.2f}',
             'distance_from_start_m': 'unknown' if place.offset is None else (
                 f'{math.hypot(*place.offset.tolist()):.2f}'),

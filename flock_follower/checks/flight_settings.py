@@ -1,0 +1,57 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of planner and bridge, judged together with the camera and the marker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+
+from flock_follower.checks.findings import ERROR, Finding, OK, WARNING
+from flock_follower.checks.observations import Observations
+from flock_follower.checks.pictures import camera_model
+from flock_follower.settings import Camera, judge
+
+#: Messages after which a rate counts as measured.
+MEASURED = 10
+
+
+def check_settings(seen: Observations) -> Iterator[Finding]:
+    """Check that the parameters of a live system can fly; a bag is judged with ours."""
+    values = {**seen.parameters.get('planner', {}), **seen.parameters.get('mavlink_bridge', {})}
+    if not values:
+        return
+    found = judge(values, _camera(seen))
+    for each in found:
+        yield Finding(ERROR if each.dangerous else WARNING, 'settings',
+                      f'{each.parameter} = {each.value:g}: {each.why}', each.valid,
+                      f'set {each.parameter}')
+    if not found:
+        yield Finding(OK, 'settings', 'judged together', 'parameters that can fly')
+
+
+def _camera(seen: Observations) -> Camera:
+    """Return the camera and the smallest marker, as far as both are known."""
+    images = seen.topic(seen.image_name)
+    rate = images.rate if len(images.arrivals) >= MEASURED else None
+    if seen.calibration is None:
+        return Camera(rate)
+    try:
+        camera = camera_model(seen)
+    except ValueError:
+        return Camera(rate)
+    focal = float(camera.matrix[1, 1])
+    marker = focal * min(seen.marker_sides.values()) if seen.marker_sides else None
+    return Camera(rate, marker, math.atan(0.5 * camera.height / focal))
