@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""A wrong hover thrust, at every limit that is accepted: planner, bridge and autopilot together."""
+"""A wrong hover thrust at all accepted limits: planner, bridge and autopilot together."""
 
 import math
 
@@ -76,7 +76,8 @@ class FollowingFlight(Flight):
         self.loop.take_odometry(state(time, 'base_link', position, velocity, yaw), arrival)
         if self.steps % 3 == 0:
             seen = now - SEEN_LATE
-            self.loop.take_neighbor(state(seen, 'leader', [1.9, 0.0, self.leader_height], np.zeros(3)))
+            self.loop.take_neighbor(state(
+                seen, 'leader', [1.9, 0.0, self.leader_height], np.zeros(3)))
             self.loop.take_frame(arrival, round(seen * NANOSECONDS))
         if self.steps % PERIOD == 0:
             self.loop.take_bridge_state(self.bridge.state(now), 0.05)
