@@ -31,6 +31,7 @@ Nothing here reads a clock. The assumptions about a neighbor at the time when a 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 from typing import NamedTuple, TypeVar
 
@@ -130,6 +131,12 @@ def at(moving: Moving, now: float) -> Moving:
     """Return the state carried to ``now`` with constant velocity."""
     return moving._replace(
         stamp=now, position=moving.position + (now - moving.stamp) * moving.velocity)
+
+
+def newest(neighbors: Iterable[Neighbor], own: OwnState) -> Neighbor | None:
+    """Return the newest estimate; of equally new ones the nearest, then the first by name."""
+    return min(neighbors, default=None, key=lambda n: (
+        -n.stamp, math.dist(n.position, own.position), n.name))
 
 
 def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -> bool:

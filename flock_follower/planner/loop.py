@@ -22,7 +22,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.messages import (
     AccelerationState,
     Command,
@@ -85,7 +85,8 @@ class PlannerLoop:
         self._own: OdometryState | None = None
         self._newest = 0
         self._ages: deque[float] = deque(maxlen=REMEMBERED)
-        self._accelerations: dict[str, AccelerationState] = {}
+        self._accelerations: list[AccelerationState] = []
+        self._earlier_accelerations: list[AccelerationState] = []
         self._neighbors: list[tuple[OdometryState, bool]] = []
         self._looked: int | None = None
         self._frames: deque[int] = deque(maxlen=FRAMES)
@@ -142,8 +143,8 @@ class PlannerLoop:
         self._newest, self._own, self._frame = state.stamp, state, state.frame
 
     def take_acceleration(self, state: AccelerationState) -> None:
-        """Take the acceleration of a neighbour; it is sent before the neighbour's state."""
-        self._accelerations[state.child] = state
+        """Take the acceleration of a neighbour, before or after the neighbour's state."""
+        self._accelerations.append(state)
 
     def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
         """
@@ -152,9 +153,6 @@ class PlannerLoop:
         :param received: whether another vehicle reported it; else the own camera sees it.
         :raises ValueError: if it is not in the frame of the odometry.
         """
-        reported = self._accelerations.get(neighbor.child)
-        if reported is not None and abs(neighbor.stamp - reported.stamp) <= ACCELERATION_AGE:
-            neighbor = with_acceleration(neighbor, reported)
         if not self._frame:
             return  # without odometry nothing flies: step() reports that
         if neighbor.frame != self._frame:
@@ -200,7 +198,7 @@ class PlannerLoop:
         here = at(me, now).position
         return min(((n.name, math.dist(at(n, now).position, here))
                     for n in self.memory.neighbors.values()),
-                   key=lambda known: (known[0] != faced, known[1]))
+                   key=lambda known: (known[0] != faced, known[1], known[0]))
 
     def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
         """Return the fault of the newest odometry of a tick at a time, ns, or ''."""
@@ -224,9 +222,10 @@ class PlannerLoop:
             self._own.frame == RELATIVE)
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if received else n.acceleration, _yaw(n), received)
+            n.velocity_covariance, None if received else self._acceleration(n), _yaw(n), received)
             for n, received in self._neighbors]
         self._own, self._neighbors = None, []
+        self._earlier_accelerations, self._accelerations = self._accelerations, []
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
@@ -247,6 +246,16 @@ class PlannerLoop:
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.separation_axis,
             self._frame, stamp, nanoseconds - stamp, decision.altitude,
             decision.state is State.RELATIVE)
+
+
+    def _acceleration(self, n: OdometryState) -> Array | None:
+        """Return the acceleration (3,), m/s^2, of a neighbour, by the message nearest in time."""
+        near = [each for each in (*self._earlier_accelerations, *self._accelerations)
+                if each.child == n.child and abs(n.stamp - each.stamp) <= ACCELERATION_AGE]
+        if not near:
+            return n.acceleration
+        return with_acceleration(n, min(near, key=lambda each: (
+            abs(n.stamp - each.stamp), each.stamp, each.vector.tolist()))).acceleration
 
 
 def _yaw(n: OdometryState) -> float | None:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -182,7 +182,11 @@ class Memory(NamedTuple):
 
 def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
-    """Return the memory with the valid new inputs, without old ones, and the rejections."""
+    """
+    Return the memory with the valid new inputs, without old ones, and the rejections.
+
+    The order of the estimates has no influence: everything after this has the order of names.
+    """
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
@@ -208,7 +212,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
     ranged = {name: n for name, n in memory.ranged.items()
               if not untimely(n.stamp, now, params.coast_timeout)}
-    for n in neighbors:
+    for n in in_order(neighbors):
         what, before = 'received estimate' if n.received else 'estimate', kept.get(n.name)
         vague = uncertain(n, params)
         unusable = implausible(n) or untimely(n.stamp, now, longest(n, params))
@@ -230,8 +234,33 @@ def ingest(memory: Memory, now: float, own: OwnState | None, neighbors: Iterable
                 kept[n.name] = n
     ranged = {name: n for name, n in ranged.items()
               if name not in kept or n.stamp > kept[name].stamp}
-    return memory._replace(now=now, own=me, neighbors=kept, ranged=ranged, jumped=jumped,
-                           drag=drag), tuple(rejected)
+    return memory._replace(now=now, own=me, neighbors=by_name(kept), ranged=by_name(ranged),
+                           jumped=jumped, drag=drag), tuple(rejected)
+
+
+def in_order(estimates: Iterable[Neighbor]) -> list[Neighbor]:
+    """Return estimates by name and stamp, in an order that does not depend on the given one."""
+    found = list(estimates)
+    if len(found) > 1:
+        found.sort(key=_rank)
+    return found
+
+
+def _rank(n: Neighbor) -> tuple[Any, ...]:
+    """Return a key that is equal only for equal estimates; NaN has no order, its bytes have."""
+    known = math.isfinite(n.stamp)
+    arrays = (n.position, n.velocity, n.position_covariance, n.velocity_covariance,
+              n.acceleration)
+    return (n.name, known, n.stamp if known else 0.0, n.received,
+            *(b'' if each is None else each.tobytes() for each in arrays), repr((n.stamp, n.yaw)))
+
+
+Known = TypeVar('Known')
+
+
+def by_name(known: dict[str, Known]) -> dict[str, Known]:
+    """Return a mapping in the order of its names: sums and ties then do not depend on history."""
+    return dict(sorted(known.items())) if len(known) > 1 else known
 
 
 def _drag(memory: Memory, before: OwnState, own: OwnState, params: PlannerParams) -> Array:

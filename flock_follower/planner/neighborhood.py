@@ -119,8 +119,8 @@ def edges(held: Collection[str], me: OwnState, flock: Sequence[Neighbor],
 
 def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]) -> Neighbor | None:
     """Return the nearest neighbor, or the one held, unless another is clearly nearer."""
-    return min(flock, default=None, key=lambda n: math.dist(n.position, me.position) / (
-        HELD if n.name == held else 1.0))
+    return min(flock, default=None, key=lambda n: (
+        math.dist(n.position, me.position) / (HELD if n.name == held else 1.0), n.name))
 
 
 KEPT_UP_WITH = 1.1  # times v_max: noise of a leader at v_max is no warning
@@ -167,7 +167,7 @@ def last_known(memory: Memory, neighbors: Neighborhood) -> Neighbor | None:
     """Return the newest estimate of a leader, first of the faced one, then of the last one."""
     names = [each.name for each in (neighbors.faced, memory.leader) if each]
     return min((n for n in neighbors.flock if n.member.role == LEADER), default=memory.leader,
-               key=lambda n: names.index(n.name) if n.name in names else len(names))
+               key=lambda n: (names.index(n.name) if n.name in names else len(names), n.name))
 
 
 def nominal(memory: Memory, state: State, me: OwnState, velocity: Array,

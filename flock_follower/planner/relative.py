@@ -36,7 +36,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
-from flock_follower.planner.inputs import at, expected, Neighbor, OwnState, untimely
+from flock_follower.planner.inputs import at, expected, Neighbor, newest, OwnState, untimely
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
@@ -96,8 +96,8 @@ def step(memory: Memory, own: OwnState, now: float, params: PlannerParams,
     old = untimely(own.stamp, now, params.odom_timeout)
     seen = {name: n for name, n in memory.neighbors.items()
             if not n.received and now - n.stamp <= OLDEST_MARKER}
-    leader = seen.get(memory.faced) or max(
-        (n for n in seen.values() if n.member.role != AVOID), key=lambda n: n.stamp, default=None)
+    leader = seen.get(memory.faced) or newest(
+        (n for n in seen.values() if n.member.role != AVOID), own)
     if old is not None or leader is None:
         return _held(memory, 'no neighbor in sight' if old is None else (
             f'the motion by attitude is {old.detail} old'))

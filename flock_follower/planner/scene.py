@@ -34,12 +34,13 @@ from flock_follower.planner.inputs import (
     at,
     expected,
     Neighbor,
+    newest,
     OwnState,
     Rejection,
     TRUSTED_TIME,
 )
 from flock_follower.planner.limits import REASONS
-from flock_follower.planner.memory import Loss, Memory, observed
+from flock_follower.planner.memory import by_name, Loss, Memory, observed
 from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import gathered, Neighborhood, NOBODY, sought
 from flock_follower.planner.params import AVOID, PlannerParams
@@ -105,8 +106,7 @@ def survey(memory: Memory, me: OwnState, state: State, blinded: bool, params: Pl
     flock = _flock(memory, me.stamp, state, leader, params)
     missed = leader
     if leader is None and neighbors.faced is None:
-        missed = max((n for n in flock.values() if n.member.role != AVOID),
-                     key=lambda n: n.stamp, default=None)
+        missed = newest((n for n in flock.values() if n.member.role != AVOID), me)
     scene = Scene(state, me, blinded, neighbors, leader, missed)
     return memory._replace(
         flock=flock, motions=observed(memory.motions, flock.values()) if flock else memory.motions,
@@ -124,8 +124,8 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
     flock = {name: n for name, n in memory.flock.items() if now - n.stamp <= params.coast_timeout
              or (state is not State.TRACK and n.member.role != AVOID)
              or (leader is not None and leader.name == name)}
-    return flock | {n.name: n for n in memory.neighbors.values()
-                    if state is State.TRACK or n.member.role == AVOID}
+    return by_name(flock | {n.name: n for n in memory.neighbors.values()
+                            if state is State.TRACK or n.member.role == AVOID})
 
 
 def awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:
@@ -150,7 +150,7 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], scene: Scene,
     if not near:  # the odometry jumped: the neighbor is at the near edge of the band, or farther
         free = float(towards @ me.position) + math.sqrt(params.law.d0)
         return Loss(towards, me.position, free, 0.0, float(me.position[2]), np.zeros(3), '')
-    n = min(near, key=lambda n: math.dist(n.position, me.position))
+    n = min(near, key=lambda n: (math.dist(n.position, me.position), n.name))
     x, y, _ = awaited(n, memory, me.stamp, params).position - me.position
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
