@@ -41,10 +41,12 @@ from flock_follower.flock.peers import (
     checked_name,
     FRAME,
     FUTURE,
+    in_order,
     is_covariance,
     leapt,
     MESSAGE_AGE_MAX,
     position_covariance,
+    rank,
     refusal,
     sender_of,
     too_fast,
@@ -93,7 +95,8 @@ class Sharing:
 
     def __init__(self, name: str) -> None:
         self.name = checked_name(name)
-        self.senders: dict[str, Sender] = {}
+        self._senders: dict[str, Sender] = {}
+        self._arrived: list[tuple[OdometryState, int]] = []
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
         self._tracks: defaultdict[str, Track] = defaultdict(Track)
@@ -102,10 +105,17 @@ class Sharing:
         self._echoes: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
         self._events: list[tuple[str, str]] = []
 
+    @property
+    def senders(self) -> dict[str, Sender]:
+        """Return the senders by their names, after all messages taken so far."""
+        self._settle()
+        return self._senders
+
     # In.
 
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
+        self._settle()
         fast, before = too_fast(state), self._own
         if self._refused((fast, 'own odometry not finite, or too fast', fast)):
             return
@@ -119,12 +129,13 @@ class Sharing:
             if self._refused((leap, 'own odometry leapt', f'{leap}: all frames are aligned anew')):
                 self._seen.clear()
                 self._tracks.clear()
-                self.senders.clear()
+                self._senders.clear()
         self._own = state
         self._tracks[self.name].add(track_point(state, True))
 
     def take_seen(self, state: OdometryState) -> None:
         """Take an own sighting of another vehicle, as on ``neighbors``."""
+        self._settle()
         name, before, fast = state.child, self._seen.get(state.child), too_fast(state)
         frame = None if self._own is None else self._own.frame
         doubt = float(position_covariance(state, False).trace())
@@ -149,9 +160,26 @@ class Sharing:
         self._relate_seen(name, point, 1)
 
     def take_message(self, state: OdometryState, received: int) -> None:
-        """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
+        """
+        Take a received message: a vehicle's state in the sender's frame ``NAME/odom``.
+
+        The order of messages that are received at the same time has no influence.
+        """
+        if self._arrived and received != self._arrived[0][1]:
+            self._settle()
+        self._arrived.append((state, received))
+
+    def _settle(self) -> None:
+        """Process the messages that arrived at one time, each sender's own states first."""
+        arrived, self._arrived = self._arrived, []
+        if len(arrived) > 1:
+            arrived.sort(key=lambda message: rank(message[0]))
+        for message in arrived:
+            self._process(*message)
+
+    def _process(self, state: OdometryState, received: int) -> None:
         name = sender_of(state.frame)
-        sender = self.senders.get(name)
+        sender = self._senders.get(name)
         # An own message may come back.
         if self._refused(
                 (not name, 'frame of a message is not unique', f'{state.frame[:70]!r}: must be '
@@ -164,9 +192,9 @@ class Sharing:
             if refused[0] == FUTURE and sender is not None:
                 sender.ban = received + BAN, 'has a clock that is ahead'
             self._refuse(*refused)
-        elif not self._refused((sender is None and len(self.senders) >= SENDERS_MAX,
+        elif not self._refused((sender is None and len(self._senders) >= SENDERS_MAX,
                                 'too many senders', name)):
-            sender = self.senders.setdefault(name, Sender(name))
+            sender = self._senders.setdefault(name, Sender(name))
             sender.received = received
             if not self._refused((received < sender.ban[0], 'ignored for a while',
                                   f'{name} {sender.ban[1]}')):
@@ -212,7 +240,8 @@ class Sharing:
         point = self._tracks[vehicle].at(stamp) if vehicle in self._tracks else None
         if point is not None:
             return point, 1
-        for sender in sorted(self.senders.values(), key=lambda s: (s.hops, s.name != vehicle)):
+        for sender in sorted(self._senders.values(),
+                             key=lambda s: (s.hops, s.name != vehicle, s.name)):
             if sender.hops >= of.hops or sender.frame is None or sender.vague or (
                     vehicle not in sender.tracks):
                 continue
@@ -223,7 +252,7 @@ class Sharing:
 
     def _relate_seen(self, name: str, ours: TrackPoint, hops: float) -> None:
         """Relate the frame of a vehicle that was seen: its own states are newer than an image."""
-        if sender := self.senders.get(name):
+        if sender := self._senders.get(name):
             self._relate(sender, name, sender.tracks[name].at(ours.stamp), ours, hops)
 
     def _relate(self, sender: Sender, vehicle: str, theirs: TrackPoint | None,
@@ -274,7 +303,7 @@ class Sharing:
         self._refuse(f'aligned anew with {sender.name}', why)
         anew = Sender(sender.name, received=sender.received, ages=sender.ages, sent=sender.sent,
                       ban=sender.ban)
-        self.senders[sender.name] = anew
+        self._senders[sender.name] = anew
         return anew
 
     # Out.
@@ -290,7 +319,7 @@ class Sharing:
             self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
             return []
         messages = [state._replace(frame=name + FRAME)
-                    for state in (own._replace(child=name), *self._seen.values())
+                    for state in (own._replace(child=name), *in_order(self._seen))
                     if abs(now - state.stamp) <= STALE
                     and state.stamp != self._sent.get(state.child)]
         for message in messages:
@@ -306,19 +335,19 @@ class Sharing:
         several states of one vehicle are known, the most certain one is used: their errors may be
         correlated.
         """
-        self.senders = {name: each for name, each in self.senders.items()
-                        if now - each.received <= FORGOTTEN}
+        self._senders = {name: each for name, each in self.senders.items()
+                         if now - each.received <= FORGOTTEN}
         own = self._own
         if own is None or now - own.stamp > to_nanoseconds(MESSAGE_AGE_MAX):
             return []
         surest: dict[str, tuple[float, OdometryState]] = {}
-        for sender in self.senders.values():
+        for sender in in_order(self._senders):
             frame = sender.frame
             if frame is not None:
                 frame.drift(now, own.position)
             if frame is None or sender.unusable(now):
                 continue
-            for name, state in sender.states.items():
+            for name, state in sorted(sender.states.items()):
                 age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(name)
                 if name == self.name or age > MESSAGE_AGE_MAX or (
                         seen is not None and now - seen.stamp <= SEEN_TIMEOUT):
@@ -333,10 +362,11 @@ class Sharing:
                     OWN_STATE_SHARE if of_itself else 1.0)
                 if name not in surest or doubt < surest[name][0]:
                     surest[name] = doubt, placed
-        return [aged(state, now) for _, state in surest.values()]
+        return [aged(state, now) for _, state in in_order(surest)]
 
     def new_events(self) -> list[tuple[str, str]]:
         """Return the refusals since the last call."""
+        self._settle()
         events, self._events = self._events, []
         return events
 
@@ -346,7 +376,7 @@ class Sharing:
             return 'no own odometry'
         if self._own.stamp - now > STALE:
             return OWN_FUTURE
-        active = {name: sender.unusable(now) for name, sender in self.senders.items()
+        active = {name: sender.unusable(now) for name, sender in sorted(self.senders.items())
                   if now - sender.received <= to_nanoseconds(MESSAGE_AGE_MAX)}
         if not active:
             return 'no other sender'

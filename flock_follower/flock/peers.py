@@ -25,7 +25,7 @@ from bisect import bisect_left
 import math
 from operator import attrgetter
 import re
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -97,6 +97,22 @@ def refusal(state: OdometryState, received: int) -> tuple[str, str] | None:
         (age > MESSAGE_AGE_MAX, 'message too old',
          f'{age:.2f} s: its clock is behind, or the way is slow'),
         (not known, 'message without a covariance', state.child)) if holds), None)
+
+
+def rank(state: OdometryState) -> tuple[object, ...]:
+    """Return a key of a message that is equal only for equal ones."""
+    arrays = (state.position, state.quaternion, state.velocity, state.angular_velocity,
+              state.pose_covariance, state.twist_covariance, state.twist_rotation)
+    return (state.frame, state.child != sender_of(state.frame), state.stamp, state.child,
+            *(each.tobytes() for each in arrays))
+
+
+Kept = TypeVar('Kept')
+
+
+def in_order(by_name: dict[str, Kept]) -> list[Kept]:
+    """Return values in the order of their names, not in that in which they came."""
+    return [by_name[name] for name in sorted(by_name)]
 
 
 #: Odometry that is further from its prediction than ``ODOMETRY_JUMP``, or this, rad, has leapt ...
