@@ -71,7 +71,8 @@ def drawn(rng: np.random.Generator) -> tuple[PlannerParams, list[Round]]:
         [0.4, 0.9]), 2.0 + rng.choice([-0.4, 0.0, 0.4])]) for name in names}
     velocities = {name: rng.choice([-0.3, 0.0, 0.3], 3) * [1.0, 1.0, 0.3] for name in names}
     together = int(rng.integers(3, TICKS))
-    lost = {name: together if rng.random() < 0.7 else int(rng.integers(2, TICKS)) for name in names}
+    lost = {name: together if rng.random() < 0.7 else int(rng.integers(2, TICKS))
+            for name in names}
     sources = {name: [[False], [True], [False, True]][rng.integers(3)] for name in names}
     rounds = []
     for tick in range(TICKS):
