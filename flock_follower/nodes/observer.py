@@ -65,6 +65,7 @@ from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
 from flock_follower.parameters.tables import alone
+from flock_follower.perception.markers import load
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
