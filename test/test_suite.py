@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+from conftest import Progress
 import pytest
 from suite import main, progress, read_status, Run, Status, verdict
 
@@ -53,6 +55,20 @@ def test_the_status_is_what_a_run_of_tests_wrote(tmp_path: Path) -> None:
     assert read_status(path) == Status()
     path.write_text(json.dumps({'total': 3, 'done': 2, 'failed': 1, 'busy': ['a::b']}))
     assert read_status(path) == Status(3, 2, 1, ('a::b',))
+
+
+def test_a_run_counts_each_test_once_and_names_those_of_a_busy_machine(tmp_path: Path) -> None:
+    path = tmp_path / 'status.json'
+    counted = Progress(str(path))
+    counted.pytest_xdist_node_collection_finished(None, ['a', 'b', 'c'])
+    busy = [('too busy', 'for 50% of the worst 2 s')]
+    for test, failed, properties in (('a', True, busy), ('b', True, []), ('c', False, [])):
+        for when in ('setup', 'call', 'teardown'):
+            counted.pytest_runtest_logreport(SimpleNamespace(
+                nodeid=test, when=when, failed=failed and when != 'setup',
+                user_properties=properties))
+        assert read_status(path).done == 'abc'.index(test) + 1
+    assert read_status(path) == Status(3, 3, 2, ('a',))
 
 
 def test_what_failed_on_a_busy_machine_is_repeated_alone(
