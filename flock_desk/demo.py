@@ -38,6 +38,7 @@ from flock_desk.runs.flight import COUNTED, RECORDED, start
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
     explained,
+    failed,
     free_udp_port,
     private_environment,
     Processes,
@@ -82,7 +83,7 @@ def _demonstrate(out: Path) -> int:
     with locked(out):
         clear(out)
         exit_codes, load = fly(bag, out)
-        with explained(load):
+        with explained(None if failed(exit_codes) else load):
             flight = read_replayed(bag, out, PARAMS)
         summary = replay_figures(flight, exit_codes, load)
         judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS, chapters(flight), load=load)

@@ -49,7 +49,7 @@ from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spaci
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.moving_picture import moving_picture
 from flock_desk.runs.plots import scenario_chapters
-from flock_desk.runs.processes import explained
+from flock_desk.runs.processes import explained, failed
 from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import (
@@ -130,7 +130,7 @@ def _fly(options: argparse.Namespace) -> int:
             clear(options.output / namespace)
         cores, exit_codes, load = fly(scenario, options.scenario, options.seed, duration,
                                       options.output, external, options.followers)
-        with explained(load):
+        with explained(None if failed(exit_codes) else load):
             code = conclude(scenario, options.output, options.followers, cores, exit_codes, load)
         if options.moving:
             with whole_file(options.moving) as file:

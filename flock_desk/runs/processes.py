@@ -21,7 +21,7 @@ its workers need this package in the same version, and the files that tasks name
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
@@ -146,6 +146,11 @@ def explained(load: Load | None) -> Iterator[None]:
         if load is not None and load.busy:
             raise TooBusyError(f'{error}: {load}; close other programs') from error
         raise
+
+
+def failed(exit_codes: Mapping[str, int | None]) -> list[str]:
+    """Return the processes that did not end well, but for those cut off while they waited."""
+    return [name for name, code in exit_codes.items() if code not in (0, TOO_BUSY_EXIT_CODE)]
 
 
 class Processes:

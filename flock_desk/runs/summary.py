@@ -34,7 +34,7 @@ import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation, STATES
 from flock_desk.runs.frame_errors import STAGES, Table
-from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
+from flock_desk.runs.processes import failed, TOO_BUSY_EXIT_CODE
 from flock_desk.runs.record import Flight, LiveFlight
 from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
@@ -205,8 +205,7 @@ def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None],
             'estimate_p50': flight.value('relative_pose', 'stamp_to_estimate_p50_ms', after),
             **{f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
                for p in (50, 95, 99)}},
-        'failed_processes': sum(code not in (0, TOO_BUSY_EXIT_CODE)
-                                for code in exit_codes.values()),
+        'failed_processes': len(failed(exit_codes)),
         'late_processes': sum(code == TOO_BUSY_EXIT_CODE for code in exit_codes.values()),
         'machine': {'waited_share': None if load is None else load.share,
                     'others': None if load is None else load.others}}
