@@ -136,16 +136,14 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
     """
     Return a replayed flight; its time begins with the bag's first image.
 
+    What no node published leaves its figures unknown.
+
     :param out: the folder of the record and the log of the embedded autopilot.
     :param params: that it was flown with.
     :raises BagError: if a record cannot be read.
-    :raises LateError: if a node published nothing.
     """
     record = read_record(out / _RECORD)
-    if missing := {'/neighbors', '/planner/state', '/command/trajectory',
-                   '/diagnostics'} - set(record):
-        raise LateError(f'nothing was published on {", ".join(sorted(missing))}')
-    commands = record['/command/trajectory']
+    commands = record.get('/command/trajectory', [])
     received = np.array([t for t, _ in commands])
     ticks = np.array([tick_time(message) for _, message in commands])
     with open_bag(bag) as opened:
@@ -160,24 +158,25 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
         [*map(from_odometry, states)] for states in (true_leader, true_own))
     table = compared(estimates(_received(record)), own, follower_states, leader_states, stamps,
                      np.ones(len(stamps)), int(stamps[0]))  # its leader is always in view
-    # The bag's clock relative to the monotonic one of the logs.
-    origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
     with np.load(out / 'autopilot.npz') as file:
         log = dict(file)
-    flown, sent = ((log[name] >= received[0]) & (log[name] <= received[-1])
-                   for name in ('state_time', 'setpoint_time'))
+    # The bag's clock relative to the monotonic one of the logs; without a command about so.
+    origin = (stamps[0] / NANOSECONDS + float(np.median(received - ticks)) if commands
+              else float(log['state_time'][-1] - table['time'][-1]))
+    sent = (np.zeros(len(log['setpoint_time']), dtype=bool) if not commands else
+            (log['setpoint_time'] >= received[0]) & (log['setpoint_time'] <= received[-1]))
     return Flight(
         duration=float(table['time'][-1]), params=params, table=table,
         paths={'leader': _positions(leader_states, stamps),
                'follower': _positions(follower_states, stamps)},
         # Its path means nothing in the bag.
-        speeds={REPLAYED: (log['state_time'][flown] - origin,
-                           np.linalg.norm(log['velocity'][flown], axis=1))},
+        speeds={REPLAYED: (log['state_time'] - origin, np.linalg.norm(log['velocity'], axis=1))},
         distance=table['true_distance'][np.isfinite(table['true_distance'])],
         setpoint_times=log['setpoint_time'][sent] - origin,
         setpoints=log['setpoint_acceleration'][sent],
-        states=[(t - origin, m.data) for t, m in record['/planner/state']],
-        diagnostics=[(t - origin, m) for t, m in record['/diagnostics']], command_times=ticks,
+        states=[(t - origin, m.data) for t, m in record.get('/planner/state', [])],
+        diagnostics=[(t - origin, m) for t, m in record.get('/diagnostics', [])],
+        command_times=ticks,
         along_law=along_law([m for _, m in commands], _received(record), own, params.law))
 
 

@@ -121,6 +121,23 @@ def test_commands_and_law_point_the_same_way_unless_a_sign_is_turned(flight: Fli
     assert replay_figures(few, {})['planner']['along_law_share'] is None
 
 
+def test_a_flight_without_a_command_is_judged_by_what_is_known(tmp_path: Path) -> None:
+    times = np.arange(600) / 20
+    with BagWriter(tmp_path / 'record') as record:
+        record.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
+                     round(29.0 * NANOSECONDS), diagnostics())
+    np.savez(tmp_path / 'autopilot.npz', state_time=times, setpoint_time=times[:20],
+             velocity=np.outer(np.linspace(0.0, 6.0, 600), [1.0, 0.0, 0.0]),
+             setpoint_acceleration=np.zeros((20, 3)))
+    judgements = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}))
+    assert {j.bound.key for j in judgements if j.fault} > {
+        'planner.rate_hz', 'planner.along_law_share', 'recall_of_processed', 'setpoints.sent'}
+    # A vehicle that runs away is none of a busy machine.
+    excused = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}), busy=True)
+    assert [j.fault for j in excused if j.verdict == 'FAILED' and 'recall' not in j.fault] == [
+        'speed_max_m_s = 6: must be at most 2']
+
+
 def test_a_process_that_was_cut_off_while_it_waited_is_late_not_failed(flight: Flight) -> None:
     summary = replay_figures(flight, {'planner': 0, 'replay': 3, 'recorder': -9})
     assert (summary['failed_processes'], summary['late_processes']) == (1, 1)
