@@ -4,7 +4,7 @@
 #   make flights   fly every scenario 200 times in lock step, with five controllers (build/flights; many minutes)
 #   make figures   redraw the paper's simulations into build/figures, and the controllers that `make flights` compared
 # Change it
-#   make test      run the test suite (about six minutes on two cores)
+#   make test      run the test suite (about six minutes on two cores); exit code 3 if a machine that is too busy fails it
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
@@ -36,6 +36,7 @@
 #   MARKERS='not ros'   which of its tests: an expression of unit, ros, slow and sweep
 #   SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
+#   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
 #   RUNS=20             how often `make flights` flies each scenario
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
@@ -49,6 +50,7 @@ TESTS ?= test
 MARKERS ?=
 SCENARIO ?= indoor
 AUTOPILOT ?=
+OUTPUT ?=
 TRUTH ?=
 FORWARD ?=
 LEADER ?=
@@ -74,27 +76,17 @@ setup:
 	@requirements/make_venv.sh $(VENV) requirements/lock.txt requirements/vision-$(VISION).txt
 
 demo: setup
-	@$(RUN) -m flock_desk.demo
+	@$(RUN) -m flock_desk.demo --output $(or $(OUTPUT),build/demo)
 
 fly: setup
-	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) --output build/fly \
+	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) \
+		--output $(or $(OUTPUT),build/fly) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
-# The whole suite in two halves side by side: what waits for nodes in real time, and what computes, in the time left. It has
-# a session of its own because Linux shares the processors between sessions first: nice(1) alone would change nothing.
 PYTEST := -m pytest --timeout 600 --timeout-method thread
-PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 test: setup
-ifeq ($(TESTS)$(MARKERS),test)
-	@mkdir -p build
-	@setsid sh -c "echo 19 > /proc/self/autogroup; exec nice -n 19 $(RUN) $(PYTEST) $(PARALLEL) -m 'not ros and not sweep'" \
-		> build/test-not-ros.log 2>&1 & computing=$$!; trap "kill -- -$$computing" INT TERM; \
-	$(RUN) $(PYTEST) -v -m 'ros and not sweep'; waited=$$?; \
-	wait $$computing; computed=$$?; cat build/test-not-ros.log; exit $$((waited | computed))
-else
-	@$(RUN) $(PYTEST) $(PARALLEL) $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
-endif
+	@$(RUN) test/suite.py $(filter-out test,$(TESTS)) $(if $(MARKERS),-m '$(MARKERS)')
 
 test-slow: setup
 	@$(RUN) $(PYTEST) -m sweep

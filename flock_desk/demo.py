@@ -18,7 +18,7 @@ The demonstration: a recorded bag becomes MAVLink setpoints, judged against boun
 ``python -m flock_desk.demo`` starts replay, relative_pose, planner, mavlink_bridge and
 the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that
 other machines cannot receive. Exit code 0 only if every bound holds; 3 if the machine was too
-busy: then nothing is judged.
+busy to judge those on time, and the others hold.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ import argparse
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-import shutil
 import sys
 import time
 
@@ -35,18 +34,20 @@ import numpy as np
 
 from flock_desk.runs.console import guarded
 from flock_desk.runs.figure_table import bounds
-from flock_desk.runs.flight import COMMANDS, COUNTED, RECORDED, start
+from flock_desk.runs.flight import COUNTED, RECORDED, start
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
+    explained,
+    failed,
     free_udp_port,
     private_environment,
     Processes,
-    SchedulingDelay,
 )
-from flock_desk.runs.record import read_replayed
+from flock_desk.runs.record import clear, locked, read_replayed
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.checks.processor import Load
 from flock_follower.files import resource
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
@@ -78,22 +79,25 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _demonstrate(out: Path) -> int:
-    shutil.rmtree(out, ignore_errors=True)
     bag = resource('bags/sample')
-    exit_codes = fly(bag, out)
-    flight = read_replayed(bag, out, PARAMS)
-    summary = replay_figures(flight, exit_codes)
-    judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS, chapters(flight))
-    print()
-    return announce(summary, judgements, [out / 'report.html'], out)
+    with locked(out):
+        clear(out)
+        exit_codes, load = fly(bag, out)
+        with explained(None if failed(exit_codes) else load):
+            flight = read_replayed(bag, out, PARAMS)
+        summary = replay_figures(flight, exit_codes, load)
+        judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS, chapters(flight), load=load)
+        print()
+        return announce(summary, judgements, [out / 'report.html'], out, load)
 
 
-def fly(bag: Path, out: Path) -> dict[str, int | None]:
+def fly(bag: Path, out: Path) -> tuple[dict[str, int | None], Load | None]:
     """
     Replay the bag through all nodes, leaving logs and records in ``out``.
 
-    :returns: the exit code of each process; None for one that had to be killed.
+    :returns: the exit code of each process, see ``Processes.stop``, and the load meanwhile.
     :raises RuntimeError: if a process ends early or a service refuses.
+    :raises TooBusyError: if something came too late because the machine was too busy.
     """
     begin = first_odometry(bag)
     port = free_udp_port()
@@ -111,21 +115,19 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
             '--yaw', f'{np.degrees(yaw_from_quaternion(begin.quaternion)):.1f}',
             '--param-file', str(resource('config/px4.params')),
             '--log', str(out / 'autopilot.npz')])
-        start(processes, parameters, [*RECORDED, COMMANDS, STATE])
+        start(processes, parameters, [*RECORDED, STATE])
         processes.wait_for_log('recorder', 'recording')
         processes.ask('mavlink_bridge/offboard')
         processes.ask('planner/engage')
         replay = processes.start('replay', 'flock_follower.nodes.replay', [
             str(bag), '--ros-args', '-p', f'topics:=[{",".join(PLAYED)}]',
-            '-p', 'wait_for_subscribers:=10.0'], show=True)
-        delay = SchedulingDelay()
-        while replay.poll() is None:
-            delay.check(time.monotonic())
-            time.sleep(0.5)
+            '-p', 'wait_for_subscribers:=10.0'], show=True, ends=True)
+        began = time.monotonic()
+        replay.wait()
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')
         time.sleep(COUNTED)
-        return processes.stop_all()
+        return processes.stop_all(), processes.load.worst(began)
 
 
 def first_odometry(path: Path) -> OdometryState:

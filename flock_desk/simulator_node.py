@@ -46,20 +46,23 @@ from flock_desk.autopilot import Endpoint, loopback_address
 from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
+    IMAGE_RATE,
     LATEST_NS,
     real_time_camera,
     RealTimeFlight,
     RenderedImage,
+    SKIPPED,
     STEP_NS,
 )
 from flock_desk.external.external_autopilot import ExternalAutopilot, ExternalVehicles
-from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
+from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.sensors.vio import Odometry
 from flock_desk.simulator_outputs import LATCHED, ODOMETRY, SimulatorOutputs, VehicleAhead
 from flock_desk.vehicles.embedded import STEP
 from flock_follower.bags.live_line import LiveLine
+from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
@@ -70,6 +73,7 @@ from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
 LATE = 0.5  # s behind the clock from which on /diagnostics reports an error
+TOO_LATE = 5.0  # s behind the clock from which on it may end, see end_if_busy
 #: Poses of an external vehicle arrive up to this much later, ns.
 POSES_LATE_NS = 40_000_000
 #: Messages taken in each service period: the vehicle ahead sends at 50 Hz, too.
@@ -105,8 +109,8 @@ SPECS = [
          "origin of the leader's odom frame in the own odom frame",
          Range(unit='m'), fixed_length=True),
     Spec('end_if_busy', False,
-         'end the flight with exit code 3 if the machine is too busy for the nodes of the parent '
-         'process'),
+         'end with exit code 3 if the flight falls 5 s behind the clock, or loses 2 % of its '
+         'images, because the machine is too busy for the nodes of the parent process'),
     Spec('log', '', '.npz file for the true motion; empty: no log'),
 ]
 
@@ -129,7 +133,9 @@ class Simulator(FlockNode):
         self._early: tuple[float, str] | None = None
         """When the bridge ended the scenario before its time, s, and its state then."""
         self._line = LiveLine()
-        self._delay = SchedulingDelay(os.getppid()) if self._values['end_if_busy'] else None
+        parent = os.getppid()
+        self._load = (LoadMeter(lambda: children(parent)) if self._values['end_if_busy']
+                      else None)
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
         seed = self._values['seed']
         # It takes a second or two: the clock starts after it.
@@ -225,13 +231,23 @@ class Simulator(FlockNode):
             self._line.end()
             if self._values['log'] and self.context.ok():
                 self._save_log()
+            skipped = self._flight.skipped_images
+            if skipped > SKIPPED * IMAGE_RATE * self._flight.time:
+                self._blame(f'{skipped} images were not rendered in time')
         except (OSError, TooBusyError) as error:
-            print(f'error: {error}', file=sys.stderr)
-            return TOO_BUSY_EXIT_CODE if isinstance(error, TooBusyError) else 1
+            busy = isinstance(error, TooBusyError)
+            print(f'{"too busy" if busy else "error"}: {error}', file=sys.stderr)
+            return TOO_BUSY_EXIT_CODE if busy else 1
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
         return 0
+
+    def _blame(self, what: str) -> None:
+        """Raise TooBusyError if the machine was too busy, and the node ends then."""
+        load = None if self._load is None else self._load.worst()
+        if load is not None and load.busy:
+            raise TooBusyError(f'{what}: {load}; close other programs')
 
     def _save_log(self) -> None:
         """
@@ -324,12 +340,14 @@ class Simulator(FlockNode):
         """
         Update the live line and the values of /diagnostics.
 
-        :raises TooBusyError: if the nodes wait too long for a processor.
+        :raises TooBusyError: if the flight is too late because the machine is too busy.
         :raises OSError: if an external vehicle is gone for good.
         """
         flight = self._flight
-        if self._delay is not None and flight.began_ns is not None:
-            self._delay.check(now)
+        if self._load is not None and flight.began_ns is not None:
+            self._load.sample(now)
+            if self._external is None and now - self._step_due() > TOO_LATE:
+                self._blame('the simulator does not keep up with the clock')
         if self._external is not None and (gone := self._external.gone(now)):
             raise OSError(gone)
         self.diagnostics.values['time_s'] = f'{flight.time:.2f}'

@@ -23,7 +23,8 @@ should have; the line below a fault says what to do.
 A line that begins with ``?`` names a property that could not be measured, and why.
 
 Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, or if
-something essential was not measured, 2 for a wrong bag, file or option, or without ROS.
+something essential was not measured, 2 for a wrong bag, file or option, or without ROS, 3 if only
+a busy computer prevents it.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ SECONDS = 6.0
 VALID_SECONDS = Range(1.0, 600.0, 's')
 COLUMNS = 100
 #: Larger files of a recording are left out of a bug report, bytes; the black box writes none.
+TOO_BUSY: Final = 3  # exit code
 LARGEST: Final = 200_000_000
 _MARKS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR', UNMEASURED: '?'}
 
@@ -108,7 +110,14 @@ def main(args: Sequence[str] | None = None) -> int:
         print(json.dumps(as_json(seen, findings), indent=2))
     else:
         print(table(seen, findings))
-    return 0 if ready(findings) else 1
+    return 0 if ready(findings) else TOO_BUSY if too_busy(seen, findings) else 1
+
+
+def too_busy(seen: Observations, findings: Sequence[Finding]) -> str:
+    """Return the load in words if nothing else prevents a flight, else ''."""
+    faults = {finding.what for finding in findings if finding.level == ERROR}
+    return str(seen.machine.load) if seen.busy and not ready(findings) and (
+        faults <= {'processor'}) else ''
 
 
 def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
@@ -174,7 +183,9 @@ def table(seen: Observations, findings: Sequence[Finding]) -> str:
             (levels.count(OK), 'ok'), (levels.count(UNMEASURED), 'not measured')))
     if unknown:
         counts += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
-    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {counts}', COLUMNS)])
+    busy = too_busy(seen, findings)
+    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {counts}', COLUMNS),
+                      *([f'too busy: {busy}'] if busy else [])])
 
 
 def write_report(path: Path, seen: Observations, findings: Sequence[Finding],

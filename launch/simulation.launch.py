@@ -15,7 +15,8 @@
 """
 Start a flight on the desk: the simulator, and the three nodes of a follower.
 
-The exit code is 1 if the simulator ends with an error, or because the machine is too busy.
+The exit code is 1 if the simulator ends with an error, or because the machine is too busy; then
+its last line begins with ``too busy:``.
 """
 
 from pathlib import Path

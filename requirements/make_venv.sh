@@ -39,10 +39,31 @@ if up_to_date "$wanted"; then exit 0; fi
 echo "setting up $venv with $("$python" --version) (a minute, once)"
 rm -rf "$venv"
 "$python" -m venv "$venv"
+log=$venv/pip.log
+count=$(cat "$@" | grep -c '==') || true
+
+# Run pip with a line every 5 s; its whole output only if it fails. PIP_USER=1 would install elsewhere.
+install() {
+  PIP_USER=0 PIP_QUIET=0 "$venv/bin/python" -m pip install --disable-pip-version-check --no-deps "$@" > "$log" 2>&1 &
+  pip=$!
+  trap 'kill "$pip" 2>/dev/null' EXIT
+  trap 'exit 130' INT TERM
+  seconds=0
+  while kill -0 "$pip" 2>/dev/null; do
+    sleep 1
+    seconds=$((seconds + 1))
+    if [ $((seconds % 5)) = 0 ]; then
+      step=$(grep -c '^Collecting\|^Processing\|^Obtaining' "$log") || true
+      if grep -q '^Installing' "$log"; then step='all'; fi
+      echo "  $seconds s: $step of at most $count packages fetched"
+    fi
+  done
+  wait "$pip" || { cat "$log" >&2; echo "error: pip failed, see above" >&2; exit 1; }
+  trap - EXIT
+}
+
 requirements=$(printf -- '-r %s ' "$@")
 # shellcheck disable=SC2086
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps $requirements
-case $* in *lock.txt*)
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . ;;
-esac
+install $requirements
+case $* in *lock.txt*) install --no-build-isolation -e . ;; esac
 printf '%s\n' "$wanted" > "$stamp"

@@ -20,20 +20,26 @@ Keeps every test on this machine and repeatable, and marks it ``unit``, ``ros`` 
 ``slow``: takes seconds, or belongs to a module of such tests; says it itself.
 ``sweep``: more cases of what another test holds; says it itself, and runs with ``make test-slow``.
 ``unit``: all else. A test without ``ros`` that loads rclpy or starts a process of ours fails.
+
+A test with ``ros`` that fails while other programs had the processors says so.
 """
 
 import ast
 from functools import cache
+import json
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 from hypothesis import HealthCheck, settings
 import pytest
 
 from flock_desk.runs.processes import private_environment
+from flock_follower.checks.processor import children, LoadMeter, PERIOD
 
 HERE = Path(__file__).resolve().parent
 
@@ -101,6 +107,82 @@ def pytest_collection_modifyitems(items):
         if not any(item.get_closest_marker(name) for name in ('ros', 'slow', 'sweep')):
             item.add_marker('unit')
     items.sort(key=lambda item: item.get_closest_marker('slow') is None)
+
+
+def family(process):
+    """Return the ids of a process, its children, and theirs."""
+    return [process, *(one for child in children(process) for one in family(child))]
+
+
+LOAD = LoadMeter(lambda: family(os.getpid()))
+
+
+def measure_load():
+    """Measure the load of this process and its nodes as long as it lives."""
+    while True:
+        LOAD.sample(time.monotonic())
+        time.sleep(PERIOD)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Add the load to the report of a test of nodes that failed on a busy machine."""
+    report = yield
+    if report.failed and item.get_closest_marker('ros'):
+        load = LOAD.worst(time.monotonic() - call.duration - PERIOD)
+        if load is not None and load.busy:
+            report.user_properties.append(('too busy', str(load)))
+            report.sections.append(('too busy', f'{load}: this may be why'))
+    return report
+
+
+class Progress:
+    """
+    Counts the tests of a run, and writes the counts to a file after each.
+
+    :param path: of the file; '': none is written.
+    """
+
+    def __init__(self, path):
+        self.path, self.total, self.done = path, 0, 0
+        self.failed, self.busy = {}, {}
+
+    def pytest_collection_finish(self, session):
+        self.total = self.total or len(session.items)
+        self.write()
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_xdist_node_collection_finished(self, node, ids):
+        self.total = len(ids)
+
+    def pytest_runtest_logreport(self, report):
+        if report.when == 'teardown':
+            self.done += 1
+        if report.failed:
+            self.failed[report.nodeid] = True
+            if load := dict(report.user_properties).get('too busy'):
+                self.busy[report.nodeid] = load
+        self.write()
+
+    def write(self):
+        """Write the status, whole."""
+        if self.path:
+            part = Path(f'{self.path}.part')
+            part.write_text(json.dumps({
+                'total': self.total, 'done': self.done, 'failed': len(self.failed),
+                'busy': [*self.busy]}))
+            part.replace(self.path)
+
+    def pytest_terminal_summary(self, terminalreporter):
+        for test, load in self.busy.items():
+            terminalreporter.write_line(f'too busy: {test}: {load}')
+
+
+def pytest_configure(config):
+    """Measure the load, where tests run; count them, where they are reported."""
+    threading.Thread(target=measure_load, daemon=True).start()
+    if not hasattr(config, 'workerinput'):
+        config.pluginmanager.register(Progress(os.environ.pop('FLOCK_FOLLOWER_TEST_STATUS', '')))
 
 
 @pytest.fixture(autouse=True)

@@ -35,6 +35,7 @@ from flock_follower.checks.observations import (
     TopicEnd,
     TopicSeen,
 )
+from flock_follower.checks.processor import Load
 from flock_follower.checks.recorded_system import judge_all
 from flock_follower.checks.topic_names import names_there, TYPES
 from flock_follower.files import resource
@@ -213,7 +214,7 @@ def healthy(live: bool = True) -> Observed:
         shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
         statuses={node: NodeStatus(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
               for node in OURS} if live else {},
-        machine=Machine(4, 0.6, 8000.0, True, domain='0'))
+        machine=Machine(Load(0.01, 0.4, 4), 8000.0, True, domain='0'))
 
 
 BRIDGE = {'link': 'alive', 'autopilot': 'PX4', 'mode': 'POSCTL', 'armed': 'False',

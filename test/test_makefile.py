@@ -42,3 +42,19 @@ def test_every_version_that_is_offered_has_a_lock(version):
     assert ended.returncode == 0
     assert f'requirements/vision-{version}.txt' in ended.stdout
     assert (ROOT / 'requirements' / f'vision-{version}.txt').is_file()
+
+
+@pytest.mark.parametrize(('command', 'default'), [('demo', 'build/demo'), ('fly', 'build/fly')])
+def test_a_flight_writes_to_the_folder_that_is_given(command, default):
+    for given, folder in (([], default), (['OUTPUT=elsewhere'], 'elsewhere')):
+        ended = make(command, *given)
+        assert ended.returncode == 0 and f'--output {folder}' in ended.stdout
+
+
+@pytest.mark.parametrize(('given', 'arguments'), [
+    ([], ''), (['TESTS=test/flocks'], 'test/flocks'),
+    (['MARKERS=not ros', 'TESTS=test/flocks test/runs'], "test/flocks test/runs -m 'not ros'")])
+def test_the_suite_runs_all_tests_or_those_that_are_named(given, arguments):
+    ended = make('test', *given)
+    assert ended.returncode == 0
+    assert ended.stdout.splitlines()[-1].strip().endswith(f'test/suite.py {arguments}'.strip())

@@ -50,6 +50,7 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 #: An image that is due for longer than this is left out, ns: if the machine does not keep up,
 #: odometry and vehicle come first.
 LATEST_NS = 30_000_000
+SKIPPED = 0.02  # of the images: more that are left out show in the flight
 SENSOR = Sensor(sub_poses=2)
 
 

@@ -24,6 +24,7 @@ on the flight (reasons, outages, processes) are named by their last part.
 from __future__ import annotations
 
 from collections.abc import Mapping
+import math
 from typing import Final, NamedTuple
 
 from flock_desk.runs.judge import FigureBound
@@ -40,6 +41,8 @@ class Figure(NamedTuple):
     :param shown: whether it is printed on the console without a bound, too.
     :param demo: its bounds in ``demo``; :param fly: in ``fly``; :param external: in ``fly`` on an
         external autopilot, if they are others.
+    :param load: how far beyond its bounds a busy machine can push it: a number, the name of a
+        limit of the flight, or LATE.
     """
 
     words: str
@@ -47,44 +50,54 @@ class Figure(NamedTuple):
     demo: Ends | None = None
     fly: Ends | None = None
     external: Ends | None = None
+    load: float | str = 0.0
 
+
+#: Any distance: processes that wait for a processor are late by any time, or lose images.
+LATE: Final = math.inf
 
 FIGURES: Final[dict[str, Figure]] = {
     'bag': Figure('bag'),
     'scenario': Figure('scenario'),
-    'duration_s': Figure('duration, s', True, external=('planned', None)),
+    'duration_s': Figure('duration, s', True, external=('planned', None), load=LATE),
     'frames': Figure('images', True),
     'frames_in_view': Figure('images with the leader in view'),
-    'processed_share': Figure('share of images looked at in time', demo=(0.9, None)),
-    'recall': Figure('share of images in view with an estimate (recall)', True, fly=(0.9, None)),
+    'processed_share': Figure('share of images looked at in time', demo=(0.9, None), load=LATE),
+    'recall': Figure('share of images in view with an estimate (recall)', True, fly=(0.9, None),
+                     load=LATE),
     'recall_of_processed': Figure('share of images looked at with an estimate',
                                   demo=(0.99, None)),
     'longest_gap_in_view_s': Figure('longest time without an estimate, leader in view, s',
-                                    fly=(None, 0.5)),
+                                    fly=(None, 0.5), load=LATE),
     'time_in_band_share': Figure('share of time in the band', True, fly=(1, None),
-                                 external=(0.99, None)),
+                                 external=(0.99, None), load=LATE),
     'distance_m': Figure('estimated distance, m', True),
     'true_distance_m': Figure('true distance, m', True),
-    'true_distance_m.min': Figure('least', True, demo=('near', None), fly=('near', None)),
+    'true_distance_m.min': Figure('least', True, demo=('near', None), fly=('near', None),
+                                  load=LATE),
     'true_distance_m.max': Figure('greatest', True, demo=(None, 'far'), fly=(None, 'far'),
-                                  external=(None, None)),
+                                  external=(None, None), load=LATE),
     'distance_rms_m': Figure('error of the distance, RMS, m', True),
     'distance_bias_m': Figure('error of the distance, mean, m', True),
     'position_rms_m': Figure('error of the relative position, RMS of the vector, m', True,
                              demo=(None, 0.05)),
     'position_bias_m': Figure('error of the relative position, mean by axis, m'),
     'velocity_rms_m_s': Figure('error of the relative velocity, RMS of the vector, m/s', True,
-                               demo=(None, 0.15)),
+                               demo=(None, 0.15), load=LATE),
     'velocity_rms_of_all_m_s': Figure('the same RMS of velocities, refused ones too, m/s',
-                                      demo=(None, 0.15)),
+                                      demo=(None, 0.15), load=LATE),
     'velocity_bias_m_s': Figure('error of the relative velocity, mean by axis, m/s'),
     'nees_position': Figure('consistency of positions (NEES; 3 is expected)', True),
     'nees_velocity': Figure('consistency of velocities (NEES; 3 is expected)', True),
     'orientation_wrong_share': Figure("share with the leader's attitude wrong by over 20°", True),
-    'altitude_off_m': Figure("farthest from the leader's height, m", external=(None, 0.3)),
+    'altitude_off_m': Figure("farthest from the leader's height, m", external=(None, 0.3),
+                             load=LATE),
     'own_speed_max_m_s': Figure('greatest speed of the follower in the bag, m/s', True),
     'faster_than_v_max_share': Figure('share of time it is faster than v_max', True),
-    'speed_max_m_s': Figure('greatest speed, m/s', demo=(None, 'speed'), fly=(None, 'speed')),
+    # While setpoints are late the autopilot keeps the last one for 0.5 s (COM_OF_LOSS_T), and the
+    # bridge brakes by a velocity that may be 0.5 s old: 1 s at a_max.
+    'speed_max_m_s': Figure('greatest speed, m/s', demo=(None, 'speed'), fly=(None, 'speed'),
+                            load='a_max'),
     'leader_speed_max_m_s': Figure('greatest speed of the leader, m/s', True),
     'leader_faster_than_v_max': Figure('leader faster than v_max for over 1 s', True),
     'check': Figure('found by the rules of check'),
@@ -93,10 +106,12 @@ FIGURES: Final[dict[str, Figure]] = {
     'detections.roi': Figure('roi: search near there'),
     'detections.full': Figure('full: search everywhere'),
     'rejections': Figure('not used, and why', True),
-    'planner.rate_hz': Figure('rate, Hz', demo=(9.9, 10.1)),
+    'planner.rate_hz': Figure('rate, Hz', demo=(9.9, 10.1), load=LATE),
+    'planner.along_law_share': Figure('share of commands that point along the law',
+                                      demo=(0.5, None), fly=(0.5, None)),
     # A shared machine may stall for a tick or two; the bridge brakes meanwhile, as it should.
-    'planner.missed_ticks': Figure('ticks missed', demo=(None, 3)),
-    'planner.missed_ticks_share': Figure('share of ticks missed', fly=(None, 0.005)),
+    'planner.missed_ticks': Figure('ticks missed', demo=(None, 3), load=LATE),
+    'planner.missed_ticks_share': Figure('share of ticks missed', fly=(None, 0.005), load=LATE),
     'planner.acceleration_max_m_s2': Figure('greatest acceleration, m/s²'),
     'planner.states': Figure('ticks in each state', True),
     'planner.hold_count': Figure('times in HOLD'),
@@ -105,21 +120,25 @@ FIGURES: Final[dict[str, Figure]] = {
     'planner.warning': Figure('first warning', True),
     'holds': Figure('HOLD of the planner: how long, and why', True),
     'setpoints': Figure('setpoints', True),
-    'setpoints.sent': Figure('sent', demo=(1, None)),
-    'setpoints.rate_hz': Figure('rate, Hz', demo=(19.5, 30.5)),
+    'setpoints.sent': Figure('sent', demo=(1, None), load=LATE),
+    'setpoints.rate_hz': Figure('rate, Hz', demo=(19.5, 30.5), load=LATE),
     'setpoints.acceleration_max_m_s2': Figure('greatest acceleration, m/s²', True,
                                               demo=(None, 'a_max'), fly=(None, 'a_max')),
     'setpoints.reasons': Figure('reasons given'),
     'latency_ms': Figure('from image to MAVLink, ms', True),
-    'latency_ms.p50': Figure('median', True, demo=(None, 120)),
-    'latency_ms.p95': Figure('95 % below', True, demo=(None, 180)),
-    'latency_ms.p99': Figure('99 % below', True, demo=(None, 200)),
+    # Newer images replace those that wait for a processor: this one grows by a late camera alone.
+    # The scenario `latency` reaches 280.
+    'latency_ms.estimate_p50': Figure('from image to estimate, median', True, demo=(None, 120),
+                                      fly=(None, 300)),
+    'latency_ms.p50': Figure('median', True, demo=(None, 120), load=LATE),
+    'latency_ms.p95': Figure('95 % below', True, demo=(None, 180), load=LATE),
+    'latency_ms.p99': Figure('99 % below', True, demo=(None, 200), load=LATE),
     'outages': Figure('outages', True),
     'hold_after_s': Figure('it held after, s'),
     'track_after_s': Figure('followed again after, s'),
     'problems': Figure('problems reported by the nodes, seconds each'),
     'external': Figure('autopilot elsewhere'),
-    'external.pace': Figure('pace of its clock by ours', external=(0.9, None)),
+    'external.pace': Figure('pace of its clock by ours', external=(0.9, None), load=LATE),
     'external.ended_early': Figure('ended early by the bridge'),
     'skipped_images': Figure('images not rendered in time', True),
     'cpu_ms_per_frame': Figure('CPU time of perception per image, ms', True),
@@ -128,8 +147,13 @@ FIGURES: Final[dict[str, Figure]] = {
     'timings.wall_time_s': Figure('in all, s'),
     'timings.cpu_ms': Figure('CPU time, ms'),
     'cpu_cores': Figure('CPU, in cores', True),
-    'cpu_cores.total': Figure('all processes', True, fly=(None, 1.5)),
+    'cpu_cores.total': Figure('all processes', True, fly=(None, 1.5), load=LATE),
     'failed_processes': Figure('processes that did not end well', demo=(None, 0), fly=(None, 0)),
+    'late_processes': Figure('processes cut off while they waited for a processor', demo=(None, 0),
+                             fly=(None, 0), load=LATE),
+    'machine': Figure('other programs', True),
+    'machine.waited_share': Figure('waited for them, share of the worst 2 s'),
+    'machine.others': Figure('processors that they used then'),
     # Of a column of followers.
     'column_of': Figure('scenario'),
     'nearest_m': Figure('nearest any two came, m'),
@@ -176,5 +200,6 @@ def bounds(command: str, limits: Mapping[str, float]) -> dict[str, FigureBound]:
             ends = figure.external or ends
         if ends is not None and ends != (None, None):
             least, most = (limits[end] if isinstance(end, str) else end for end in ends)
-            found[key] = FigureBound(key, least, most)
+            load = limits[figure.load] if isinstance(figure.load, str) else figure.load
+            found[key] = FigureBound(key, least, most, load)
     return found

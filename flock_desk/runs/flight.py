@@ -35,18 +35,19 @@ import numpy as np
 
 from flock_desk.runs.processes import (
     free_udp_port,
+    LateError,
     private_environment,
     Processes,
-    SchedulingDelay,
     wait_until,
 )
 from flock_desk.scenarios.scenario import Scenario
+from flock_follower.checks.processor import Load
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.transport import open_transport
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
-            '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
-COMMANDS = 'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory'
+            '/diagnostics:diagnostic_msgs/msg/DiagnosticArray',
+            'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory']
 SIH_TRUTH = 'udpin:127.0.0.1:19410'  # where PX4's SIH sends the truth
 ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
 START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
@@ -109,17 +110,17 @@ def spacing(scenario: Scenario) -> float:
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         external: External | None = None, followers: int = 1
-        ) -> tuple[dict[str, float], dict[str, int | None]]:
+        ) -> tuple[dict[str, float], dict[str, int | None], Load | None]:
     """
     Fly a scenario through all nodes, leaving logs and records in ``out``.
 
     :param name: of the scenario, as the simulator shall load it.
     :param external: the autopilot that flies the follower; None: the embedded one.
     :param followers: how many fly in a column; the logs of each are in ``namespaces``.
-    :returns: each process's CPU time as a share of the flight, and its exit code, None for one
-        that had to be killed.
+    :returns: each process's CPU time as a share of the flight, its exit code, see
+        ``Processes.stop``, and the load during the flight, None if it is unknown.
     :raises RuntimeError: if a process ends early or a service refuses, with the reason.
-    :raises TooBusyError: if the machine is too busy.
+    :raises TooBusyError: if something came too late because the machine was too busy.
     """
     fleet = namespaces(followers)
     with Processes(private_environment(), out) as processes:
@@ -130,7 +131,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             parameters = parameters_of_nodes(
                 scenario, name, seed + i, duration, out / namespace, external,
                 fleet[i - 1] if i else '', i + 1)
-            start(processes, parameters, [*RECORDED, *([COMMANDS] if external else [])],
+            start(processes, parameters, RECORDED,
                   namespace, show=i == 0)
         try:
             for namespace in reversed(fleet):  # the first one flies off when it is engaged
@@ -141,6 +142,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
                     call(processes, f'{prefix}mavlink_bridge/arm')
                 call(processes, f'{prefix}mavlink_bridge/offboard')
                 call(processes, f'{prefix}planner/engage')
+            began = time.monotonic()
             cores = watch(processes, duration, external is not None)
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
             if early:
@@ -162,7 +164,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         for recorder, code in exit_codes.items():
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
-        return cores, exit_codes
+        return cores, exit_codes, processes.load.worst(began)
 
 
 def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorded: Sequence[str],
@@ -186,7 +188,7 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
             f'{prefix}{node}',
             'flock_desk.simulator_node' if simulates else f'flock_follower.nodes.{node}',
             ['--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
-            show=show and simulates)
+            show=show and simulates, ends=simulates)
 
 
 def simulators_of(processes: Processes) -> list[subprocess.Popen[bytes]]:
@@ -265,10 +267,10 @@ def watch(processes: Processes, duration: float, external: bool) -> dict[str, fl
     the vehicle is disarmed, which is not waited for here; the scenario has also ended if the
     bridge reports so.
 
-    :raises RuntimeError: if the simulator does not keep up, or something ends early.
-    :raises TooBusyError: if the machine is too busy.
+    :raises LateError: if the simulator does not keep up.
+    :raises RuntimeError: if it ends early.
     """
-    simulators, delay = simulators_of(processes), SchedulingDelay()
+    simulators = simulators_of(processes)
     begin = now = time.monotonic()
     used = before = processes.cpu()
     while None in (codes := [simulator.poll() for simulator in simulators]) and not any(codes):
@@ -277,9 +279,8 @@ def watch(processes: Processes, duration: float, external: bool) -> dict[str, fl
                          or ended_by_bridge(processes.log('mavlink_bridge'))):
             break
         if now > begin + duration + PATIENCE:
-            raise RuntimeError('the simulator does not keep up with the clock')
+            raise LateError('the simulator does not keep up with the clock')
         used = {**used, **processes.cpu()}
-        delay.check(now)
         time.sleep(0.2)
     else:
         if external and not any(codes) and not ended_by_bridge(processes.log('mavlink_bridge')):
@@ -312,7 +313,8 @@ def call(processes: Processes, service: str, value: Sequence[str] = ('true',),
     Call a service.
 
     :param value: see ``Processes.ask``.
-    :raises RuntimeError: if it goes on refusing, or the simulator has ended, with the reason.
+    :raises LateError: if it goes on refusing, with the reason.
+    :raises RuntimeError: if the simulator has ended, or a node has.
     """
     simulators = simulators_of(processes)
     answer = processes.ask(service, timeout, lambda: (

@@ -40,11 +40,16 @@ COUNTERS = ('rejections.', 'setpoints.reasons.')
 
 
 class FigureBound(NamedTuple):
-    """A figure and the bounds that it must keep, both included; None is no bound."""
+    """
+    A figure and the bounds that it must keep, both included; None is no bound.
+
+    ``load``: how far beyond them a busy machine can push the figure; infinite: any distance.
+    """
 
     key: str
     least: float | None = None
     most: float | None = None
+    load: float = 0.0
 
     def __str__(self) -> str:
         """Return the bounds as text, such as '≥ 9.9, ≤ 10.1'."""
@@ -53,11 +58,17 @@ class FigureBound(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """A bound, the figure found, and its fault, or ''."""
+    """A bound, the figure found, and its fault, or ''; ``judged``: whether the bound counts."""
 
     bound: FigureBound
     figure: float | None
     fault: str
+    judged: bool = True
+
+    @property
+    def verdict(self) -> str:
+        """Return 'ok', 'FAILED' or 'not judged'."""
+        return 'not judged' if not self.judged else 'FAILED' if self.fault else 'ok'
 
 
 def load_bounds(path: str | Path) -> list[FigureBound]:
@@ -103,11 +114,18 @@ def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> 
                              f'{", ".join(near)}')
 
 
-def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[Judgement]:
-    """Return the verdict on every bound; a figure that is None or not finite breaks its bound."""
+def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any],
+          busy: bool = False) -> list[Judgement]:
+    """
+    Return the verdict on every bound; a figure that is None or not finite breaks its bound.
+
+    :param busy: whether the machine was too busy. Then a broken bound is not judged if load can
+        push the figure as far. A bound that holds does hold: load improves no figure.
+    """
     figures, judgements = dict(flat(summary)), []
     for bound in bounds:
-        key, least, most = bound
+        key, least, most, load = bound
+        excess = math.inf  # of an unknown figure
         figure = figures.get(key, 0 if key.startswith(COUNTERS) else None)
         fault = ''
         if figure is None:
@@ -116,9 +134,12 @@ def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[J
             fault = f'{key} = {figure}: must be finite'
         elif least is not None and figure < least:
             fault = f'{key} = {figure:.6g}: must be at least {least:g}'
+            excess = least - figure
         elif most is not None and figure > most:
             fault = f'{key} = {figure:.6g}: must be at most {most:g}'
-        judgements.append(Judgement(bound, figure, fault))
+            excess = figure - most
+        judged = not (busy and fault and (excess <= load or figure is None))
+        judgements.append(Judgement(bound, figure, fault, judged))
     return judgements
 
 

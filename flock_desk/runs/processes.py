@@ -21,8 +21,7 @@ its workers need this package in the same version, and the files that tasks name
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import contextlib
 from functools import cache
@@ -39,14 +38,19 @@ import time
 from types import FrameType, TracebackType
 from typing import TypeVar
 
+from flock_follower.checks.processor import (
+    Load,
+    LoadMeter,
+    longest_wait,
+    PERIOD,
+    stopped,
+    threads_of,
+)
 from flock_follower.checks.system import dead_segments
 from flock_follower.files import resource
 
-#: A flight is not judged if its processes, ready to run, wait for a processor for more than this
-#: share of the time for which they wait or run, over so long, s.
-BUSY_SHARE = 0.88
-BUSY_WINDOW = 8.0
 TOO_BUSY_EXIT_CODE = 3
+LONGEST_STOP = 60.0  # s until a process is killed, however long it waits for a processor
 PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
 SCHEDULER_TIMEOUT = 10.0  # s to find the scheduler of a cluster
@@ -125,49 +129,28 @@ def _end(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
+class LateError(RuntimeError):
+    """Something did not happen in time, which a busy machine explains."""
+
+
 class TooBusyError(Exception):
     """The machine gave the processes too little processor time to judge them."""
 
 
-class SchedulingDelay:
-    """
-    The share of time for which the children of a process, ready to run, wait for a processor.
+@contextlib.contextmanager
+def explained(load: Load | None) -> Iterator[None]:
+    """Raise TooBusyError for what came too late inside the block, if the load was too high."""
+    try:
+        yield
+    except (LateError, TimeoutError) as error:
+        if load is not None and load.busy:
+            raise TooBusyError(f'{error}: {load}; close other programs') from error
+        raise
 
-    :param parent: the id of that process; by default this one.
-    :param proc: the folder of the kernel's process files.
-    """
 
-    def __init__(self, parent: int | None = None, proc: Path = Path('/proc')) -> None:
-        self._parent = os.getpid() if parent is None else parent
-        self._proc = proc
-        self._history: deque[tuple[float, dict[Path, list[int]]]] = deque()
-
-    def check(self, now: float) -> None:
-        """
-        Read the schedulers' counters at a time, s; at most twice per second.
-
-        :raises TooBusyError: if they wait for more than ``BUSY_SHARE`` over ``BUSY_WINDOW``.
-        """
-        if self._history and now - self._history[-1][0] < 0.5:
-            return
-        counters: dict[Path, list[int]] = {}  # ns run and waited, of each thread
-        for tasks in self._proc.glob(f'{self._parent}/task/*/children'):
-            with contextlib.suppress(OSError, ValueError):  # a thread that has ended
-                for child in tasks.read_text(encoding='ascii').split():
-                    for path in self._proc.glob(f'{child}/task/*/schedstat'):
-                        counters[path] = [*map(int, path.read_text(encoding='ascii').split())]
-        self._history.append((now, counters))
-        began, before = self._history[0]
-        if now - began < BUSY_WINDOW:
-            return
-        self._history.popleft()
-        ran, waited = (sum(counters[path][k] - before[path][k]
-                           for path in counters.keys() & before.keys()) for k in (0, 1))
-        if waited > BUSY_SHARE * (ran + waited):
-            raise TooBusyError(
-                f'the processes waited for a processor for {waited / (ran + waited):.0%} of the '
-                f'last {BUSY_WINDOW:g} s (load {os.getloadavg()[0]:.0f} on {os.cpu_count()} '
-                'processors): close other programs; nothing is judged')
+def failed(exit_codes: Mapping[str, int | None]) -> list[str]:
+    """Return the processes that did not end well, but for those cut off while they waited."""
+    return [name for name, code in exit_codes.items() if code not in (0, TOO_BUSY_EXIT_CODE)]
 
 
 class Processes:
@@ -175,7 +158,8 @@ class Processes:
     A group of child processes with a log file each; leaving the ``with`` block stops them all.
 
     So do SIGTERM and SIGHUP (a closed terminal, a job past its time) to the process that is in the
-    block, where its main thread is. Against SIGKILL of that process there is no help.
+    block, where its main thread is. Against SIGKILL of that process there is no help. Inside the
+    block a thread measures the ``load``; what comes too late on a busy machine is a TooBusyError.
 
     :param environment: the children's environment, see :func:`private_environment`.
     :param log_folder: where ``NAME.log`` holds each child's stdout and stderr.
@@ -185,11 +169,19 @@ class Processes:
         self.environment = environment
         self.log_folder = log_folder
         self.children: dict[str, subprocess.Popen[bytes]] = {}
+        self.load = LoadMeter(lambda: [os.getpid(), *(
+            child.pid for child in [*self.children.values()])])
+        self._ending: set[str] = set()
+        self._left = threading.Event()
         log_folder.mkdir(parents=True, exist_ok=True)
 
     def start(self, name: str, module: str, arguments: Sequence[str] = (), *,
-              show: bool = False) -> subprocess.Popen[bytes]:
-        """Start ``python -m MODULE ARGUMENTS``; ``show`` leaves its output on the terminal."""
+              show: bool = False, ends: bool = False) -> subprocess.Popen[bytes]:
+        """
+        Start ``python -m MODULE ARGUMENTS``.
+
+        :param show: leave its output on the terminal. :param ends: whether it ends by itself.
+        """
         command = [sys.executable, '-m', module, *arguments]
         with open(self.log_folder / f'{name}.log', 'wb') as log:
             output = {} if show else {'stdout': log, 'stderr': subprocess.STDOUT}
@@ -198,7 +190,20 @@ class Processes:
                 command, env=self.environment, start_new_session=True,
                 stdin=subprocess.DEVNULL, **output)  # type: ignore[call-overload]
         self.children[name] = child
+        self._ending.discard(name)
+        if ends:
+            self._ending.add(name)
         return child
+
+    def broken(self) -> str:
+        """Return which child has ended or was stopped, '' if none: no load does that."""
+        for name, child in self.children.items():
+            if name not in self._ending:
+                if (code := child.poll()) is not None:
+                    return f'{name} ended early, with exit code {code}'
+                if stopped(child.pid):
+                    return f'{name} was stopped by a signal'
+        return ''
 
     def log(self, name: str) -> str:
         """Return the output of a child so far."""
@@ -245,7 +250,8 @@ class Processes:
 
         :param given_up: returns why to stop asking, '' to go on.
         :param value: ``('false',)``, or ``()`` for a Trigger.
-        :raises RuntimeError: if it has not succeeded after ``timeout`` seconds, with the reason.
+        :raises LateError: if it has not succeeded after ``timeout`` seconds, with the reason.
+        :raises RuntimeError: if it is given up, or a child is broken.
         """
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout
@@ -253,28 +259,41 @@ class Processes:
             # Time to find the service, or the last answer would hide why it was refused before.
             left = max(deadline - time.monotonic(), FIND_TIMEOUT)
             child = self.start(name, 'flock_follower.nodes.call',
-                               [service, *value, '--timeout', f'{left:g}'])
+                               [service, *value, '--timeout', f'{left:g}'], ends=True)
             while child.poll() is None:
-                if reason := given_up():
+                if reason := given_up() or self.broken():
                     raise RuntimeError(reason)
                 time.sleep(0.02)
             answer = self.last_line(name)
             if child.returncode == 0:
                 return answer
             if time.monotonic() > deadline:
-                raise RuntimeError(answer.removeprefix('error: '))
+                raise LateError(answer.removeprefix('error: '))
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
-        """Send SIGINT, wait, and return the exit code; None if SIGKILL was needed."""
+        """
+        Send SIGINT, wait, and return the exit code; None if SIGKILL was needed.
+
+        1 if it ended earlier by itself and should not. The time for which it waits for a processor
+        is added to ``timeout``; TOO_BUSY_EXIT_CODE if it was cut off all the same.
+        """
         child = self.children.pop(name)
-        if child.poll() is None:
-            child.send_signal(signal.SIGINT)
-        try:
-            return child.wait(timeout)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-            return None
+        if child.poll() is not None:
+            return child.returncode or int(name not in self._ending)
+        before, begin = threads_of(child.pid), time.monotonic()
+        took = waited = 0.0
+        child.send_signal(signal.SIGINT)
+        while child.poll() is None:
+            if took > LONGEST_STOP or took - waited > timeout:
+                child.kill()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(0.05)
+            waited = max(waited, longest_wait(before, threads_of(child.pid)))
+            took = time.monotonic() - begin
+        # A node that does not end in time is ended by an alarm of its own.
+        if child.returncode in (-signal.SIGKILL, -signal.SIGALRM) and waited > 0.5 * took:
+            return TOO_BUSY_EXIT_CODE
+        return None if child.returncode == -signal.SIGKILL else child.returncode
 
     def stop_all(self, timeout: float = 2.0) -> dict[str, int | None]:
         """Stop every child, the last started first, and return their exit codes."""
@@ -287,6 +306,7 @@ class Processes:
             name = lock.name.removesuffix('_el')
             for dead in (lock, lock.with_name(name), lock.with_name(f'sem.{name}_mutex')):
                 dead.unlink(missing_ok=True)
+        threading.Thread(target=self._measure, daemon=True).start()
         # Python lets only the main thread handle signals.
         main = threading.current_thread() is threading.main_thread()
         self._handlers = {number: signal.signal(number, _end)
@@ -295,10 +315,27 @@ class Processes:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        """Stop the children that still run."""
+        """
+        Stop the children that still run.
+
+        :raises TooBusyError: for what came too late, if the machine was too busy.
+        :raises RuntimeError: if it came too late because a child was broken.
+        """
+        self._left.set()
+        fault = self.broken()
         self.stop_all()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
+        if isinstance(error, (LateError, TimeoutError)):
+            with explained(self.load.worst()):
+                if fault:
+                    raise RuntimeError(fault) from error
+                raise error
+
+    def _measure(self) -> None:
+        """Measure the load until the block is left."""
+        while not self._left.wait(PERIOD):
+            self.load.sample(time.monotonic())
 
 
 def computed(function: Callable[[Given], Result], tasks: Sequence[Given], jobs: int = 1,

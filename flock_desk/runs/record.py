@@ -30,8 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_desk.runs.frame_errors import FrameErrors, Table
+from flock_desk.runs.processes import LateError
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import (
     from_odometry,
@@ -48,8 +50,9 @@ from flock_follower.planner.params import PlannerParams
 
 LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
 REPLAYED = 'vehicle that flew the commands'
+SAME_TIME_NS = 50_000_000  # between an estimate and the odometry that places it
 _RECORD = 'record'
-_FILES = (_RECORD, 'flight.npz', 'report.html', 'summary.json')
+_FILES = (_RECORD, 'autopilot.npz', 'flight.npz', 'report.html', 'summary.json')
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +69,7 @@ class Flight:
 
     Of a flight through the nodes: ``distance`` holds true distances, m, as often as they are
     known; ``diagnostics`` the arrays published, each with its time; ``command_times`` are those
-    for which the planner commanded, s on the bag's clock.
+    for which the planner commanded, s on the bag's clock; ``along_law``: see :func:`along_law`.
     """
 
     name: str = LEADER_NAME
@@ -83,6 +86,7 @@ class Flight:
     distance: Array = field(default_factory=lambda: np.empty(0))
     diagnostics: Sequence[tuple[float, Any]] = ()
     command_times: Array = field(default_factory=lambda: np.empty(0))
+    along_law: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def values(self, node: str, key: str) -> list[tuple[float, str]]:
         """Return the values of a key in a node's diagnostics, with their times."""
@@ -132,16 +136,14 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
     """
     Return a replayed flight; its time begins with the bag's first image.
 
+    What no node published leaves its figures unknown.
+
     :param out: the folder of the record and the log of the embedded autopilot.
     :param params: that it was flown with.
     :raises BagError: if a record cannot be read.
-    :raises RuntimeError: if a node published nothing.
     """
     record = read_record(out / _RECORD)
-    if missing := {'/neighbors', '/planner/state', '/command/trajectory',
-                   '/diagnostics'} - set(record):
-        raise RuntimeError(f'nothing was published on {", ".join(sorted(missing))}')
-    commands = record['/command/trajectory']
+    commands = record.get('/command/trajectory', [])
     received = np.array([t for t, _ in commands])
     ticks = np.array([tick_time(message) for _, message in commands])
     with open_bag(bag) as opened:
@@ -156,24 +158,26 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
         [*map(from_odometry, states)] for states in (true_leader, true_own))
     table = compared(estimates(_received(record)), own, follower_states, leader_states, stamps,
                      np.ones(len(stamps)), int(stamps[0]))  # its leader is always in view
-    # The bag's clock relative to the monotonic one of the logs.
-    origin = stamps[0] / NANOSECONDS + float(np.median(received - ticks))
     with np.load(out / 'autopilot.npz') as file:
         log = dict(file)
-    flown, sent = ((log[name] >= received[0]) & (log[name] <= received[-1])
-                   for name in ('state_time', 'setpoint_time'))
+    # The bag's clock relative to the monotonic one of the logs; without a command about so.
+    origin = (stamps[0] / NANOSECONDS + float(np.median(received - ticks)) if commands
+              else float(log['state_time'][-1] - table['time'][-1]))
+    sent = (np.zeros(len(log['setpoint_time']), dtype=bool) if not commands else
+            (log['setpoint_time'] >= received[0]) & (log['setpoint_time'] <= received[-1]))
     return Flight(
         duration=float(table['time'][-1]), params=params, table=table,
         paths={'leader': _positions(leader_states, stamps),
                'follower': _positions(follower_states, stamps)},
         # Its path means nothing in the bag.
-        speeds={REPLAYED: (log['state_time'][flown] - origin,
-                           np.linalg.norm(log['velocity'][flown], axis=1))},
+        speeds={REPLAYED: (log['state_time'] - origin, np.linalg.norm(log['velocity'], axis=1))},
         distance=table['true_distance'][np.isfinite(table['true_distance'])],
         setpoint_times=log['setpoint_time'][sent] - origin,
         setpoints=log['setpoint_acceleration'][sent],
-        states=[(t - origin, m.data) for t, m in record['/planner/state']],
-        diagnostics=[(t - origin, m) for t, m in record['/diagnostics']], command_times=ticks)
+        states=[(t - origin, m.data) for t, m in record.get('/planner/state', [])],
+        diagnostics=[(t - origin, m) for t, m in record.get('/diagnostics', [])],
+        command_times=ticks,
+        along_law=along_law([m for _, m in commands], _received(record), own, params.law))
 
 
 def tick_time(message: Any) -> float:
@@ -182,19 +186,44 @@ def tick_time(message: Any) -> float:
     return (command.stamp + command.ahead) / NANOSECONDS
 
 
+def along_law(commands: Iterable[Any], neighbors: Sequence[OdometryState],
+              own: Sequence[OdometryState], law: FlockingParams) -> NDArray[np.bool_]:
+    """
+    Return whether each command points along the law, horizontally.
+
+    The guard and the limits change the law's length and direction, but seldom turn it round.
+    Commands that rest on no estimate, or on one without odometry at its stamp, are left out.
+
+    :param neighbors: as published. :param own: the odometry.
+    """
+    known = {state.stamp: state for state in neighbors if state.frame != RELATIVE}
+    stamps, along = np.array([state.stamp for state in own]), []
+    for message in commands:
+        command = from_trajectory(message, message.header.frame_id)
+        leader = known.get(command.stamp)
+        if leader is None or not len(stamps):
+            continue
+        ego = own[int(np.argmin(np.abs(stamps - command.stamp)))]
+        if abs(ego.stamp - command.stamp) <= SAME_TIME_NS:
+            demanded = acceleration([leader.position - ego.position],
+                                    [leader.velocity - ego.velocity], law)
+            along.append(bool(demanded[:2] @ np.asarray(command.acceleration)[:2] > 0.0))
+    return np.array(along, dtype=bool)
+
+
 def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight:
     """
     Return the flight of a scenario that `fly` recorded in a folder.
 
     :param namespace: of its nodes; others publish their diagnostics on the same topic.
     :raises BagError: if its record cannot be read.
-    :raises RuntimeError: if the scenario never began, or no image was made.
+    :raises LateError: if the scenario never began, or no image was made.
     """
     with np.load(out / 'flight.npz') as file:
         log = dict(file)
     began, ended = float(log['began']), float(log['ended'])
     if not math.isfinite(began):
-        raise RuntimeError('the scenario never began: no offboard mode, or not engaged')
+        raise LateError('the scenario never began: no offboard mode, or not engaged')
     epoch = int(log['epoch_ns']) + round((began - float(log['start'])) * 1e9)
 
     def flown(times: Any, begin: float = began, end: float = ended) -> Any:
@@ -202,7 +231,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
 
     shown = flown(log['image_stamp'], epoch, epoch + round((ended - began) * 1e9))
     if not shown.any():
-        raise RuntimeError('not one image was rendered in time: the machine is too busy')
+        raise LateError('not one image was rendered in time')
     state_flown = flown(log['state_time'])
     log['clock'] = log['clock'][flown(log['clock'][:, 0])]
     for name in log:
@@ -211,16 +240,17 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         elif name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
             log[name] = log[name][state_flown]
     record = read_record(out / _RECORD)
+    commands = record.get('/command/trajectory', [])
     if str(log['pose_source']):
-        commands = record.get('/command/trajectory', [])
         log['setpoint_time'] = np.array([time for time, _ in commands])
         log['setpoint_acceleration'] = np.reshape(
             [from_trajectory(message, 'odom').acceleration for _, message in commands],
             (-1, 3))
     sent = flown(log['setpoint_time'])
     neighbors, stamps = _received(record), log['image_stamp']
+    own = _states(log, 'odom', log['odom_stamp'])
     table = compared(
-        estimates(neighbors), _states(log, 'odom', log['odom_stamp']),
+        estimates(neighbors), own,
         _states(log, 'follower', stamps), _states(log, LEADER_NAME, stamps), stamps,
         judged(log['image_usable'], stamps, neighbors), epoch)
     times, hidden = table['time'], table['visible'] == 0.0
@@ -235,6 +265,8 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         distance=log['distance'][flown(log['distance_time'])],
         setpoint_times=log['setpoint_time'][sent] - began,
         setpoints=log['setpoint_acceleration'][sent],
+        along_law=along_law([m for t, m in commands if began <= t <= ended], neighbors, own,
+                            scenario.flight.planner(True).law),
         states=[(float(t) - began, str(s))
                 for t, s in zip(log['planner_time'], log['planner_state'])],
         diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
@@ -358,7 +390,8 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise RuntimeError(f'another flight writes to {folder}: give --output') from error
+            raise RuntimeError(f'another flight writes to {folder}: give --output (with make: '
+                               'OUTPUT=)') from error
         yield
 
 

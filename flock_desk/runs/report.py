@@ -33,7 +33,9 @@ from typing import Any, NamedTuple
 from flock_desk.runs.console import WIDTH
 from flock_desk.runs.figure_table import shown, words
 from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
+from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
 from flock_desk.runs.summary import consistency, write_summary
+from flock_follower.checks.processor import Load
 from flock_follower.files import whole_file
 
 _STYLE = """
@@ -81,45 +83,55 @@ def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[s
     for key, value in figures.items():
         line = f'  {key:<{width}}  {text(value):>10}  {_verdict(key, value)}'
         if key in judged:
-            line += f'{judged[key].bound!s:<16}  {"FAILED" if judged[key].fault else "ok"}'
+            line += f'{judged[key].bound!s:<16}  {judged[key].verdict}'
         lines += textwrap.wrap(line, WIDTH, drop_whitespace=False,
                                subsequent_indent=' ' * (width + 4))
     return [line.rstrip() for line in lines]
 
 
 def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
-             pages: Sequence[Path], logs: Path | None = None) -> int:
+             pages: Sequence[Path], logs: Path | None = None, load: Load | None = None) -> int:
     """
     Print the table, the broken bounds and the files to look at; return the exit code.
 
     :param logs: the folder to look at if something failed.
+    :param load: why bounds were not judged.
     """
     print('\n'.join([*table(summary, judgements), *(f'report: {page}' for page in pages)]),
           flush=True)
-    faults = [f'FAILED: {judgement.fault}' for judgement in judgements if judgement.fault]
+    faults = [f'FAILED: {each.fault}' for each in judgements if each.verdict == 'FAILED']
     if faults and logs is not None:
         faults.append(f'the logs of every process are in {logs}')
-    for fault in faults:
-        print(fault, file=sys.stderr)
-    return 1 if faults else 0
+    busy = too_busy(judgements, load)
+    for line in filter(None, [*faults, busy and f'too busy: {busy}']):
+        print(line, file=sys.stderr)
+    return 1 if faults else TOO_BUSY_EXIT_CODE if busy else 0
+
+
+def too_busy(judgements: Sequence[Judgement], load: Load | None) -> str:
+    """Return why bounds were not judged, and which, in one line; '' if all were."""
+    unjudged = ', '.join(each.bound.key for each in judgements if not each.judged)
+    return f'{load}; close other programs; not judged: {unjudged}' if unjudged else ''
 
 
 def report(folder: Path, title: str, introduction: str, summary: Mapping[str, Any],
            bounds: Sequence[FigureBound], chapters: Sequence[Chapter],
-           warnings: Sequence[str] = (), parts: Mapping[str, Any] | None = None
-           ) -> list[Judgement]:
+           warnings: Sequence[str] = (), parts: Mapping[str, Any] | None = None,
+           load: Load | None = None) -> list[Judgement]:
     """
     Judge a summary, write summary.json and report.html to a folder, and return the judgements.
 
     :param warnings: shown at the top of the report.
+    :param load: of the machine meanwhile; None if it is unknown, or irrelevant.
     :param parts: summaries of the parts, which are judged and written, too, but not shown.
     :raises OSError: if a file cannot be written.
     """
     whole = {**summary, **(parts or {})}
-    judgements = judge(bounds, whole)
+    judgements = judge(bounds, whole, load is not None and load.busy)
+    busy = too_busy(judgements, load)
     write_summary(whole, folder / 'summary.json')
     write_report(folder / 'report.html', title, introduction, summary, judgements, chapters,
-                 warnings)
+                 [*([f'too busy: {busy}'] if busy else []), *warnings])
     return judgements
 
 
@@ -162,11 +174,10 @@ def _label(key: str, depth: int = 0) -> str:
 
 def _bounds(judgements: Sequence[Judgement]) -> str:
     rows = []
-    for bound, figure, fault in judgements:
-        mark = 'FAILED' if fault else 'ok'
-        rows.append(f'<tr><td>{_label(bound.key)} <code>{escape(bound.key)}</code></td>'
-                    f'<td>{escape(text(figure))}</td><td>{bound}</td>'
-                    f'<td class="{mark}">{mark}</td></tr>')
+    for each in judgements:
+        rows.append(f'<tr><td>{_label(each.bound.key)} <code>{escape(each.bound.key)}</code></td>'
+                    f'<td>{escape(text(each.figure))}</td><td>{each.bound}</td>'
+                    f'<td class="{each.verdict}">{each.verdict}</td></tr>')
     return f'<h2>Bounds</h2><table class="bounds">{"".join(rows)}</table>' if rows else ''
 
 

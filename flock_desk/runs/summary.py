@@ -34,9 +34,11 @@ import numpy as np
 
 from flock_desk.runs.evaluation import Evaluation, STATES
 from flock_desk.runs.frame_errors import STAGES, Table
+from flock_desk.runs.processes import failed, TOO_BUSY_EXIT_CODE
 from flock_desk.runs.record import Flight, LiveFlight
 from flock_desk.scenarios.scenario import Outage
 from flock_follower.checks.findings import ERROR, WARNING
+from flock_follower.checks.processor import Load
 from flock_follower.files import whole_file
 from flock_follower.geometry import Array
 
@@ -48,6 +50,7 @@ BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
 LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
 OUTRUN = 1.0  # s for which a leader is faster than v_max that outruns; a gust is shorter
+COMMANDS = 10  # whose directions are judged at least
 OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
 
 
@@ -165,14 +168,20 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Any]:
                 for what, times in cpu.items()}}})
 
 
-def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None],
+                   load: Load | None = None) -> dict[str, Any]:
     """
     Return the figures that ``demo`` and ``fly`` have in common, NaN if they are unknown.
 
     ``true_distance_m`` is that of ``flight.distance``. ``setpoints`` are those on the wire,
     ``speed_max_m_s`` is the vehicle's, ``latency_ms`` from an image's stamp to MAVLink, as the
     bridge counts it. ``holds`` are those of the planner, each with its reason.
-    ``failed_processes`` counts those that did not end with 0 in time.
+    ``failed_processes`` counts those that did not end with 0 in time, but for ``late_processes``,
+    which waited for a processor until they were cut off. ``along_law_share`` is that of the
+    commands, None of fewer than ``COMMANDS``. ``machine``: the other programs on it during the
+    worst 2 s, None if unknown.
+
+    :param load: of the flight, None if unknown.
     """
     held = hold_figures(flight.states, flight.values('planner', 'reason'), flight.duration)
     after = flight.duration + 1.0  # every node publishes its counters once per second
@@ -183,36 +192,45 @@ def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None]) -> dict
         'frames': len(flight.table['time']),
         **sight_figures([flight.table], flight.params.max_velocity_std),
         'true_distance_m': spread(flight.distance),
-        'planner': {'missed_ticks': missed, **held['planner']},
+        'planner': {'along_law_share': (mean(flight.along_law)
+                                        if len(flight.along_law) >= COMMANDS else None),
+                    'missed_ticks': missed, **held['planner']},
         'holds': held['holds'],
         'setpoints': {
             'sent': len(flight.setpoints),
             'rate_hz': rate(flight.setpoint_times),
             'acceleration_max_m_s2': most(norms(flight.setpoints))},
         'speed_max_m_s': most(next(iter(flight.speeds.values()))[1]),
-        'latency_ms': {f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
-                       for p in (50, 95, 99)},
-        'failed_processes': sum(code != 0 for code in exit_codes.values())}
+        'latency_ms': {
+            'estimate_p50': flight.value('relative_pose', 'stamp_to_estimate_p50_ms', after),
+            **{f'p{p}': flight.value('mavlink_bridge', f'latency_p{p}_ms', after)
+               for p in (50, 95, 99)}},
+        'failed_processes': len(failed(exit_codes)),
+        'late_processes': sum(code == TOO_BUSY_EXIT_CODE for code in exit_codes.values()),
+        'machine': {'waited_share': None if load is None else load.share,
+                    'others': None if load is None else load.others}}
 
 
-def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+def replay_figures(flight: Flight, exit_codes: Mapping[str, int | None],
+                   load: Load | None = None) -> dict[str, Any]:
     """
     Return the summary of ``demo``.
 
     Beside :func:`flight_figures`: ``processed_share`` is the share of the bag's images that
     perception processed in time; ``recall_of_processed`` is that of these.
     """
-    common = flight_figures(flight, exit_codes)
+    common = flight_figures(flight, exit_codes, load)
     processed = flight.value('relative_pose', 'images_processed', math.inf) / common['frames']
     return jsonable({
         **common,
         'processed_share': processed,
-        'recall_of_processed': (common['recall'] or 0.0) / processed if processed else 0.0,
+        'recall_of_processed': (common['recall'] or 0.0) / processed if processed else None,
         'planner': {'rate_hz': rate(flight.command_times), **common['planner']}})
 
 
 def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
-                     exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+                     exit_codes: Mapping[str, int | None],
+                     load: Load | None = None) -> dict[str, Any]:
     """
     Return the summary of ``fly``.
 
@@ -230,7 +248,7 @@ def scenario_figures(flight: LiveFlight, cores: Mapping[str, float],
     """
     params, table, log = flight.scenario.flight, flight.table, flight.log
     times, leader_speeds = flight.speeds['leader']
-    common = flight_figures(flight, exit_codes)
+    common = flight_figures(flight, exit_codes, load)
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
     missed = common['planner']['missed_ticks'] * flight.params.period / flight.duration
     return jsonable({

@@ -24,6 +24,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
+from flock_follower.checks.processor import Load
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
@@ -95,15 +96,14 @@ class Machine:
     """
     The computer during the observation.
 
-    ``idle``: idle share of the processors, 0 to 1, None if unknown;
+    ``load``: of our nodes, None if it is unknown;
     ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
     ``shares_memory``: whether images may come through shared memory; ``segment``: its size, bytes.
     ``open_nodes``: our nodes on this computer that others on the network can reach; 'check' if
     those are unknown and others can reach ``check`` itself.
     """
 
-    processors: int = 0
-    idle: float | None = None
+    load: Load | None = None
     shared_memory_free: float | None = None
     shares_memory: bool = False
     segment: int = 512 * 1024
@@ -182,6 +182,11 @@ class Observations:
     def status(self, node: str) -> NodeStatus | None:
         """Return the newest status of a node of ours, by its plain name, or None."""
         return self.statuses.get(full_name(node, self.namespace).lstrip('/'))
+
+    @property
+    def busy(self) -> bool:
+        """Return whether the computer was too busy: then times in a fault are not judged."""
+        return self.machine.load is not None and self.machine.load.busy
 
     def topic(self, name: str) -> TopicSeen:
         """Return the observation of a topic of ours; an empty one if there is none."""

@@ -24,8 +24,6 @@ from pathlib import Path
 import time
 from typing import Final
 
-import numpy as np
-
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -36,11 +34,10 @@ from flock_follower.checks.findings import (
     WARNING,
 )
 from flock_follower.checks.observations import Machine, Observations, OURS
+from flock_follower.checks.processor import BUSY
 from flock_follower.checks.topic_names import full_name
 
-#: Share of the processors that is idle: below the first a warning, below the second an error.
-IDLE = 0.25
-NONE_IDLE = 0.05
+STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.
 ROOM = 32.0
 #: Segments of killed processes from which on there is a warning: 180 raised the latency of the
@@ -72,12 +69,14 @@ ADVICE: Final[Mapping[str, str]] = {
 def check_machine(seen: Observations) -> Iterator[Finding]:
     """Check the computer."""
     machine = seen.machine
-    if machine.idle is not None:
-        yield judged(machine.idle < NONE_IDLE, machine.idle < IDLE, 'processor',
-                     f'{machine.idle:.0%} of {machine.processors} cores left',
-                     f'{IDLE:.0%} or more left, at least {NONE_IDLE:.0%}',
+    load, wanted = machine.load, f'at most {BUSY:.0%}, never {STARVED:.0%}'
+    if load is not None:
+        yield judged(load.share > STARVED, load.busy, 'processor', str(load), wanted,
                      'end programs that are not needed (rviz, recordings), or reduce the load of '
                      'the odometry')
+    elif seen.live:
+        yield Finding(UNMEASURED, 'processor', 'our nodes do not run on this computer, or its '
+                      'kernel does not count for how long they wait', wanted)
     if machine.shares_memory:
         yield _shared_memory(machine, max((p.bytes for p in seen.pictures), default=0))
 
@@ -111,15 +110,6 @@ def dead_segments(folder: Path = Path('/dev/shm')) -> list[Path]:
             if time.time() - path.stat().st_mtime > YOUNG:
                 dead.append(path)
     return dead
-
-
-def idle_share(before: str, after: str) -> float | None:
-    """Return the share of the processors that was idle between two readings of /proc/stat."""
-    first, second = (np.array(text.splitlines()[0].split()[1:9], dtype=float)
-                     for text in (before, after))
-    spent = second - first
-    total = float(spent.sum())
-    return float(spent[3] + spent[4]) / total if total > 0.0 else None
 
 
 def check_diagnostics(seen: Observations) -> Iterator[Finding]:

@@ -139,6 +139,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
     """
     Check rate, stamps and latency of a topic, and whether it has stopped.
 
+    On a busy computer rate and latency are not judged if they are faulty.
+
     :param rates: below which there is a warning, and an error, Hz; ``faster``: the advice.
     :param latencies: above which there is a warning, and an error, s; ``sooner``: the advice.
     """
@@ -151,9 +153,11 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
         yield Finding(ERROR, name, f'stopped: none in the last {silence:.1f} s',
                       'messages to the end', 'see the log of its driver; is it still running?')
     wanted, rate = f'{rates[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
+    busy = 'not judged, the computer is too busy: '
     yield first(
         f'{name} rate', wanted,
         (len(topic.arrivals) <= 2, UNMEASURED, f'{len(topic.arrivals)} messages are too few', ''),
+        (seen.busy and topic.rate < rates[0], UNMEASURED, busy + rate, ''),
         (topic.rate < rates[1], ERROR, rate, faster),
         (topic.rate < rates[0], WARNING, rate, faster),
         (True, OK, rate, ''))
@@ -171,6 +175,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
          '--use-sim-time)'),
         (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronise),
         (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronise),
+        (seen.busy and (middle > latencies[0] or most > latencies[1]), UNMEASURED,
+         busy + measured, ''),
         (middle > latencies[1], ERROR, measured, sooner),
         (middle > latencies[0] or most > latencies[1], WARNING, measured, sooner),
         (True, OK, measured, ''))

@@ -37,7 +37,8 @@ from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
-from flock_follower.checks.system import dead_segments, idle_share
+from flock_follower.checks.processor import Load, LoadMeter, PERIOD
+from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -68,7 +69,6 @@ from flock_follower.perception.markers import load
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics
-PROCESSORS = Path('/proc/stat')
 #: Topics that are decoded; of the others only the rate is measured.
 READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom')
 COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory', 'mavlink/odom')
@@ -106,16 +106,18 @@ class Observer(Node):
         """
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        before, end = PROCESSORS.read_text(), self._begin + self._seconds
+        ours = [process for process, *_ in processes()]
+        meter, end = LoadMeter(lambda: ours), self._begin + self._seconds
         try:
             while rclpy.ok() and (now := time.monotonic()) < end:
-                executor.spin_once(timeout_sec=end - now)
+                meter.sample(now)
+                executor.spin_once(timeout_sec=min(end - now, PERIOD))
         finally:
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():
             raise ExternalShutdownException
         self.seen.duration = time.monotonic() - self._begin
-        self.seen.machine = _machine(idle_share(before, PROCESSORS.read_text()))
+        self.seen.machine = _machine(meter.worst())
         self._look_at_graph()
         self.seen.static_child = self._static.transform(self.seen.child_frame)
         own = self.seen.value('relative_pose', 'neighbors_file', '')
@@ -198,28 +200,29 @@ class Observer(Node):
                 del seen.topics[topic]
 
 
-def processes() -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield name and environment of our nodes on this computer, except those of other users."""
+def processes() -> Iterator[tuple[int, str, dict[str, str]]]:
+    """Yield id, name and environment of our nodes on this computer, but not of other users'."""
     for folder in Path('/proc').glob('[0-9]*'):
         with suppress(OSError):  # ended meanwhile, or of another user
             words = _words(folder / 'cmdline')
             for node in OURS:
                 if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
-                    yield node, dict(entry.split('=', 1) for entry in _words(folder / 'environ')
-                                     if '=' in entry)
+                    yield int(folder.name), node, dict(
+                        entry.split('=', 1) for entry in _words(folder / 'environ')
+                        if '=' in entry)
 
 
 def _words(path: Path) -> list[str]:
     return path.read_bytes().decode(errors='replace').split('\0')
 
 
-def _machine(idle: float | None) -> Machine:
+def _machine(load: Load | None) -> Machine:
     free = None
     if Path('/dev/shm').exists():
         room = os.statvfs('/dev/shm')
         free = room.f_bavail * room.f_frsize / 1e6
     return Machine(
-        os.cpu_count() or 0, idle, free, shares_memory(), segment_size(os.environ),
+        load, free, shares_memory(), segment_size(os.environ),
         os.environ.get('ROS_DOMAIN_ID', '0'), _open_nodes(),
         len(dead_segments()))
 
@@ -227,7 +230,7 @@ def _machine(idle: float | None) -> Machine:
 def _open_nodes() -> list[str]:
     """Return our nodes on this computer that the network reaches; if none is known, for check."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    found = {node: environment for node, environment in processes()
+    found = {node: environment for _, node, environment in processes()
              if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}
     return sorted(node for node, environment in found.items() if open_to_network(environment))
 

@@ -29,6 +29,7 @@ from observed import FOCAL, healthy, Observed, odometry_rows, shift_rows, sighti
 import pytest
 
 from flock_follower.bags.message_types import empty
+from flock_follower.check import main
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
@@ -39,8 +40,9 @@ from flock_follower.checks.observations import (
     TopicEnd,
     TopicSeen,
 )
+from flock_follower.checks.processor import Load
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.system import dead_segments, idle_share
+from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import TYPES
 from flock_follower.geometry import (
     quaternion_from_rpy,
@@ -275,12 +277,22 @@ FAULTS: list[Fault] = [
     Fault('odometry as late as the planner allows', BOTH, ERROR, 'odom latency', '310 ms',
           'processor time',
           delayed('odom', 0.3)),
-    Fault('little processor time left', LIVE, WARNING, 'processor', '20% of 4 cores left',
-          'end programs', machine(idle=0.2)),
+    Fault('little processor time left', LIVE, WARNING, 'processor', 'for 20% of the worst 2 s',
+          'end programs', machine(load=Load(0.2, 3.0, 4))),
     Fault('a source without rates and covariances', BOTH, WARNING, 'odom lacks',
           'angular velocity', 'odom_std', columns(slice(12, 27), [0.0] * 15)),
-    Fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end programs',
-          machine(idle=0.02)),
+    Fault('no processor time left', LIVE, ERROR, 'processor', '(3.9 of 4 processors)',
+          'end programs', machine(load=Load(0.7, 3.9, 4))),
+    # What is late meanwhile may be in time on a computer that is not; another clock never is.
+    Fault('late on a busy computer', LIVE, UNMEASURED, 'odom latency', '310 ms', '',
+          together(delayed('odom', 0.3), machine(load=Load(0.2, 3.0, 4)))),
+    Fault('few on a busy computer', LIVE, UNMEASURED, 'odom rate', '10.0 Hz', '',
+          together(kept('odom', slice(None, None, 5)), change(rows=odometry_rows(10.0)),
+                   machine(load=Load(0.2, 3.0, 4)))),
+    Fault('another clock on a busy computer', LIVE, ERROR, 'odom latency', 'or another clock',
+          'set use_sim_time', together(delayed('odom', 100.0), machine(load=Load(0.2, 3.0, 4)))),
+    Fault('nodes on another computer', LIVE, UNMEASURED, 'processor', 'do not run on this', '',
+          machine(load=None)),
     Fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_',
           machine(shared_memory_free=2.0)),
     Fault('segments of killed processes', LIVE, WARNING, 'shared memory', '180 segments',
@@ -420,6 +432,23 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
         assert all(finding.level != ERROR for finding in findings)
 
 
+@pytest.mark.parametrize(('load', 'late', 'fault', 'code', 'last'), [
+    (0.2, 0.0, False, 0, 'ready to fly'), (0.2, 0.3, False, 0, 'ready to fly'),
+    (0.7, 0.0, False, 3, 'too busy: for 70% of the worst 2 s'),
+    (0.7, 0.3, True, 1, 'not ready to fly'), (0.01, 0.3, False, 1, 'not ready to fly')])
+def test_the_exit_code_is_3_if_only_a_busy_computer_prevents_a_flight(
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], load: float,
+        late: float, fault: bool, code: int, last: str) -> None:
+    seen = healthy(True)
+    delayed('odom', late)(seen)
+    machine(load=Load(load, 1.5, 2))(seen)
+    if fault:
+        seen.nodes.remove('/planner')
+    monkeypatch.setattr('flock_follower.check._observe', lambda _: (seen, seen.judged()))
+    assert main([]) == code
+    assert capsys.readouterr().out.splitlines()[-1].startswith(last)
+
+
 def test_an_image_without_an_encoding_is_a_fault() -> None:
     seen, message = Observations(), empty(TYPES['image_raw'])
     Collector(seen, 5.0).take('image_raw', '/image_raw', message, 1.0)
@@ -435,13 +464,6 @@ def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:
     with open(locked, 'rb') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert dead_segments(tmp_path) == [free]
-
-
-def test_the_share_of_the_processors_that_idles() -> None:
-    before = 'cpu  100 0 50 800 50 0 0 0 0 0\ncpu0 1 2 3 4 5 6 7 8 9 10\n'
-    after = 'cpu  150 0 75 820 55 0 0 0 0 0\n'
-    assert idle_share(before, after) == pytest.approx(0.25)
-    assert idle_share(after, after) is None
 
 
 def test_an_empty_graph_is_one_line() -> None:

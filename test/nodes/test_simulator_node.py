@@ -14,25 +14,40 @@
 
 """The simulator node as a real process: what subscribers receive, and what it refuses."""
 
+from contextlib import nullcontext
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 from nav_msgs.msg import Odometry
 import numpy as np
+import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
-from flock_desk.runs.processes import free_udp_port, wait_until
+from flock_desk.runs.processes import free_udp_port, TooBusyError, wait_until
+from flock_desk.simulator_node import Simulator
+from flock_follower.checks.processor import Load
 from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.perception.markers import detect
 
 DEADLINE = 40.0  # s, for what should take a few
 TOPICS = {'image_raw': Image, 'camera_info': CameraInfo, 'odom': Odometry,
           'truth/odom': Odometry, 'truth/neighbors': Odometry}
+
+
+@pytest.mark.parametrize('load', [Load(0.5, 1.5, 2), Load(0.01, 0.1, 2), None])
+def test_a_flight_behind_the_clock_is_excused_by_a_load_and_by_nothing_else(load):
+    meter = SimpleNamespace(worst=lambda: load)
+    expected = (pytest.raises(TooBusyError, match='^9 images lost: for 50% of the worst 2 s')
+                if load is not None and load.busy else nullcontext())
+    with expected:
+        Simulator._blame(SimpleNamespace(_load=meter), '9 images lost')
+    Simulator._blame(SimpleNamespace(_load=None), '9 images lost')  # end_if_busy is false
 
 
 def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(ros):

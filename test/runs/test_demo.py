@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,8 @@ pytestmark = pytest.mark.slow
 
 BAG = resource('bags/sample')
 LATER = 5.0  # s from the bag's clock to that of the logs, but for the bag's start
-COUNTED = {'relative_pose': {'images_processed': '360'}, 'planner': {'missed_ticks': '0'},
+COUNTED = {'relative_pose': {'images_processed': '360', 'stamp_to_estimate_p50_ms': '20.0'},
+           'planner': {'missed_ticks': '0'},
            'mavlink_bridge': {f'latency_p{p}_ms': '40.0' for p in (50, 95, 99)}}
 
 
@@ -104,6 +106,41 @@ def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: Flight) 
     least = {b.key for b in BOUNDS if b.most is None}
     assert {j.bound.key for j in judge(BOUNDS, broken) if not j.fault} == least
     assert all(j.fault for j in judge(BOUNDS, {}))
+
+
+def test_commands_and_law_point_the_same_way_unless_a_sign_is_turned(flight: Flight) -> None:
+    share = replay_figures(flight, {})['planner']['along_law_share']
+    # Here the planner brakes the bag's follower, which is faster than 0.5 m/s, against the law.
+    assert len(flight.along_law) > 100 and share > 0.6
+    turned = replace(flight, along_law=~flight.along_law)
+    broken = [j for j in judge(BOUNDS, replay_figures(turned, {}), busy=True)
+              if j.verdict == 'FAILED']
+    assert [j.bound.key for j in broken] == ['planner.along_law_share']
+    # Of too few commands nothing is known; a busy machine explains that.
+    few = replace(flight, along_law=flight.along_law[:9])
+    assert replay_figures(few, {})['planner']['along_law_share'] is None
+
+
+def test_a_flight_without_a_command_is_judged_by_what_is_known(tmp_path: Path) -> None:
+    times = np.arange(600) / 20
+    with BagWriter(tmp_path / 'record') as record:
+        record.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
+                     round(29.0 * NANOSECONDS), diagnostics())
+    np.savez(tmp_path / 'autopilot.npz', state_time=times, setpoint_time=times[:20],
+             velocity=np.outer(np.linspace(0.0, 6.0, 600), [1.0, 0.0, 0.0]),
+             setpoint_acceleration=np.zeros((20, 3)))
+    judgements = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}))
+    assert {j.bound.key for j in judgements if j.fault} > {
+        'planner.rate_hz', 'planner.along_law_share', 'recall_of_processed', 'setpoints.sent'}
+    # A vehicle that runs away is none of a busy machine.
+    excused = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}), busy=True)
+    assert [j.fault for j in excused if j.verdict == 'FAILED' and 'recall' not in j.fault] == [
+        'speed_max_m_s = 6: must be at most 2']
+
+
+def test_a_process_that_was_cut_off_while_it_waited_is_late_not_failed(flight: Flight) -> None:
+    summary = replay_figures(flight, {'planner': 0, 'replay': 3, 'recorder': -9})
+    assert (summary['failed_processes'], summary['late_processes']) == (1, 1)
 
 
 def test_the_report_shows_the_flight_and_its_errors(flight: Flight) -> None:

@@ -25,14 +25,16 @@ import sys
 import pytest
 
 from flock_desk.runs.processes import (
-    BUSY_SHARE,
-    BUSY_WINDOW,
     claim_domain,
-    SchedulingDelay,
+    explained,
+    LateError,
+    Processes,
+    TOO_BUSY_EXIT_CODE,
     TooBusyError,
     wait_until,
 )
 from flock_desk.runs.record import clear, locked
+from flock_follower.checks.processor import Load
 
 PROGRAM = """
 import os, pathlib, sys, time
@@ -66,33 +68,76 @@ def test_children_end_with_the_program_that_started_them(tmp_path: Path, number:
         wait_until(lambda: not lives(child), 1.0, 'the child to end')
 
 
-@pytest.mark.parametrize('share, busy', [(BUSY_SHARE - 0.02, False), (BUSY_SHARE + 0.02, True)])
-def test_processes_that_wait_for_a_processor_end_the_flight(
-        tmp_path: Path, share: float, busy: bool) -> None:
-    children = tmp_path / '6' / 'task' / '6' / 'children'
-    children.parent.mkdir(parents=True)
-    children.write_text('7 ')
-    delay = SchedulingDelay(6, tmp_path)
+BUSY, QUIET = Load(0.5, 1.5, 2), Load(0.01, 0.1, 2)
 
-    def counters(thread: int, time: float, share: float) -> None:
-        folder = tmp_path / '7' / 'task' / str(thread)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / 'schedstat').write_text(
-            f'{round(5e8 * time * (1.0 - share))} {round(5e8 * time * share)} 3')
 
-    counters(2, 0.0, 0.99)  # a thread that ends: what it did is over
-    counters(1, 1e4, 0.99)  # what was before the flight does not count, either
-    delay.check(0.0)
-    (tmp_path / '7' / 'task' / '2' / 'schedstat').unlink()
-    for seconds in range(1, 12):
-        folder = tmp_path / '7' / 'task' / '1' / 'schedstat'
-        ran, waited, _ = map(int, folder.read_text().split())
-        folder.write_text(f'{ran + round(1e9 * (1 - share))} {waited + round(1e9 * share)} 3')
-        if busy and seconds >= BUSY_WINDOW:
-            with pytest.raises(TooBusyError, match='waited for a processor for 90%'):
-                delay.check(seconds)
-        else:
-            delay.check(seconds)
+@pytest.mark.parametrize('error', [LateError('too late'), TimeoutError('too late')])
+def test_what_came_too_late_is_excused_by_a_load_and_by_nothing_else(error: Exception) -> None:
+    with pytest.raises(TooBusyError, match='^too late: for 50% of the worst 2 s'), explained(BUSY):
+        raise error
+    for load in (QUIET, None):  # unknown is not busy
+        with pytest.raises(type(error)), explained(load):
+            raise error
+
+
+def test_a_fault_that_no_load_explains_is_none_of_it() -> None:
+    with pytest.raises(RuntimeError, match='^planner ended early$'), explained(BUSY):
+        raise RuntimeError('planner ended early')
+
+
+@pytest.mark.ros
+def test_a_broken_child_is_named_whatever_the_load(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('flock_desk.runs.processes.LoadMeter.worst', lambda *_: BUSY)
+    with pytest.raises(RuntimeError, match='^node was stopped by a signal$'), Processes(
+            dict(os.environ), tmp_path) as processes:
+        node = processes.start('node', 'timeit', ['-n1', '-r1', 'import time; time.sleep(600)'])
+        processes.start('replay', 'timeit', ['-n1', '-r1', 'pass'], ends=True).wait()
+        assert processes.broken() == ''
+        node.send_signal(signal.SIGSTOP)
+        wait_until(lambda: processes.broken() != '', 5.0, 'the stop')
+        raise LateError('the service did not answer')
+
+
+@pytest.mark.ros
+def test_the_exit_code_tells_who_ended_when(tmp_path: Path) -> None:
+    with Processes(dict(os.environ), tmp_path) as processes:
+        for name, ends in (('replay', True), ('planner', False)):
+            processes.start(name, 'timeit', ['-n1', '-r1', 'pass'], ends=ends).wait()
+        node = processes.start('stopped', 'timeit', [
+            '-n1', '-r1', 'import time; print(1, flush=True); time.sleep(600)'])
+        processes.wait_for_log('stopped', '1')  # it handles SIGINT, as a node does
+        node.send_signal(signal.SIGSTOP)
+        # It should not have ended yet; a stopped process waits for no processor.
+        assert processes.stop_all(timeout=0.2) == {'stopped': None, 'planner': 1, 'replay': 0}
+
+
+class Starved:
+    """A child that is cut off after a while by the alarm of a node."""
+
+    pid, returncode = 7, -signal.SIGALRM
+
+    def __init__(self) -> None:
+        self._polls = iter([None] * 4)
+
+    def poll(self) -> int | None:
+        return next(self._polls, self.returncode)
+
+    def send_signal(self, number: int) -> None:
+        assert number == signal.SIGINT
+
+    def wait(self, timeout: float) -> None:
+        raise subprocess.TimeoutExpired('', timeout)
+
+
+@pytest.mark.parametrize(('waited', 'code'), [
+    (60.0, TOO_BUSY_EXIT_CODE), (0.0, -signal.SIGALRM)])
+def test_a_process_that_waited_for_a_processor_to_its_deadline_is_late_not_faulty(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waited: float, code: int) -> None:
+    monkeypatch.setattr('flock_desk.runs.processes.longest_wait', lambda *_: waited)
+    processes = Processes({}, tmp_path)
+    processes.children['node'] = Starved()  # type: ignore[assignment]
+    assert processes.stop('node') == code
 
 
 def test_two_flights_do_not_write_to_one_folder(tmp_path: Path) -> None:

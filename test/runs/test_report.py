@@ -17,6 +17,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 import re
 from typing import Any
@@ -27,7 +28,8 @@ from flock_desk.runs.console import guarded, progress
 from flock_desk.runs.figure_table import bounds, FIGURES, words
 from flock_desk.runs.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
 from flock_desk.runs.processes import TooBusyError
-from flock_desk.runs.report import announce, table, text, WIDTH, write_report
+from flock_desk.runs.report import announce, report, table, text, WIDTH, write_report
+from flock_follower.checks.processor import Load
 
 SUMMARY: dict[str, Any] = {
     'frames': 360, 'recall': 0.97, 'nees_position': None, 'bag': 'sample',
@@ -81,10 +83,42 @@ def test_a_wrong_file_of_bounds_is_named(tmp_path: Path) -> None:
             load_bounds(path)
 
 
+@pytest.mark.parametrize(('figure', 'load', 'verdict'), [
+    (150.0, 0.0, 'ok'), (250.0, math.inf, 'not judged'), (250.0, 60.0, 'not judged'),
+    (250.0, 40.0, 'FAILED'), (250.0, 0.0, 'FAILED'), (None, 0.0, 'not judged')])
+def test_a_busy_machine_excuses_what_load_can_do_and_no_more(
+        figure: float | None, load: float, verdict: str) -> None:
+    bound = FigureBound('x', most=200.0, load=load)
+    assert judge([bound], {'x': figure}, busy=True)[0].verdict == verdict
+    assert judge([bound], {'x': figure})[0].verdict == (
+        'ok' if figure is not None and figure <= 200.0 else 'FAILED')
+
+
+def test_the_verdict_of_a_busy_machine_is_a_code_and_the_last_line(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    load, summary = Load(0.4, 1.2, 2), {'late': 300.0, 'far': 9.0}
+    late, far = FigureBound('late', most=200.0, load=math.inf), FigureBound('far', most=2.0)
+    judgements = report(tmp_path, 'title', '', summary, [late], (), load=load)
+    assert announce(summary, judgements, [], tmp_path, load) == 3
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith('too busy: for 40% of the worst 2 s') and last.endswith(
+        'not judged: late')
+    page = (tmp_path / 'report.html').read_text()
+    assert 'Too busy: for 40% of the worst 2 s' in page and '>not judged</td>' in page
+    # A fault that no load explains is the verdict.
+    judgements = report(tmp_path, 'title', '', summary, [late, far], (), load=load)
+    assert announce(summary, judgements, [], tmp_path, load) == 1
+    assert 'FAILED: far' in capsys.readouterr().err
+    judgements = report(tmp_path, 'title', '', summary, [late], (), load=Load(0.01, 0.1, 2))
+    assert announce(summary, judgements, [], tmp_path, None) == 1
+
+
 def test_each_command_has_the_bounds_of_the_table() -> None:
     limits = {'near': 0.9, 'far': 2.83, 'a_max': 2.5, 'speed': 0.55, 'planned': 59.9}
     fly, external = bounds('fly', limits), bounds('external', limits)
-    assert fly['true_distance_m.max'] == ('true_distance_m.max', None, 2.83)
+    assert fly['true_distance_m.max'] == (
+        'true_distance_m.max', None, 2.83, math.inf)
+    assert fly['speed_max_m_s'].load == 2.5 and fly['failed_processes'].load == 0.0
     assert 'true_distance_m.max' not in external and 'external.pace' not in fly
     assert external['duration_s'].least == 59.9 and external['time_in_band_share'].least == 0.99
     assert all(key in FIGURES for key in {**fly, **external, **bounds('demo', limits)})

@@ -1,0 +1,173 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Whether the machine was too busy: the time for which processes waited for a processor.
+
+The kernel counts for each thread the time for which it ran, and for which it was ready and waited
+(``/proc/PID/task/TID/schedstat``). Processes that work together also wait for each other, on a
+quiet machine, too. So that part of their waiting counts for which other programs had the
+processors (``/proc/stat``). Both files are there in a container. Without them the load is unknown,
+and an unknown load excuses nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+import contextlib
+import os
+from pathlib import Path
+from typing import Final, NamedTuple
+
+#: Share of WINDOW for which processes wait for a processor that others have: busy from there on.
+#: Of `demo` and `fly` on two processors: 0.01 to 0.09 alone, 0.2 beside two busy programs.
+BUSY: Final = 0.1
+WINDOW: Final = 2.0  # s: a shorter burst breaks no bound, or shows in it
+PERIOD: Final = 0.5  # s between two readings, at least
+PROC: Final = Path('/proc')
+_TICK: Final = 1.0 / os.sysconf('SC_CLK_TCK')  # s
+
+
+class Counters(NamedTuple):
+    """Readings at one time, s: ns run and waited of each thread, by its file; others in s."""
+
+    time: float
+    threads: Mapping[Path, tuple[int, int]]
+    machine: float
+    """Processor time of all programs, s, on the processors that these processes may use."""
+
+
+class Load(NamedTuple):
+    """The waiting of some processes over some time."""
+
+    share: float
+    """Of the time for which they ran or waited, they waited for a processor that others had."""
+    others: float
+    """Processors that other programs used."""
+    processors: int
+    """Processors that these processes may use."""
+
+    @property
+    def busy(self) -> bool:
+        """Return whether times measured meanwhile say nothing about these processes."""
+        return self.share > BUSY
+
+    def __str__(self) -> str:
+        """Return the cause and the share, in words."""
+        return (f'for {self.share:.0%} of the worst {WINDOW:g} s the processes waited for a '
+                f'processor that other programs had ({self.others:.1f} of {self.processors} '
+                'processors)')
+
+
+def threads_of(process: int, proc: Path = PROC) -> dict[Path, tuple[int, int]]:
+    """Return ns run and ns waited of each thread of a process; none if it has ended."""
+    found = {}
+    for path in proc.glob(f'{process}/task/*/schedstat'):
+        with contextlib.suppress(OSError, ValueError, IndexError):  # it has ended meanwhile
+            ran, waited = path.read_text(encoding='ascii').split()[:2]
+            found[path] = int(ran), int(waited)
+    return found
+
+
+def children(process: int, proc: Path = PROC) -> list[int]:
+    """Return the ids of the children of a process."""
+    found: list[int] = []
+    for path in proc.glob(f'{process}/task/*/children'):
+        with contextlib.suppress(OSError, ValueError):
+            found += map(int, path.read_text(encoding='ascii').split())
+    return found
+
+
+def stopped(process: int, proc: Path = PROC) -> bool:
+    """Return whether a process was stopped by a signal or a debugger; no load explains that."""
+    with contextlib.suppress(OSError, IndexError):
+        stat = (proc / str(process) / 'stat').read_text(encoding='utf-8', errors='replace')
+        return stat.rpartition(')')[2].split()[0] in ('T', 't')
+    return False
+
+
+def longest_wait(before: Mapping[Path, tuple[int, int]],
+                 after: Mapping[Path, tuple[int, int]]) -> float:
+    """Return the time, s, for which that thread waited that waited longest between readings."""
+    return 1e-9 * max((counted[1] - before.get(path, (0, 0))[1]
+                       for path, counted in after.items()), default=0)
+
+
+def read_counters(processes: Iterable[int], now: float, proc: Path = PROC,
+                  usable: Iterable[int] | None = None) -> Counters | None:
+    """
+    Return the counters of some processes and of the machine, None if the kernel has none.
+
+    :param now: s. :param usable: numbers of the processors; by default those of this process.
+    """
+    threads = {path: counted for process in processes
+               for path, counted in threads_of(process, proc).items()}
+    names = {f'cpu{number}' for number in (
+        os.sched_getaffinity(0) if usable is None else usable)}
+    ticks = 0
+    try:
+        for line in (proc / 'stat').read_text(encoding='ascii').splitlines():
+            name, *fields = line.split()
+            if name in names:
+                # user nice system idle iowait irq softirq steal; guests are in user.
+                ticks += sum(map(int, fields[:3])) + sum(map(int, fields[5:8]))
+    except (OSError, ValueError):
+        return None
+    return Counters(now, threads, ticks * _TICK) if threads else None
+
+
+def load_between(before: Counters, after: Counters, processors: int) -> Load:
+    """Return the load between two readings; a thread that is only in the second one is new."""
+    ran, waited = (1e-9 * sum(counted[k] - before.threads.get(path, (0, 0))[k]
+                              for path, counted in after.threads.items()) for k in (0, 1))
+    used = max(after.machine - before.machine, 0.0)
+    others = max(used - ran, 0.0)
+    share = waited / (ran + waited) * others / (others + ran) if waited > 0.0 else 0.0
+    return Load(share, others / max(after.time - before.time, 1e-9), processors)
+
+
+class LoadMeter:
+    """
+    Measures the load of some processes, window by window.
+
+    :param processes: returns their ids.
+    :param proc: the folder of the kernel's process files.
+    :param usable: numbers of the processors; by default those of this process.
+    """
+
+    def __init__(self, processes: Callable[[], Iterable[int]], proc: Path = PROC,
+                 usable: Iterable[int] | None = None) -> None:
+        self._processes, self._proc = processes, proc
+        self._usable = tuple(os.sched_getaffinity(0) if usable is None else usable)
+        self._recent: deque[Counters] = deque()
+        self._windows: list[tuple[float, Load]] = []
+
+    def sample(self, now: float) -> None:
+        """Read the counters at a time, s; more often than every PERIOD is in vain."""
+        if self._recent and now - self._recent[-1].time < PERIOD:
+            return
+        counters = read_counters(self._processes(), now, self._proc, self._usable)
+        if counters is None:
+            return
+        self._recent.append(counters)
+        while len(self._recent) > 1 and now - self._recent[1].time >= WINDOW:
+            self._recent.popleft()
+        if now - self._recent[0].time >= WINDOW:
+            self._windows.append((now, load_between(
+                self._recent[0], counters, len(self._usable))))
+
+    def worst(self, since: float = 0.0) -> Load | None:
+        """Return the load of the worst window that ended after a time, s; None if unknown."""
+        return max((load for time, load in self._windows if time >= since), default=None)
