@@ -364,8 +364,9 @@ class Gate:
         if setpoint.kind == setpoint_rules.BRAKE and self._held is not None:
             return self._held.height
         odom = self._sources[ODOM]
+        # A vehicle that is judged by its autopilot may fly commands on another's odometry.
         if setpoint.kind != setpoint_rules.COMMAND or self._command is None or (
-                place.height is None or odom.position is None):
+                self._source() != ODOM or place.height is None or odom.position is None):
             return None
         altitude = float(odom.position[2] + odom.velocity[2] * (now - odom.velocity_time))
         height = place.height + self._command.command.altitude - altitude
