@@ -160,7 +160,7 @@ def test_the_table_names_the_topic_to_remap_and_ends_with_the_verdict(
     assert checked(capsys, bag, '--remap', 'odom:=/vio/odometry')[0] == 0
     assert main([str(SAMPLE)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        'usable: 0 errors, 0 warnings, 15 ok, 3 not measured (odom positions, marker size, '
+        'usable: 0 errors, 0 warnings, 16 ok, 3 not measured (odom positions, marker size, '
         'camera mounting)')
 
 
