@@ -39,6 +39,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRESS = 20.0  # s between two lines
 PYTEST = (sys.executable, '-m', 'pytest', '--timeout', '600', '--timeout-method', 'thread', '-v')
 PARALLEL = ('-n', '2', '--dist', 'loadfile', '--no-loadscope-reorder')
+#: What computes leaves three quarters of a processor to what waits for nodes in real time.
+COMPUTING, NICENESS = 'test-computing', 5
 #: Where conftest.py writes how far a run is.
 STATUS = 'FLOCK_FOLLOWER_TEST_STATUS'
 FAILED, TOO_BUSY = 1, 3  # exit codes
@@ -76,7 +78,7 @@ def main(args: Sequence[str] | None = None) -> int:
         ended = run({'test': (*PARALLEL, *options.tests, *markers)})
     else:
         ended = run({'test-nodes': ('-m', 'ros and not sweep'),
-                     'test-computing': (*PARALLEL, '-m', 'not ros and not sweep')})
+                     COMPUTING: (*PARALLEL, '-m', 'not ros and not sweep')})
     again = [test for each in ended for test in each.status.busy]
     alone = []
     if again:
@@ -108,7 +110,8 @@ def run(runs: Mapping[str, Sequence[str]]) -> list[Run]:
             log = stack.enter_context(open(build / f'{name}.log', 'wb'))
             (build / f'{name}.json').unlink(missing_ok=True)
             children[name] = stack.enter_context(subprocess.Popen(
-                [*PYTEST, *arguments], cwd=ROOT, stdout=log, stderr=subprocess.STDOUT,
+                ['nice', '-n', str(NICENESS if name == COMPUTING else 0), *PYTEST, *arguments],
+                cwd=ROOT, stdout=log, stderr=subprocess.STDOUT,
                 env={**os.environ, STATUS: str(build / f'{name}.json')}))
         due = began
         # Ctrl-C reaches them, too; they end, and are waited for.
