@@ -108,7 +108,8 @@ def test_cycles_of_start_and_ctrl_c_are_clean(tmp_path):
             with contextlib.suppress(TimeoutError):
                 wait_until(lambda children=children: all(
                     child.poll() is not None for child in children.values()), 1.0, 'all to end')
-            for node, code in processes.stop_all(timeout=2.0).items():
+            processes.stop_all(timeout=2.0)
+            for node, code in ((node, child.returncode) for node, child in children.items()):
                 if code == -signal.SIGINT:
                     continue  # Python had not reached the package yet: not ours to keep quiet
                 # SIGALRM: Fast DDS hung, and the deadline ended it.
