@@ -15,9 +15,10 @@
 Run the suite, as ``make test`` does: what computes, and beside it what waits for nodes.
 
 What computes yields a little, and both go on beside other work. Every 20 s a line reports the
-tests done, their number, the time left, and the logs. A test of nodes that failed while other programs had the
-processors may have failed for that: it is repeated alone at the end, and that result counts. Exit
-code 0 if all passed, 1 if one failed, 3 if only tests failed for which it was too busy alone, too.
+tests done, their number, the time left, and the logs. A test of nodes that failed while other
+programs had the processors may have failed for that: it is repeated alone at the end, and that
+result counts. Exit code 0 if all passed, 1 if one failed, 3 if only tests failed for which it was
+too busy alone, too.
 
 ``test/suite.py [TEST ...] [-m MARKERS]``: some tests only.
 """

@@ -283,9 +283,10 @@ def planner_params(values: Mapping[str, Any], name: str = '') -> PlannerParams:
     :raises OSError: if it cannot be read.
     """
     cameras(values)
-    refuse(values)
-    return filled(PlannerParams(), values, vehicles={
+    params = filled(PlannerParams(), values, vehicles={
         other: who for other, who in _vehicles(values['neighbors_file']).items() if other != name})
+    refuse(values)
+    return params
 
 
 def gate_limits(values: Mapping[str, Any]) -> GateLimits:
@@ -294,8 +295,9 @@ def gate_limits(values: Mapping[str, Any]) -> GateLimits:
 
     :raises ValueError: if they do not fit together, or cannot fly.
     """
+    limits = filled(GateLimits(), values)
     refuse(values)
-    return filled(GateLimits(), values)
+    return limits
 
 
 @lru_cache

@@ -130,7 +130,9 @@ def test_a_command_says_what_it_rests_on_and_points_to_the_leader(rig: Rig) -> N
     (point,) = command.points
     stamp = stamp_to_nanoseconds(command.header.stamp)
     ahead = stamp_to_nanoseconds(point.time_from_start)
-    assert (command.header.frame_id, list(command.joint_names)) == ('odom', ['base_link'])
+    assert (command.header.frame_id, list(command.joint_names)) == (
+        'odom', ['base_link', 'altitude'])
+    assert point.transforms[1].translation.z == pytest.approx(2.0)
     assert (stamp - START) % STEP == 0  # to the nanosecond, an estimate's
     assert START < stamp <= stamp + ahead <= rig.now
     assert np.all(np.isnan(to_array(point.transforms[0].translation)))
@@ -194,19 +196,21 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
 
 
 def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig: Rig) -> None:
-    assert 'd1 = 8.0: must be a number in [d0' in rig.set(a_max=1.0, d0=9.0)
+    assert 'd1 = 8.0: must be a number in [d0' in rig.set(a_max=2.0, d0=9.0)
+    assert 'd1 = 1.2: must be at least 2.11 m^2' in rig.set(d1=1.2)
     assert rig.node.get_parameter('a_max').value == 2.5
     assert 'must be at most 2.5: its value at the start' in rig.set(a_max=2.51)
     rig.fly()
     assert rig.set(require_bridge=False) and rig.set(coast_timeout=0.4)
     assert 'cannot be switched off in flight' in rig.set(guard=False)
-    assert rig.set(v_max=0.3, a_max=0.1) == ''
-    assert 'must be at most 0.3: in flight it can only be lowered' in rig.set(v_max=0.4)
+    assert 'a_max = 0.1: must be a number in [1.5, 20]' in rig.set(a_max=0.1)
+    assert rig.set(v_max=0.05, a_max=1.5) == ''
+    assert 'must be at most 0.05: in flight it can only be lowered' in rig.set(v_max=0.4)
     for distance in (2.7, 1.0):
         rig.run(0.7, (distance, 0.0, 2.0))
         u = rig.acceleration()
-        # Too far, it is bounded by the lowered limit; separation keeps the a_max of the start.
-        assert np.linalg.norm(u) <= 0.1 if distance > 2.0 else u[0] < -0.5
+        # Too far, it is bounded by the lowered limit; separation keeps the v_max of the start.
+        assert np.linalg.norm(u) <= 0.05 / 0.3 + 1e-6 if distance > 2.0 else u[0] < -0.5
     rig.bridge_state = 'READY'
     rig.run(0.1)
     assert rig.set(v_max=0.5, a_max=2.5, guard=False) == ''
