@@ -14,6 +14,7 @@
 
 """What `make` refuses before it makes anything."""
 
+import os
 from pathlib import Path
 import shutil
 import subprocess
@@ -25,8 +26,12 @@ pytestmark = pytest.mark.skipif(shutil.which('make') is None, reason='make is no
 
 
 def make(*arguments):
+    # Settings of the `make test` that runs these tests are no settings of this make.
+    outside = {name: value for name, value in os.environ.items()
+               if name not in ('MAKEFLAGS', 'MAKELEVEL', 'MAKEOVERRIDES', 'MFLAGS', 'TESTS',
+                               'MARKERS', 'VISION')}
     return subprocess.run(['make', '--dry-run', *arguments], cwd=ROOT, capture_output=True,
-                          text=True, timeout=20.0)
+                          text=True, timeout=20.0, env=outside)
 
 
 @pytest.mark.parametrize('version', ['3', '4', '4.6', '5.0', ''])
