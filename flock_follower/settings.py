@@ -38,7 +38,7 @@ NARROWEST: Final[float] = 0.45
 #: Width of the band, m, below which a leader that reverses leaves it.
 NARROW: Final[float] = 1.0
 #: Width of a marker, px, below which it is lost.
-TINY: Final[float] = 12.0
+MARKER_LOST_WIDTH: Final[float] = 12.0
 #: Images that may be lost in a row before the neighbor is not followed any more.
 LOST_IMAGES: Final[float] = 2.0
 #: Assumed acceleration of a hidden neighbor, m/s^2, above which the vehicle retreats from nothing.
@@ -132,7 +132,7 @@ def _band(values: Mapping[str, Any]) -> Iterator[Judgement]:
 
 def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
     if camera.marker is not None and 'd1' in values:
-        far, range_max = math.sqrt(float(values['d1'])), camera.marker / TINY
+        far, range_max = math.sqrt(float(values['d1'])), camera.marker / MARKER_LOST_WIDTH
         far += float(values.get('radius', 0.0))
         if far > range_max:
             most = max(range_max - float(values.get('radius', 0.0)), 0.0)

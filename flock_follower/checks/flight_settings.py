@@ -25,7 +25,7 @@ from flock_follower.checks.pictures import camera_model
 from flock_follower.settings import Camera, judge
 
 #: Messages after which a rate counts as measured.
-MEASURED = 10
+MEASURED_MESSAGES = 10
 
 
 def check_settings(seen: Observations) -> Iterator[Finding]:
@@ -45,7 +45,7 @@ def check_settings(seen: Observations) -> Iterator[Finding]:
 def _camera(seen: Observations) -> Camera:
     """Return the camera and the smallest marker, as far as both are known."""
     images = seen.topic(seen.image_name)
-    rate = images.rate if len(images.arrivals) >= MEASURED else None
+    rate = images.rate if len(images.arrivals) >= MEASURED_MESSAGES else None
     if seen.calibration is None:
         return Camera(rate)
     try:

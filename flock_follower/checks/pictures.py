@@ -24,9 +24,10 @@ import numpy as np
 from flock_follower.checks.findings import ERROR, Finding, first, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
 from flock_follower.perception.camera import CameraModel
+from flock_follower.settings import MARKER_LOST_WIDTH
 
-#: Sides of a marker, px: below the first its range is noisy, below the second it is lost.
-SMALL, TINY = 18.0, 12.0
+#: Side of a marker, px, below which its range is noisy.
+SMALL = 18.0
 #: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
 #: Largest distance of the optical axis from the middle, share of the image: K for images of
@@ -122,7 +123,7 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
         (share == 0.0, WARNING, unseen,
          'hold the leader before the camera; is it the dictionary and id of the print, flat, its '
          'margin white?'),
-        (side < TINY, ERROR, measured,
+        (side < MARKER_LOST_WIDTH, ERROR, measured,
          'come nearer, print it larger, or use a longer lens or a finer image'),
         (side < SMALL, WARNING, measured,
          'come nearer, or print the marker larger: a small marker is lost easily'),

@@ -116,7 +116,7 @@ class GateLimits(Checked):
                                                  DISAGREEMENT_LEAST)
 
 
-#: The share of ``a_max`` that a stop at a bound is planned with; see ``_deceleration``.
+#: The share of ``a_max`` that a stop at a bound is planned with: the rest is for errors of thrust.
 BRAKING_SHARE: Final[float] = 0.4
 #: Time from a decision to the commanded acceleration, s: attitude, sending, velocity.
 REACTION_TIME: Final[float] = 0.4

@@ -143,7 +143,7 @@ class PlannerLoop:
         self._newest, self._own, self._frame = state.stamp, state, state.frame
 
     def take_acceleration(self, state: AccelerationState) -> None:
-        """Take the acceleration of a neighbour, before or after the neighbour's state."""
+        """Take the acceleration of a neighbor, before or after the neighbor's state."""
         self._accelerations.append(state)
 
     def take_neighbor(self, neighbor: OdometryState, received: bool = False) -> None:
@@ -249,7 +249,7 @@ class PlannerLoop:
 
 
     def _acceleration(self, n: OdometryState) -> Array | None:
-        """Return the acceleration (3,), m/s^2, of a neighbour, by the message nearest in time."""
+        """Return the acceleration (3,), m/s^2, of a neighbor, by the message nearest in time."""
         near = [each for each in (*self._earlier_accelerations, *self._accelerations)
                 if each.child == n.child and abs(n.stamp - each.stamp) <= ACCELERATION_AGE]
         if not near:
