@@ -72,7 +72,8 @@ class Range:
 THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.
 A_MAX = Range(1.5, 20.0, 'm/s^2')
-V_MAX = Range(0.05, 5.0, 'm/s')
+#: Below it gusts and the velocity error of odometry are as large as the limit.
+V_MAX = Range(0.1, 5.0, 'm/s')
 ODOM_TIMEOUT = Range(0.1, 1.0, 's')
 
 
