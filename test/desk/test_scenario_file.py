@@ -73,7 +73,7 @@ FLOCK = 'summary: a test\nflock: {followers: 4, cameras: [front]}'
 
 @pytest.mark.parametrize(('change', 'message'), [
     (('v_max: 2', 'v_max: fast'), "flight.v_max = 'fast': must be a number"),
-    (('v_max: 2', 'v_max: -1'), 'flight.v_max = -1.0: must be a number in [0.05, 5] m/s'),
+    (('v_max: 2', 'v_max: -1'), 'flight.v_max = -1.0: must be a number in [0.1, 5] m/s'),
     (('v_max: 2', 'd1: 0.5'),
      'flight.d1 = 0.5: must be a number in [d0 + 0.001, 10000] m^2, where d0 = 1.0'),
     (('v_max: 2', 'vmax: 2'), 'flight.vmax: unknown key: must be one of beta, d0, d1, a_max'),

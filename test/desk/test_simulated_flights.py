@@ -266,7 +266,7 @@ def test_a_wrong_scenario_is_a_message_not_a_traceback(
     bad.write_text('summary: bad\nflight:\n  v_max: 99\n')
     assert main(['--scenario', str(bad), '--output', str(tmp_path)]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f'error: {bad}: flight.v_max = 99.0: must be a number in [0.05, 5] m/s')
+        f'error: {bad}: flight.v_max = 99.0: must be a number in [0.1, 5] m/s')
 
 
 def children(parent: int) -> list[str]:

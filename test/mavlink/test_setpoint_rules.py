@@ -41,7 +41,7 @@ from flock_follower.mavlink.velocity_check import (
     ODOM,
 )
 from flock_follower.messages import Command, FASTEST_OWN
-from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX
+from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX, V_MAX
 
 LIMITS = GateLimits()
 UNKNOWN = Motion()
@@ -245,7 +245,7 @@ MOTION = st.builds(Motion, VECTOR, AGE, NUMBER, AGE)
 BOTH_MOTIONS = st.fixed_dictionaries({
     'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT])})
 LIMIT_SETS = st.builds(
-    GateLimits, a_max=st.floats(A_MAX.low, 20.0), v_max=st.floats(0.05, 5.0),
+    GateLimits, a_max=st.floats(A_MAX.low, 20.0), v_max=st.floats(V_MAX.low, V_MAX.high),
     speed_horizon=st.floats(0.02, 2.0),
     brake_time=st.floats(0.05, 2.0))
 ARGUMENTS = st.fixed_dictionaries({
@@ -316,7 +316,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
 
 
 @settings(max_examples=500)
-@given(st.floats(1.5, 20.0), st.floats(0.05, 2.0), DIRECTION, st.floats(0.0, 3.0),
+@given(st.floats(1.5, 20.0), st.floats(V_MAX.low, 2.0), DIRECTION, st.floats(0.0, 3.0),
        st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.tuples(*[st.floats(-2.0, 2.0)] * 3),
        st.none() | st.floats(-math.pi, math.pi), st.sampled_from([True, False]))
 def test_the_offset_is_added_to_the_command_except_along_too_fast_a_velocity(

@@ -204,13 +204,13 @@ def test_parameters_are_set_in_flight_or_refused_and_limits_are_only_lowered(rig
     assert rig.set(require_bridge=False) and rig.set(coast_timeout=0.4)
     assert 'cannot be switched off in flight' in rig.set(guard=False)
     assert 'a_max = 0.1: must be a number in [1.5, 20]' in rig.set(a_max=0.1)
-    assert rig.set(v_max=0.05, a_max=1.5) == ''
-    assert 'must be at most 0.05: in flight it can only be lowered' in rig.set(v_max=0.4)
+    assert rig.set(v_max=0.1, a_max=1.5) == ''
+    assert 'must be at most 0.1: in flight it can only be lowered' in rig.set(v_max=0.4)
     for distance in (2.7, 1.0):
         rig.run(0.7, (distance, 0.0, 2.0))
         u = rig.acceleration()
         # Too far, it is bounded by the lowered limit; separation keeps the v_max of the start.
-        assert np.linalg.norm(u) <= 0.05 / 0.3 + 1e-6 if distance > 2.0 else u[0] < -0.5
+        assert np.linalg.norm(u) <= 0.1 / 0.3 + 1e-6 if distance > 2.0 else u[0] < -0.5
     rig.bridge_state = 'READY'
     rig.run(0.1)
     assert rig.set(v_max=0.5, a_max=2.5, guard=False) == ''
