@@ -176,12 +176,15 @@ class EmbeddedAutopilot:
                 return self._answer_timesync(message, now)
             case 'SET_GPS_GLOBAL_ORIGIN':
                 controller.has_origin = True  # where on Earth does not matter here
-                return [mavlink.MAVLink_gps_global_origin_message(
-                    message.latitude, message.longitude, message.altitude,
-                    self._boot_ms(now) * 1000)]
+                # PX4 1.18 returns it on request only.
+                return [] if self._profile.px4 else [self._origin(now)]
             case 'COMMAND_LONG':
                 return self._command(message, now)
         return []
+
+    def _origin(self, now: float) -> Any:
+        return mavlink.MAVLink_gps_global_origin_message(
+            round(LATITUDE * 1e7), round(LONGITUDE * 1e7), 0, self._boot_ms(now) * 1000)
 
     def _answer_timesync(self, message: Any, now: float) -> list[Any]:
         # Zero would turn an answer into a request, and both ends would answer for ever.
@@ -218,8 +221,11 @@ class EmbeddedAutopilot:
                 for text in texts]
 
     def _command(self, message: Any, now: float) -> list[Any]:
-        controller = self.controller
+        controller, returned = self.controller, []
         match message.command:
+            case mavlink.MAV_CMD_REQUEST_MESSAGE if controller.has_origin and (
+                    message.param1 == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN):
+                results, returned = [ACCEPTED], [self._origin(now)]
             case mavlink.MAV_CMD_DO_SET_MODE:
                 results = controller.command_mode(
                     (message.param1, message.param2, message.param3), now)
@@ -236,7 +242,7 @@ class EmbeddedAutopilot:
                 results = [ACCEPTED]
             case _:
                 results = [int(mavlink.MAV_RESULT_UNSUPPORTED)]
-        return [*self._status_texts(), *(mavlink.MAVLink_command_ack_message(
+        return [*self._status_texts(), *returned, *(mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
             for result in results)]
 

@@ -299,6 +299,9 @@ class Bridge:
         """Send the odometry that is queued for forwarding."""
         if self.forwarder is None or self.telemetry.dialect is None:
             return
+        if self.housekeeping.origin.awaited:
+            self.forwarder.withhold()
+            return
         for message in self.forwarder.messages(self.telemetry.dialect, now):
             # On a line too slow for both, setpoints go first.
             room = not self.link.transport.congested()

@@ -27,8 +27,10 @@ from itertools import pairwise
 import math
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import Dialect
 from flock_follower.ranges import first_reason
 
@@ -49,6 +51,12 @@ _NEEDED: Final[dict[int, str]] = {
 #: For this long, s, after its fix was lost an estimator may still report a valid velocity: 7 s on
 #: PX4 and on ArduPilot. If it reports one afterwards, it has another source, such as optical flow.
 GPS_SILENCE: Final[float] = 10.0
+
+#: An estimate further than this, m, from odometry or from the home position is another place.
+FARTHEST_ESTIMATE: Final[float] = 1000.0
+#: From this coordinate on, m, two neighboring numbers of LOCAL_POSITION_NED (float32) are 0.5 m
+#: apart.
+COARSE_COORDINATE: Final[float] = 2.0 ** 22
 
 
 class GpsFix(NamedTuple):
@@ -154,3 +162,25 @@ class Arrivals:
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
         return len(self.recent(message_id, now, window)) + 1 < ENOUGH * wanted * window
+
+
+def misplaced(position: Array | None, home: Array | None, odometry: Array | None) -> str:
+    """
+    Return why the estimate cannot be the vehicle's place, or ''.
+
+    :param position: LOCAL_POSITION_NED (3,), m, ENU; None: not known.
+    :param home: HOME_POSITION (3,) in the same frame, m; None: not known.
+    :param odometry: position of the odometry (3,), m; None: not known.
+    """
+    if position is None:
+        return ''
+    if not float(np.max(np.abs(position))) < COARSE_COORDINATE:
+        return 'LOCAL_POSITION_NED has steps of 0.5 m: reboot the autopilot'
+    for name, other in (('odom', odometry), ('HOME_POSITION', home)):
+        if other is None or not np.all(np.isfinite(other)):
+            continue
+        away = math.dist(position, other)
+        if not away <= FARTHEST_ESTIMATE:
+            return (f'LOCAL_POSITION_NED is {away / 1000.0:.0f} km from {name}: '
+                    'reboot the autopilot')
+    return ''

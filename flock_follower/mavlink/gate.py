@@ -265,6 +265,11 @@ class Gate:
             f'more than setpoints offset ({THRUST_OFFSET_MAX:g}): check the load, the '
             f'battery, and {self.hover_thrust}')
 
+    @property
+    def odometry_position(self) -> Array | None:
+        """Return the newest position of odometry (3,), m; None if there is none."""
+        return self._sources[ODOM].position
+
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = self._known(now).braking

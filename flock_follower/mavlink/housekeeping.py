@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Requests beside the flight: telemetry rates, clock offset, parameters, reasons, origin.
+Requests beside the flight: telemetry rates, clock offset, parameters, reasons.
 
 Every request is repeated after a reboot of the autopilot, and when a lost link returns.
 
@@ -37,6 +37,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect
 from flock_follower.mavlink.estimator_health import RECENT
+from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
@@ -136,13 +137,6 @@ RATES: Final[Mapping[int, float]] = MappingProxyType({
 #: messages, s: the largest age of a velocity for braking.
 FEW: Final[float] = 0.5
 PAUSE: Final[float] = 0.3
-#: An origin is sent again after this, s, until the autopilot reports one.
-ORIGIN_PERIOD: Final[float] = 5.0
-#: Latitude, longitude, deg, and height, m, of the origin sent to PX4 if none is configured: the
-#: start of PX4's simulators. Zeros are no substitute: ground stations read 0 N 0 E as no position,
-#: and PX4 would expect the magnetic field off Africa, whose inclination and declination are wrong
-#: almost everywhere else.
-ANY_ORIGIN: Final[tuple[float, float, float]] = (47.397742, 8.545594, 0.0)
 #: Period of requests for the reasons that prevent arming, s, while disarmed; and the time in which
 #: the autopilot answers, s.
 WHY_PERIOD: Final[float] = 30.0
@@ -164,7 +158,7 @@ class Housekeeping:
     :param estimate_rate: requested rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, sent to an estimator without an origin.
     :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
-        receives ``ANY_ORIGIN`` if ``origin`` is None.
+        receives ``global_origin.ANY_ORIGIN`` if ``origin`` is None.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
@@ -175,9 +169,9 @@ class Housekeeping:
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
-        self._origin = origin
+        self.origin = GlobalOrigin(link, origin, without_gps)
         self.without_gps = without_gps
-        self._origin_sent = self._heartbeat_sent = -math.inf
+        self._heartbeat_sent = -math.inf
         self._timesync_sent = self._why_asked = -math.inf
         self._reboots = 0
         self._alive_since = math.inf  # s; infinite: it is not connected
@@ -194,17 +188,22 @@ class Housekeeping:
             self._heartbeat_sent = now
         if not alive:
             self._alive_since = math.inf
+            status = self._link.telemetry.status
+            if status is not None and not status.armed:
+                self.origin.begin_again()  # it may reboot: odometry waits for its new origin
             return
-        reboots = self._link.telemetry.reboots
+        reboots, dialect = self._link.telemetry.reboots, self._link.telemetry.dialect
         if reboots != self._reboots or math.isinf(self._alive_since):
             self._reboots, self._alive_since = reboots, now
             self.timesync = TimeSync()  # the autopilot's clock may have restarted
             self._requested, self.parameters = {}, self._new_check()
+            self.origin.begin_again()
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now
             self._link.send(self.timesync.request(to_nanoseconds(now)))
-        self._send_origin(now)
+        self.origin.step(None if dialect is None else self.parameters.values.get(
+            dialect.gps_switch), now)
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
         status = self._link.telemetry.status
@@ -272,25 +271,3 @@ class Housekeeping:
                    and arrivals.too_seldom(message_id, least[message_id], now))}
         self._link.request_streams(due)
         self._requested.update(dict.fromkeys(due, now))
-
-    def _send_origin(self, now: float) -> None:
-        telemetry, origin = self._link.telemetry, self._origin
-        dialect = telemetry.dialect
-        # An autopilot that has an origin, by GPS or from before, keeps it.
-        if dialect is None or 'GPS_GLOBAL_ORIGIN' in telemetry.newest or (
-                now - self._origin_sent < ORIGIN_PERIOD):
-            return
-        if origin is None and self.without_gps and (
-                self.parameters.values.get(dialect.gps_switch) == 0):
-            origin = ANY_ORIGIN
-        if origin is None or (
-                # Sent before odometry is fused, PX4's heights would jump by the origin's.
-                telemetry.estimator is not None and not telemetry.estimator.has_velocity):
-            return
-        latitude, longitude, height = origin
-        # PX4's heights jumped by it whenever odometry returned: a take-off went on to 30 m.
-        height = height if dialect.origin_has_height else 0.0
-        if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
-                self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
-                round(height * 1e3))):
-            self._origin_sent = now

@@ -98,6 +98,12 @@ class OdometryForwarder:
             self._queue.append((state, time, self.reset_counter))
         return ''
 
+    def withhold(self) -> None:
+        """Drop the queued states: the autopilot may not take odometry yet."""
+        if self._queue:
+            self.counters['before the origin'] += len(self._queue)
+        self._queue.clear()
+
     def messages(self, dialect: Dialect, now: float) -> list[Any]:
         """Return the messages to send now, oldest first; states that are too old are dropped."""
         fresh = [entry for entry in self._queue if now - entry[1] <= OLDEST]

@@ -30,7 +30,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink import commands, envelope, parameter_check
 from flock_follower.mavlink.commands import Goal, NOT_RECEIVED, Request, Vehicle
 from flock_follower.mavlink.dialects import Dialect, PX4, VehicleStatus
-from flock_follower.mavlink.estimator_health import explained
+from flock_follower.mavlink.estimator_health import explained, misplaced
 from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
@@ -208,7 +208,9 @@ class Requests:
         if in_air:
             reasons += [IN_AIR[telemetry.flying(now)],
                         envelope.outside(gate.limits, gate.heights.height(now))]
-        reasons.append(self._end.battery_low(now))
+        reasons += [self._end.battery_low(now), self._housekeeping.origin.obstacle,
+                    misplaced(telemetry.local_place(now), telemetry.home(),
+                              gate.odometry_position)]
         if self._require_failsafe:
             reasons.append(parameter_check.obstacle(
                 dialect, self._housekeeping.parameters, self._housekeeping.without_gps))

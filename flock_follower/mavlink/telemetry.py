@@ -219,9 +219,19 @@ class Telemetry:
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None if not fresh."""
+        place = self.local_place(now)
+        return None if place is None else float(place[2])
+
+    def local_place(self, now: float) -> Array | None:
+        """Return LOCAL_POSITION_NED (3,), m, ENU; None if not fresh."""
         local = self.local_position
         fresh = local is not None and now - local.time <= ESTIMATE_TIMEOUT
-        return float(local.position[2]) if local is not None and fresh else None
+        return local.position if local is not None and fresh else None
+
+    def home(self) -> Array | None:
+        """Return HOME_POSITION in the frame of LOCAL_POSITION_NED (3,), m, ENU; None: unknown."""
+        message = self.recent('HOME_POSITION', math.inf, 0.0)
+        return None if message is None else ned_to_enu([message.x, message.y, message.z])
 
     def sea_level_altitude(self, now: float) -> float | None:
         """Return the height above mean sea level, m; None if not fresh (no GPS)."""
@@ -247,7 +257,6 @@ class Telemetry:
         fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
         if fallen and self._fallen:  # a single one may have been delayed
             self.reboots += 1
-            self.newest.pop('GPS_GLOBAL_ORIGIN', None)
             fallen, self._boot_time_ms = False, stamp
         self._fallen = fallen
         self._boot_time_ms = max(self._boot_time_ms, stamp)

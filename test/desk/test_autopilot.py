@@ -153,8 +153,11 @@ def test_px4_without_an_origin_stays_in_its_take_off_until_it_gets_one():
     assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
     assert flight.mode('AUTO.LOITER') == [0, 1] and flight.mode('POSCTL') == [0, 1]
     assert not flight.all('HOME_POSITION')
-    answers = flight.send(ORIGIN)
-    assert [m.get_type() for m in answers] == ['GPS_GLOBAL_ORIGIN']
+    assert not flight.send(ORIGIN)
+    answers = flight.send(mavlink.MAVLink_command_long_message(
+        1, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+        0, 0, 0, 0, 0, 0))
+    assert [m.get_type() for m in answers] == ['GPS_GLOBAL_ORIGIN', 'COMMAND_ACK']
     flight.fly(0.1, seen(flight))
     assert flight.controller.mode == 'AUTO.LOITER'
 

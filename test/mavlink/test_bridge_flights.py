@@ -21,6 +21,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.mavlink.global_origin import NO_HEIGHT
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 
 pytestmark = pytest.mark.slow
@@ -110,22 +111,65 @@ def test_on_a_congested_line_setpoints_are_sent_and_odometry_is_not():
 GIVEN = (47.4, 8.5, 488.0)
 
 
-@pytest.mark.parametrize(('personality', 'options', 'reported'), [
+def told_origins(flight):
+    return [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
+            if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
+
+
+def forwarded(flight):
+    return [time for time, m in flight.received if m.get_type() == 'ODOMETRY']
+
+
+@pytest.mark.parametrize(('personality', 'options', 'told'), [
     # PX4 is told an origin without height, and any where it flies without GPS.
-    ('px4', without_gps('px4'), {(473977420, 85455940, 0)}),
-    ('px4', without_gps('px4', origin=GIVEN), {(474000000, 85000000, 0)}),
-    ('px4', {'bridge': {'forwarder': OdometryForwarder(30.0)}}, set()),
+    ('px4', without_gps('px4'), [(473977420, 85455940, NO_HEIGHT)]),
+    ('px4', without_gps('px4', origin=GIVEN), [(474000000, 85000000, NO_HEIGHT)]),
+    ('px4', {'bridge': {'forwarder': OdometryForwarder(30.0)}}, []),
     # Until it shows that it has one.
     ('arducopter', {'bridge': {'origin': GIVEN}, 'faults': [
         Fault('drop', 0.0, 8.0, 'sent', message='GPS_GLOBAL_ORIGIN')]},
-     {(474000000, 85000000, 488000)})])
-def test_an_origin_is_told_until_the_autopilot_has_one(personality, options, reported):
-    flight = forwarding(Flight(personality, **options))
+     2 * [(474000000, 85000000, 488000)])])
+def test_an_origin_is_told_until_the_autopilot_has_one(personality, options, told):
+    flight = forwarding(Flight(personality, start='landed', **options))
     flight.fly(8.0)
-    origins = [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
-               if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
-    assert set(origins) == reported and (len(origins) == 2 if 'faults' in options else True)
+    assert told_origins(flight) == told
     origin = mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 488000)
     flight.wire.arrived.append(origin.pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(6.0)
-    assert sum(m.get_type() == 'SET_GPS_GLOBAL_ORIGIN' for _, m in flight.received) == len(origins)
+    assert told_origins(flight) == told
+
+
+def test_odometry_waits_for_the_origin_on_the_ground():
+    """PX4 1.18 moves its estimate by 5,000 km if the origin comes after vision."""
+    flight = forwarding(Flight(start='landed', **without_gps('px4')))
+    flight.fly(6.0)
+    told = [time for time, m in flight.received if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
+    assert len(told) == 1 and told[0] < min(forwarded(flight)) < 4.0
+
+
+def test_in_the_air_odometry_never_waits_and_no_origin_is_told():
+    flight = forwarding(Flight(**without_gps('px4')))
+    flight.fly(4.0)
+    assert min(forwarded(flight)) < 1.0 and not told_origins(flight)
+
+
+def test_an_origin_that_is_never_returned_refuses_offboard():
+    flight = forwarding(Flight(start='landed', **without_gps('px4'), faults=[
+        Fault('drop', 0.0, 60.0, 'sent', message='GPS_GLOBAL_ORIGIN')]))
+    flight.fly(8.0)
+    assert not forwarded(flight) and len(told_origins(flight)) >= 3
+    assert 'GPS_GLOBAL_ORIGIN returned' in flight.bridge.refusal(flight.now)
+
+
+def test_an_origin_comes_too_late_for_an_estimate_that_has_begun():
+    """A restarted bridge asks for the origin; without one the autopilot needs a reboot."""
+    flight = forwarding(Flight(start='landed', **without_gps('px4'), faults=[
+        Fault('drop', 0.0, 60.0, 'sent', message='GPS_GLOBAL_ORIGIN')]))
+    while not flight.bridge.telemetry.estimator or not (
+            flight.bridge.telemetry.estimator.has_velocity):
+        flight.bridge.housekeeping.origin.awaited = False
+        flight.fly(0.05)
+        assert flight.now < 20.0
+    flight.bridge.housekeeping.origin.begin_again()  # as if the bridge were another one
+    flight.fly(3.0)
+    assert 'reboot it' in flight.bridge.refusal(flight.now)

@@ -16,6 +16,7 @@
 
 import math
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
@@ -27,6 +28,7 @@ from flock_follower.mavlink.estimator_health import (
     explained,
     gps_fix,
     GpsFix,
+    misplaced,
 )
 
 # What PX4 1.16 sent while vision was fused in flight, then 0.6 s and 5 s after it was lost.
@@ -111,3 +113,16 @@ def test_it_is_distrusted_from_what_it_rests_on_and_from_what_the_estimator_says
 def test_a_fix_is_lost_since_the_first_message_without_it():
     assert (fixes(1).fixed, fixes(1, 6).fixed) == (False, True)
     assert GpsFix(False, 6.0) == LOST
+
+
+@pytest.mark.parametrize(('position', 'home', 'odometry', 'reason'), [
+    (None, (0, 0, 0), (0, 0, 0), ''), ((1, 2, 3), None, None, ''),
+    ((990, 0, 0), (0, 0, 0), (0, 0, 0), ''), ((1, 2, 3), (math.nan, 0, 0), (1, 2, 3), ''),
+    ((1100, 0, 0), None, (0, 0, 0), 'km from odom'), ((0, 0, 0), (0, 1100, 0), None, 'km from H'),
+    # What PX4 1.18 sent after its origin came too late.
+    ((-1067128.1, -5227320.5, 489.7), None, None, 'steps of 0.5 m'),
+    ((math.nan, 0, 0), None, None, 'steps of 0.5 m')])
+def test_an_estimate_in_another_place_is_found(position, home, odometry, reason):
+    found = misplaced(*(None if each is None else np.array(each, dtype=float)
+                        for each in (position, home, odometry)))
+    assert (reason in found) and bool(found) == bool(reason)
