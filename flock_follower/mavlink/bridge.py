@@ -218,8 +218,7 @@ class Bridge:
             self._take_status(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
-        setpoint, accepted = self.gate.decide(
-            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
+        setpoint, accepted = self._decide(now)
         if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers data: no setpoint is queued while the link is dead.
@@ -240,6 +239,10 @@ class Bridge:
         first = accepted if sent and accepted is not self._last_command else None
         self._last_command = first or self._last_command
         return Cycle(setpoint, sent, first)
+
+    def _decide(self, now: float) -> tuple[Setpoint, AcceptedCommand | None]:
+        return self.gate.decide(now, self.telemetry.silence(now), self.withheld(),
+                                self.distrusted(now), self.telemetry.mode_age(now))
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
@@ -327,8 +330,7 @@ class Bridge:
             make = commands.land if self.requests.landing else commands.hold
             goal = make(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)
-        setpoint, _ = self.gate.decide(
-            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
+        setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 

@@ -15,7 +15,8 @@
 """
 Requests beside the flight: telemetry rates, clock offset, parameters, reasons, origin.
 
-Every request is repeated after a reboot of the autopilot, and when a lost link returns.
+Every request is repeated after a reboot of the autopilot and with another vehicle; when a lost
+link returns only the telemetry is requested again, the answers are kept.
 
 ``TimeSync`` measures the offset between the autopilot's clock and ours by TIMESYNC, and answers
 the autopilot's own requests. A request has ``tc1 = 0`` and the sender's time in ``ts1``; the
@@ -179,7 +180,7 @@ class Housekeeping:
         self.without_gps = without_gps
         self._origin_sent = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._why_asked = -math.inf
-        self._reboots = 0
+        self._vehicle = -1, 0  # reboots, and changes of the vehicle; none was connected
         self._alive_since = math.inf  # s; infinite: it is not connected
         self._requested: dict[int, float] = {}  # when each message was requested last, s
 
@@ -195,11 +196,13 @@ class Housekeeping:
         if not alive:
             self._alive_since = math.inf
             return
-        reboots = self._link.telemetry.reboots
-        if reboots != self._reboots or math.isinf(self._alive_since):
-            self._reboots, self._alive_since = reboots, now
-            self.timesync = TimeSync()  # the autopilot's clock may have restarted
-            self._requested, self.parameters = {}, self._new_check()
+        vehicle = self._link.telemetry.reboots, self._link.peer_changes
+        if vehicle != self._vehicle or math.isinf(self._alive_since):
+            self._requested, self._alive_since = {}, now
+        if vehicle != self._vehicle:
+            self._vehicle = vehicle
+            self.timesync = TimeSync()  # its clock has restarted
+            self.parameters = self._new_check()
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
             self._timesync_sent = now

@@ -47,9 +47,11 @@ FELL_SILENT: Final[str] = 'fell silent'
 #: After a takeover offboard is refused for this long, s: another program must not undo it.
 TAKEOVER_TIME: Final[float] = 10.0
 TWO_COMMAND: Final[str] = 'two nodes command'
-#: If two messages with the mode (HEARTBEAT, CURRENT_MODE) are further apart than this, s, the
-#: pilot may have taken over in between.
+#: The vehicle is braked if no message with the mode (HEARTBEAT, CURRENT_MODE) came for this, s.
+MODE_TIMEOUT: Final[float] = 3.0
+#: After this long without the mode, s, the permission ends: the pilot may have taken over.
 LONGEST_SILENCE: Final[float] = 5.0
+MODE_UNKNOWN: Final[str] = 'mode unknown'
 
 
 class Phase(enum.Enum):
@@ -126,6 +128,13 @@ class Permission:
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return Permission(reason=f'{FELL_SILENT}: {why}') if self.streams else self
 
+    def unseen(self, silence: float) -> Permission:
+        """Brake for good after a time, s, without the mode: the pilot may have taken over."""
+        flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
+        return self if not flown or silence <= LONGEST_SILENCE else replace(
+            self, phase=Phase.GIVING_BACK,
+            reason=f'{MODE_UNKNOWN} for {silence:.0f} s, the pilot may have taken over')
+
     def landed(self) -> Permission:
         """End a flight after a landing."""
         return Permission(reason=ON_GROUND) if self.streams else self
@@ -133,6 +142,11 @@ class Permission:
     def restarted(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
         return Permission(reason=why)
+
+    def left(self, status: VehicleStatus) -> Permission:
+        """End a flight whose mode somebody else has changed."""
+        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
+                          received=self.received)
 
     def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
         """
@@ -143,20 +157,17 @@ class Permission:
         """
         if not self.streams or received <= self.since:
             return self
-        now, silence = replace(self, received=received), received - self.received
-        if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
-            return replace(now, phase=Phase.GIVING_BACK,
-                           reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
-                                  'over')
+        now = replace(self.unseen(received - self.received), received=received)
         if now.phase is Phase.GIVING_BACK:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
+            if now.reason.startswith(MODE_UNKNOWN) and status.armed:
+                return now.left(status)
             return Permission(reason=f'given back ({now.reason})')
         if now.phase is Phase.READY and (not status.armed or airborne is False):
             return Permission(reason=ON_GROUND if status.armed else 'disarmed')
         if not status.offboard:
-            return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
-                              received=received) if now.obeyed else now
+            return now.left(status) if now.obeyed else now
         if now.phase is Phase.ACTIVE:
             return now if status.armed else Permission(reason='disarmed')
         if airborne is None:

@@ -161,7 +161,12 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert active.phase is Phase.ACTIVE
     lost = next_permission(active, seen(OURS, active.received + LONGEST_SILENCE + 0.1))
     assert lost.announced() == (
-        'READY: giving back: no HEARTBEAT for 5 s, the pilot may have taken over')
+        'READY: giving back: mode unknown for 5 s, the pilot may have taken over')
+    assert active.unseen(LONGEST_SILENCE) is active
+    assert active.unseen(LONGEST_SILENCE + 0.1).announced() == lost.announced()
+    # Somebody has changed the mode meanwhile; a disarmed vehicle was landed.
+    assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
+    assert next_permission(lost, seen(DISARMED, 20.0)).phase is Phase.INACTIVE
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS, 2.0), seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS), seen(PILOT, 20.0)).phase is Phase.TAKEN_OVER
@@ -173,7 +178,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('requested', 1.0), ('blinded', 'no velocity'), ('failed', 'late'),
+EVENTS = [('requested', 1.0), ('unseen', 5.1), ('blinded', 'no velocity'), ('failed', 'late'),
           LANDED, ENDED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]
