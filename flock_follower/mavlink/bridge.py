@@ -37,10 +37,11 @@ from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import FELL_SILENT
+from flock_follower.mavlink.permission import FELL_SILENT, STICK
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
+from flock_follower.mavlink.sticks import KINDS, StickWatch
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import OdometryState, to_nanoseconds
@@ -99,6 +100,7 @@ class Bridge:
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
+        self.sticks = StickWatch(self.end.params.stick_override)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
         self.status = self.requests.status
@@ -120,6 +122,8 @@ class Bridge:
         self._takers: dict[str, Callable[[Any, float], object]] = {
             'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
             'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
+            **dict.fromkeys(KINDS, lambda message, now: self.sticks.take(
+                message, now, self.telemetry.transmitter_lost(now))),
             'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message)}
 
     def alive(self, now: float) -> bool:
@@ -288,14 +292,17 @@ class Bridge:
         why, action = self.end.reason(
             self.gate.active_since, self.gate.command_time,
             self.gate.handover(now) if flies else '', now)
+        if moved := self.sticks.moved and self.housekeeping.watches_sticks():
+            why, action = STICK.text, HOLD
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
             held, *_ = handover.current.modes
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask and not self.requests.stopping:
+            stop = commands.position if moved else commands.hold
             self.handover = self.requests.begin(
-                commands.hold if ask == HOLD else commands.land, now, why=self.end.why)
+                stop if ask == HOLD else commands.land, now, why=self.end.why)
             self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
@@ -342,4 +349,7 @@ class Bridge:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
             self.gate.permit(self.gate.permission.restarted(
                 'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
+        flew = self.gate.permission.flies
         self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        if self.gate.permission.flies and not flew:
+            self.sticks.begin(now)

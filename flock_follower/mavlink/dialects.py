@@ -129,6 +129,10 @@ class Dialect:
     """Rate requested for it, Hz."""
     least_mode_rate: float
     """Rate at which it then arrives while the mode does not change, Hz."""
+    position: str = ''
+    """The mode that the bridge requests if the pilot moves a stick; '': the hold mode."""
+    stick_speed: str = ''
+    """Parameter of the speed above which a stick takes over by itself; '': there is none."""
     reports_checks: bool = False
     """Whether it answers MAV_CMD_RUN_PREARM_CHECKS by EVENTs that name the failed checks."""
     no_reason: str = ''
@@ -213,7 +217,7 @@ PX4: Final[Dialect] = Dialect(
     # Two changes further apart than 20 ms arrive as two messages. The cost is that of 2 Hz:
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, mode_rate=50.0, least_mode_rate=2.0,
-    reports_checks=True,
+    position='POSCTL', stick_speed='MAN_OVERRIDE_SPD', reports_checks=True,
     no_reason='PX4 sends the cause only to a ground station: look there, or set announce_as_gcs')
 #: ArduCopter; its behaviour was measured on 4.7.
 ARDUPILOT: Final[Dialect] = Dialect(

@@ -63,6 +63,7 @@ _FLYING: Final[dict[int, bool]] = {
     mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
     mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
 _UNKNOWN_VOLTAGE = 65535  # mV
+_TRANSMITTER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 
 
 class SensorAltitude(NamedTuple):
@@ -217,6 +218,13 @@ class Telemetry:
         """Return whether the vehicle reports that it is in the air; None without a report."""
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)
+
+    def transmitter_lost(self, now: float) -> bool:
+        """Return whether the autopilot reports that the pilot's transmitter is lost."""
+        message = self.recent('SYS_STATUS', LANDED_OLDEST, now)
+        return message is not None and bool(
+            message.onboard_control_sensors_enabled & _TRANSMITTER
+            & ~message.onboard_control_sensors_health)
 
     @property
     def landed(self) -> int | None:

@@ -29,6 +29,7 @@ from flock_follower.mavlink.permission import (
     NOT_REQUESTED,
     Permission,
     Phase,
+    STICK,
 )
 
 DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'fly.md'
@@ -92,7 +93,9 @@ def test_a_landing_ends_the_permission(events):
 def test_a_takeover_bars_offboard_for_ten_seconds():
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
     for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
-        assert permission.taken_over(now).startswith(f'the pilot took over {seconds} s ago')
+        assert permission.taken_over(now).startswith(
+            f'the pilot, or a failsafe, took over {seconds} s ago')
+        assert permission.attributed(STICK, now).taken_over(now).startswith('the pilot took over')
     assert permission.taken_over(14.9)
     assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
