@@ -37,11 +37,12 @@ from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import FELL_SILENT, STICK
+from flock_follower.mavlink.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
 from flock_follower.mavlink.sticks import KINDS, StickWatch
+from flock_follower.mavlink.takeover import AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import OdometryState, to_nanoseconds
@@ -100,6 +101,8 @@ class Bridge:
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
+        self.takeover = TakeoverWatch()
+        self._reported_cause: Cause | None = None  # to the ground station
         self.sticks = StickWatch(self.end.params.stick_override)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
@@ -205,6 +208,7 @@ class Bridge:
         return self.housekeeping.timesync.age(estimate.time_boot_ms, to_nanoseconds(now))
 
     def _take(self, message: Any, now: float) -> None:
+        self.takeover.take(message, self.telemetry.dialect, now)
         if (status := self.telemetry.shown(message)) is not None:
             # Each one: of two that arrive at once, the first may show that the pilot took over.
             self._take_status(status, now)
@@ -353,3 +357,19 @@ class Bridge:
         self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))
         if self.gate.permission.flies and not flew:
             self.sticks.begin(now)
+        if self.gate.permission.phase is not Phase.TAKEN_OVER:
+            self._reported_cause = None
+        self._attribute_takeover(now)
+
+    def _attribute_takeover(self, now: float) -> None:
+        """Find out who has taken over; report it once it is known, or after AFTER."""
+        permission, dialect = self.gate.permission, self.telemetry.dialect
+        if permission.phase is not Phase.TAKEN_OVER or permission.cause in (PILOT, STICK) or (
+                dialect is None):
+            return
+        cause = self.takeover.cause(dialect, permission.received)
+        self.gate.permit(permission.attributed(cause, now))
+        settled = cause not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
+        if settled and cause != self._reported_cause:
+            self._reported_cause = cause
+            self.ground_station.take_handover(cause.text)

@@ -129,6 +129,8 @@ class Dialect:
     """Rate requested for it, Hz."""
     least_mode_rate: float
     """Rate at which it then arrives while the mode does not change, Hz."""
+    pilot_modes: tuple[str, ...] = ()
+    """Modes that no failsafe enters; (): not known."""
     position: str = ''
     """The mode that the bridge requests if the pilot moves a stick; '': the hold mode."""
     stick_speed: str = ''
@@ -253,7 +255,8 @@ ARDUPILOT: Final[Dialect] = Dialect(
           for source in ('POSXY', 'VELXY'))),
     hover_thrust='MOT_THST_HOVER',
     # HEARTBEAT is sent at once when the mode changes; 5 Hz covers lost ones.
-    mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0)
+    mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0,
+    pilot_modes=('STABILIZE', 'ACRO', 'LOITER', 'POSHOLD', 'SPORT', 'DRIFT', 'FLOWHOLD'))
 DIALECTS: Final[Mapping[str, Dialect]] = MappingProxyType({
     dialect.name: dialect for dialect in (PX4, ARDUPILOT)})
 #: Values of the parameter ``autopilot``.

@@ -84,7 +84,8 @@ def test_a_switch_away_and_back_in_messages_that_arrive_together_is_seen():
         mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode]).pack(codec)
         for mode in ('POSCTL', 'OFFBOARD')]
     flight.fly(0.05)
-    assert flight.bridge.state(flight.now) == 'TAKEN_OVER: offboard was left for POSCTL'
+    assert flight.bridge.state(flight.now) == (
+        'TAKEN_OVER: offboard was left for POSCTL: the pilot took over')
 
 
 def test_a_line_that_delivers_late_gets_no_setpoint_while_nothing_is_received():

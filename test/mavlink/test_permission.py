@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
+from flock_follower.mavlink import takeover
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import (
     FELL_SILENT,
@@ -97,6 +98,10 @@ def test_a_takeover_bars_offboard_for_ten_seconds():
             f'the pilot, or a failsafe, took over {seconds} s ago')
         assert permission.attributed(STICK, now).taken_over(now).startswith('the pilot took over')
     assert permission.taken_over(14.9)
+    failed = permission.attributed(takeover.failsafe('fence'), 6.0)
+    assert not failed.taken_over(6.0)
+    assert failed.announced() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
+    assert failed.attributed(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
     assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
