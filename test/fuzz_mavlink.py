@@ -219,7 +219,8 @@ class BridgeUnderFire:
 
     def _watch(self):
         """Note what forbids setpoints: a vehicle that is not flown by them, and a takeover."""
-        phase = self.bridge.gate.permission.phase
+        permission = self.bridge.gate.permission
+        phase = permission.phase
         self._was_active = phase is Phase.ACTIVE or (
             self._was_active and phase is Phase.GIVING_BACK)
         restarts = self.bridge.telemetry.reboots, self.link.peer_changes
@@ -227,6 +228,8 @@ class BridgeUnderFire:
             self._restarts, self._taken_over = restarts, -math.inf
         if phase is not Phase.TAKEN_OVER:
             self._free = True
+        elif not permission.cause.pilot:  # a failsafe bars nothing, a pilot after it does
+            self._free, self._taken_over = True, -math.inf
         elif self._free:
             self._free, self._taken_over = False, self.now
 

@@ -37,10 +37,12 @@ from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import FELL_SILENT
+from flock_follower.mavlink.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
 from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
+from flock_follower.mavlink.sticks import KINDS, StickWatch
+from flock_follower.mavlink.takeover import AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import OdometryState, to_nanoseconds
@@ -99,6 +101,9 @@ class Bridge:
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
+        self.takeover = TakeoverWatch()
+        self._reported_cause: Cause | None = None  # to the ground station
+        self.sticks = StickWatch(self.end.params.stick_override)
         self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
         self.status = self.requests.status
@@ -120,6 +125,8 @@ class Bridge:
         self._takers: dict[str, Callable[[Any, float], object]] = {
             'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
             'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
+            **dict.fromkeys(KINDS, lambda message, now: self.sticks.take(
+                message, now, self.telemetry.transmitter_lost(now))),
             'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message)}
 
     def alive(self, now: float) -> bool:
@@ -201,6 +208,7 @@ class Bridge:
         return self.housekeeping.timesync.age(estimate.time_boot_ms, to_nanoseconds(now))
 
     def _take(self, message: Any, now: float) -> None:
+        self.takeover.take(message, self.telemetry.dialect, now)
         if (status := self.telemetry.shown(message)) is not None:
             # Each one: of two that arrive at once, the first may show that the pilot took over.
             self._take_status(status, now)
@@ -218,8 +226,7 @@ class Bridge:
             self._take_status(status, now)
             self._refer_height(status, now)
         flew = self.gate.flies
-        setpoint, accepted = self.gate.decide(
-            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
+        setpoint, accepted = self._decide(now)
         if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers data: no setpoint is queued while the link is dead.
@@ -240,6 +247,10 @@ class Bridge:
         first = accepted if sent and accepted is not self._last_command else None
         self._last_command = first or self._last_command
         return Cycle(setpoint, sent, first)
+
+    def _decide(self, now: float) -> tuple[Setpoint, AcceptedCommand | None]:
+        return self.gate.decide(now, self.telemetry.silence(now), self.withheld(),
+                                self.distrusted(now), self.telemetry.mode_age(now))
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
         return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
@@ -285,14 +296,17 @@ class Bridge:
         why, action = self.end.reason(
             self.gate.active_since, self.gate.command_time,
             self.gate.handover(now) if flies else '', now)
+        if moved := self.sticks.moved and self.housekeeping.watches_sticks():
+            why, action = STICK.text, HOLD
         held = ''
         if handover is not None and handover.outcome is not None and handover.outcome.success:
             held, *_ = handover.current.modes
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask and not self.requests.stopping:
+            stop = commands.position if moved else commands.hold
             self.handover = self.requests.begin(
-                commands.hold if ask == HOLD else commands.land, now, why=self.end.why)
+                stop if ask == HOLD else commands.land, now, why=self.end.why)
             self.ground_station.take_handover(self.end.why)
 
     def send_odometry(self, now: float) -> None:
@@ -330,8 +344,7 @@ class Bridge:
             make = commands.land if self.requests.landing else commands.hold
             goal = make(self.telemetry.dialect)
             self.link.send_command(goal.command, goal.params)
-        setpoint, _ = self.gate.decide(
-            now, self.telemetry.silence(now), self.withheld(), self.distrusted(now))
+        setpoint, _ = self._decide(now)
         if setpoint.kind != NONE:
             self.link.send(self._message(np.zeros(3), setpoint, now))
 
@@ -343,4 +356,23 @@ class Bridge:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
             self.gate.permit(self.gate.permission.restarted(
                 'the autopilot rebooted' if before[0] != self._vehicle[0] else _OTHER_VEHICLE))
+        flew = self.gate.permission.flies
         self.gate.take_status(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        if self.gate.permission.flies and not flew:
+            self.sticks.begin(now)
+        if self.gate.permission.phase is not Phase.TAKEN_OVER:
+            self._reported_cause = None
+        self._attribute_takeover(now)
+
+    def _attribute_takeover(self, now: float) -> None:
+        """Find out who has taken over; report it once it is known, or after AFTER."""
+        permission, dialect = self.gate.permission, self.telemetry.dialect
+        if permission.phase is not Phase.TAKEN_OVER or permission.cause in (PILOT, STICK) or (
+                dialect is None):
+            return
+        cause = self.takeover.cause(dialect, permission.received)
+        self.gate.permit(permission.attributed(cause, now))
+        settled = cause not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
+        if settled and cause != self._reported_cause:
+            self._reported_cause = cause
+            self.ground_station.take_handover(cause.text)

@@ -118,6 +118,13 @@ def hold(dialect: Dialect) -> Goal:
     return replace(goal, name='hold', reached=lambda vehicle: not vehicle.status.offboard)
 
 
+def position(dialect: Dialect) -> Goal:
+    """Return the goal of the mode that obeys the pilot's sticks, else of the hold mode."""
+    modes = dict.fromkeys(filter(None, (dialect.position, dialect.hold)))
+    return replace(enter(dialect, *modes, ends_flight=True), name='position',
+                   reached=lambda vehicle: not vehicle.status.offboard)
+
+
 def land(dialect: Dialect) -> Goal:
     """Return the goal of landing here: reached when the vehicle descends, not when it is down."""
     return replace(enter(dialect, dialect.land, ends_flight=True), name='land', insists=True)

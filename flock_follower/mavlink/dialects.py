@@ -129,6 +129,12 @@ class Dialect:
     """Rate requested for it, Hz."""
     least_mode_rate: float
     """Rate at which it then arrives while the mode does not change, Hz."""
+    pilot_modes: tuple[str, ...] = ()
+    """Modes that no failsafe enters; (): not known."""
+    position: str = ''
+    """The mode that the bridge requests if the pilot moves a stick; '': the hold mode."""
+    stick_speed: str = ''
+    """Parameter of the speed above which a stick takes over by itself; '': there is none."""
     reports_checks: bool = False
     """Whether it answers MAV_CMD_RUN_PREARM_CHECKS by EVENTs that name the failed checks."""
     no_reason: str = ''
@@ -213,7 +219,7 @@ PX4: Final[Dialect] = Dialect(
     # Two changes further apart than 20 ms arrive as two messages. The cost is that of 2 Hz:
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
     mode_message=mavlink.MAVLINK_MSG_ID_CURRENT_MODE, mode_rate=50.0, least_mode_rate=2.0,
-    reports_checks=True,
+    position='POSCTL', stick_speed='MAN_OVERRIDE_SPD', reports_checks=True,
     no_reason='PX4 sends the cause only to a ground station: look there, or set announce_as_gcs')
 #: ArduCopter; its behaviour was measured on 4.7.
 ARDUPILOT: Final[Dialect] = Dialect(
@@ -249,7 +255,8 @@ ARDUPILOT: Final[Dialect] = Dialect(
           for source in ('POSXY', 'VELXY'))),
     hover_thrust='MOT_THST_HOVER',
     # HEARTBEAT is sent at once when the mode changes; 5 Hz covers lost ones.
-    mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0)
+    mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0,
+    pilot_modes=('STABILIZE', 'ACRO', 'LOITER', 'POSHOLD', 'SPORT', 'DRIFT', 'FLOWHOLD'))
 DIALECTS: Final[Mapping[str, Dialect]] = MappingProxyType({
     dialect.name: dialect for dialect in (PX4, ARDUPILOT)})
 #: Values of the parameter ``autopilot``.

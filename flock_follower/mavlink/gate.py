@@ -294,8 +294,8 @@ class Gate:
         ) or envelope.exceeded(self.limits, self.place(now)) or (
             self._height_watch.reason) or self.thrust_error(now, disturbance.THRUST_HANDOVER_TIME)
 
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = ''
-               ) -> tuple[Setpoint, AcceptedCommand | None]:
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = '', distrusted: str = '',
+               mode_age: float = 0.0) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return the setpoint to send at ``now``, s, and its command, if any.
 
@@ -305,8 +305,10 @@ class Gate:
         :param link_age: time since the autopilot is missing, s.
         :param withheld: a reason of the caller's own to send nothing.
         :param distrusted: why the velocity of the autopilot is invalid, or ''.
+        :param mode_age: time since a message last had the mode, s.
         """
         self.new_command = False
+        self.permit(self.permission.unseen(mode_age))
         self._notice_landing(now)
         self._distrusted_since = min(self._distrusted_since, now) if distrusted else math.inf
         active = self.permission.phase is Phase.ACTIVE
@@ -332,7 +334,8 @@ class Gate:
             self.limits, full=self.full_limits, known=known,
             command=None if command is None else command.command,
             command_age=math.inf if command is None else now - command.time,
-            link_age=link_age, armed=armed, airborne=airborne, withheld=withheld, place=place,
+            link_age=link_age, mode_age=mode_age, armed=armed, airborne=airborne,
+            withheld=withheld, place=place,
             unplaced=self.heights.lost(now) or (
                 '' if command is not None and command.command.relative else self._displaced),
             held=self._held or Held(), relative=self.relative.permission(

@@ -15,7 +15,8 @@
 """
 Requests beside the flight: telemetry rates, clock offset, parameters, reasons.
 
-Every request is repeated after a reboot of the autopilot, and when a lost link returns.
+Every request is repeated after a reboot of the autopilot and with another vehicle; when a lost
+link returns only the telemetry is requested again, the answers are kept.
 
 ``TimeSync`` measures the offset between the autopilot's clock and ours by TIMESYNC, and answers
 the autopilot's own requests. A request has ``tc1 = 0`` and the sender's time in ``ts1``; the
@@ -40,6 +41,7 @@ from flock_follower.mavlink.estimator_health import RECENT
 from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
+from flock_follower.mavlink.sticks import take_over_slowly
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 from flock_follower.messages import to_nanoseconds
 
@@ -133,6 +135,11 @@ RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 20.0,
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 20.0,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5})
+#: The requested rates of the pilot's sticks, Hz.
+STICK_RATES: Final[Mapping[int, float]] = MappingProxyType({
+    mavlink.MAVLINK_MSG_ID_MANUAL_CONTROL: 10.0, mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 10.0})
+#: The version is requested again after this, s, until the autopilot reports it.
+VERSION_PERIOD: Final[float] = 5.0
 #: An estimate at less than this share of the requested rate is reported, and a longer pause in all
 #: messages, s: the largest age of a velocity for braking.
 FEW: Final[float] = 0.5
@@ -143,10 +150,15 @@ WHY_PERIOD: Final[float] = 30.0
 WHY_WAIT: Final[float] = 3.0
 
 
-def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
-    """Return the requested messages by id, and their rates, Hz."""
+def wanted_rates(dialect: Dialect, estimate_rate: float, sticks: bool = False
+                 ) -> dict[int, float]:
+    """
+    Return the requested messages by id, and their rates, Hz.
+
+    :param sticks: whether the pilot's sticks are watched.
+    """
     return {dialect.mode_message: dialect.mode_rate, dialect.estimator_status: 5.0,
-            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0, **(STICK_RATES if sticks else {}),
             **dict.fromkeys(ESTIMATE.values(), estimate_rate), **RATES}
 
 
@@ -172,8 +184,8 @@ class Housekeeping:
         self.origin = GlobalOrigin(link, origin, without_gps)
         self.without_gps = without_gps
         self._heartbeat_sent = -math.inf
-        self._timesync_sent = self._why_asked = -math.inf
-        self._reboots = 0
+        self._timesync_sent = self._why_asked = self._version_asked = -math.inf
+        self._vehicle = -1, 0  # reboots, and changes of the vehicle; none was connected
         self._alive_since = math.inf  # s; infinite: it is not connected
         self._requested: dict[int, float] = {}  # when each message was requested last, s
 
@@ -192,11 +204,14 @@ class Housekeeping:
             if status is not None and not status.armed:
                 self.origin.begin_again()  # it may reboot: odometry waits for its new origin
             return
-        reboots, dialect = self._link.telemetry.reboots, self._link.telemetry.dialect
-        if reboots != self._reboots or math.isinf(self._alive_since):
-            self._reboots, self._alive_since = reboots, now
-            self.timesync = TimeSync()  # the autopilot's clock may have restarted
-            self._requested, self.parameters = {}, self._new_check()
+        telemetry = self._link.telemetry
+        vehicle, dialect = (telemetry.reboots, self._link.peer_changes), telemetry.dialect
+        if vehicle != self._vehicle or math.isinf(self._alive_since):
+            self._requested, self._alive_since = {}, now
+        if vehicle != self._vehicle:
+            self._vehicle = vehicle
+            self.timesync = TimeSync()  # its clock has restarted
+            self.parameters = self._new_check()
             self.origin.begin_again()
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
@@ -204,12 +219,21 @@ class Housekeeping:
             self._link.send(self.timesync.request(to_nanoseconds(now)))
         self.origin.step(None if dialect is None else self.parameters.values.get(
             dialect.gps_switch), now)
+        if 'AUTOPILOT_VERSION' not in telemetry.newest and (
+                now - self._version_asked >= VERSION_PERIOD):
+            self._version_asked = now
+            self._link.send_command(
+                mavlink.MAV_CMD_REQUEST_MESSAGE, (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,))
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
         status = self._link.telemetry.status
         if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
             self._why_asked = now
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
+
+    def watches_sticks(self) -> bool:
+        """Return whether the bridge hands over if the pilot moves a stick."""
+        return take_over_slowly(self._link.telemetry, self.parameters)
 
     def request_reasons(self) -> None:
         """Request the autopilot's reasons for its last refusal."""
@@ -262,7 +286,7 @@ class Housekeeping:
         arrivals, dialect = self._link.telemetry.arrivals, self._link.telemetry.dialect
         if dialect is None:
             return
-        wanted = wanted_rates(dialect, self._estimate_rate)
+        wanted = wanted_rates(dialect, self._estimate_rate, self.watches_sticks())
         # Permission, braking and heights depend on them, and a request may be lost.
         least = {**wanted, dialect.mode_message: dialect.least_mode_rate}
         due = {message_id: wanted[message_id] for message_id in wanted

@@ -153,7 +153,7 @@ MOST_PIECES: Final[int] = 300
 #: timestamp that was accepted, and refuse a new stream (the autopilot, started again) that is more
 #: than a minute behind that. With a minute at most no message accepted can have that effect.
 MOST_AHEAD: Final[float] = 60.0
-#: The autopilot's HEARTBEAT has to be missing for this long, s, before it may come from elsewhere.
+#: The autopilot has to be silent for this long, s, before its HEARTBEAT may come from elsewhere.
 PEER_TIMEOUT: Final[float] = 2.0
 
 
@@ -284,11 +284,13 @@ class Link:
         if peer == self.transport.peer:
             return ''
         # Answer one vehicle only: a second one with the same id must be silent first.
-        if now - self.telemetry.heartbeat_time <= PEER_TIMEOUT:
+        if now - self.telemetry.message_time <= PEER_TIMEOUT:
             return 'second sender'
         if kind != 'HEARTBEAT':
             return 'before HEARTBEAT'
-        self.peer_changes += math.isfinite(self.telemetry.heartbeat_time)
+        if math.isfinite(self.telemetry.message_time):
+            self.peer_changes += 1
+            self.telemetry.forget()
         self.transport.peer = peer
         return ''
 

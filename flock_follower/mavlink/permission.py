@@ -36,7 +36,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import enum
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.planner import modes
@@ -47,9 +47,23 @@ FELL_SILENT: Final[str] = 'fell silent'
 #: After a takeover offboard is refused for this long, s: another program must not undo it.
 TAKEOVER_TIME: Final[float] = 10.0
 TWO_COMMAND: Final[str] = 'two nodes command'
-#: If two messages with the mode (HEARTBEAT, CURRENT_MODE) are further apart than this, s, the
-#: pilot may have taken over in between.
+#: The vehicle is braked if no message with the mode (HEARTBEAT, CURRENT_MODE) came for this, s.
+MODE_TIMEOUT: Final[float] = 3.0
+#: After this long without the mode, s, the permission ends: the pilot may have taken over.
 LONGEST_SILENCE: Final[float] = 5.0
+MODE_UNKNOWN: Final[str] = 'mode unknown'
+
+
+class Cause(NamedTuple):
+    """Who or what has changed the mode."""
+
+    text: str
+    pilot: bool
+    """Whether it is a pilot, or may be one."""
+
+
+UNKNOWN: Final[Cause] = Cause('pilot or failsafe: unknown', True)
+STICK: Final[Cause] = Cause('the pilot moved a stick', True)
 
 
 class Phase(enum.Enum):
@@ -75,6 +89,8 @@ class Permission:
     """When the newest message with the mode was received since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
+    cause: Cause = UNKNOWN
+    """While TAKEN_OVER, who has changed the mode."""
 
     @property
     def streams(self) -> bool:
@@ -88,9 +104,12 @@ class Permission:
 
     def taken_over(self, now: float) -> str:
         """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
-        if self.phase is not Phase.TAKEN_OVER or now - self.received >= TAKEOVER_TIME:
+        taken = self.phase is Phase.TAKEN_OVER or self.reason == STICK.text
+        if not taken or not self.cause.pilot or now - self.received >= TAKEOVER_TIME:
             return ''
-        return (f'the pilot took over {max(now - self.received, 0.0):.0f} s ago: refused for '
+        unknown = self.cause == UNKNOWN and self.reason != STICK.text
+        who = 'the pilot, or a failsafe,' if unknown else 'the pilot'
+        return (f'{who} took over {max(now - self.received, 0.0):.0f} s ago: refused for '
                 f'{TAKEOVER_TIME:g} s; hold and land stay available')
 
     def announced(self) -> str:
@@ -126,6 +145,13 @@ class Permission:
         # Setpoints alone would end the failsafe of PX4 if a velocity returned.
         return Permission(reason=f'{FELL_SILENT}: {why}') if self.streams else self
 
+    def unseen(self, silence: float) -> Permission:
+        """Brake for good after a time, s, without the mode: the pilot may have taken over."""
+        flown = self.phase in (Phase.READY, Phase.ACTIVE) and self.obeyed
+        return self if not flown or silence <= LONGEST_SILENCE else replace(
+            self, phase=Phase.GIVING_BACK,
+            reason=f'{MODE_UNKNOWN} for {silence:.0f} s, the pilot may have taken over')
+
     def landed(self) -> Permission:
         """End a flight after a landing."""
         return Permission(reason=ON_GROUND) if self.streams else self
@@ -133,6 +159,19 @@ class Permission:
     def restarted(self, why: str) -> Permission:
         """Reset: the autopilot, rebooted or replaced, has not received the request."""
         return Permission(reason=why)
+
+    def left(self, status: VehicleStatus, cause: Cause = UNKNOWN) -> Permission:
+        """End a flight whose mode the pilot or the autopilot has changed."""
+        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}: {cause.text}',
+                          received=self.received, cause=cause)
+
+    def attributed(self, cause: Cause, now: float) -> Permission:
+        """Name the cause of a takeover, found at ``now``, s; the time of a pilot counts anew."""
+        if self.phase is not Phase.TAKEN_OVER or cause == self.cause:
+            return self
+        left, _, _ = self.reason.partition(': ')
+        return replace(self, reason=f'{left}: {cause.text}', cause=cause, received=(
+            now if cause.pilot and not self.cause.pilot else self.received))
 
     def seen(self, status: VehicleStatus, received: float, airborne: bool | None) -> Permission:
         """
@@ -143,20 +182,19 @@ class Permission:
         """
         if not self.streams or received <= self.since:
             return self
-        now, silence = replace(self, received=received), received - self.received
-        if now.obeyed and status.offboard and status.armed and silence > LONGEST_SILENCE:
-            return replace(now, phase=Phase.GIVING_BACK,
-                           reason=f'no HEARTBEAT for {silence:.0f} s, the pilot may have taken '
-                                  'over')
+        now = replace(self.unseen(received - self.received), received=received)
         if now.phase is Phase.GIVING_BACK:
             if status.offboard and status.armed:
                 return replace(now, obeyed=True)
+            if status.armed and now.reason == STICK.text:
+                return now.left(status, STICK)
+            if status.armed and now.reason.startswith(MODE_UNKNOWN):
+                return now.left(status)
             return Permission(reason=f'given back ({now.reason})')
         if now.phase is Phase.READY and (not status.armed or airborne is False):
             return Permission(reason=ON_GROUND if status.armed else 'disarmed')
         if not status.offboard:
-            return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
-                              received=received) if now.obeyed else now
+            return now.left(status) if now.obeyed else now
         if now.phase is Phase.ACTIVE:
             return now if status.armed else Permission(reason='disarmed')
         if airborne is None:

@@ -43,6 +43,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.permission import MODE_TIMEOUT, MODE_UNKNOWN
 from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.velocity_check import (
     finite_vector,
@@ -148,8 +149,8 @@ class Held(NamedTuple):
 
 
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, armed: bool, airborne: bool, withheld: str,
-           place: Location, unplaced: str, held: Held, relative: Relative,
+           command_age: float, link_age: float, mode_age: float, armed: bool, airborne: bool,
+           withheld: str, place: Location, unplaced: str, held: Held, relative: Relative,
            offset: ArrayLike) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
@@ -162,6 +163,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param known: the vehicle's motion, as far as it is known.
     :param command: the newest command; its time is ``command_age`` seconds ago.
     :param link_age: time since the autopilot is missing, s.
+    :param mode_age: time since a message last had the mode, s: the pilot may have switched since.
     :param armed: whether it is armed; before, setpoints are level.
     :param airborne: whether it reports that it flies: on the ground PX4 interprets any upward
         acceleration as a request to take off.
@@ -178,8 +180,11 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     offset = _sane_offset(offset)
-    reason = _refusal(limits, known, command, command_age, link_age, unplaced, relative, place,
-                      airborne)
+    reason = first_reason(
+        # Written so that NaN fails.
+        (not link_age <= limits.link_timeout, 'link lost'),
+        (not mode_age <= MODE_TIMEOUT, MODE_UNKNOWN),
+    ) or _refusal(limits, known, command, command_age, unplaced, relative, place, airborne)
     if not reason and command is not None and command.relative:
         return _relative(full, command, offset, place)
     velocity = known.velocity
@@ -217,11 +222,8 @@ def _sane_offset(offset: ArrayLike) -> Array:
 
 
 def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-             link_age: float, unplaced: str, relative: Relative, place: Location,
-             airborne: bool) -> str:
+             unplaced: str, relative: Relative, place: Location, airborne: bool) -> str:
     """Return why a command may not pass, or ''."""
-    if not link_age <= limits.link_timeout:  # written so that NaN fails
-        return 'link lost'
     if command is not None and command.relative:
         reason = _marker_refusal(limits, relative, place, airborne)
     else:

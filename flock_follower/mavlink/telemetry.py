@@ -46,6 +46,7 @@ from flock_follower.mavlink.estimator_health import (
     gps_fix,
     GpsFix,
 )
+from flock_follower.mavlink.permission import MODE_TIMEOUT
 from flock_follower.messages import OdometryState
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
@@ -62,6 +63,7 @@ _FLYING: Final[dict[int, bool]] = {
     mavlink.MAV_LANDED_STATE_ON_GROUND: False, mavlink.MAV_LANDED_STATE_TAKEOFF: False,
     mavlink.MAV_LANDED_STATE_IN_AIR: True, mavlink.MAV_LANDED_STATE_LANDING: True}
 _UNKNOWN_VOLTAGE = 65535  # mV
+_TRANSMITTER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 
 
 class SensorAltitude(NamedTuple):
@@ -191,25 +193,38 @@ class Telemetry:
         """
         Return the time for which messages of the autopilot have been overdue, s; 0 if none is.
 
-        Once it streams telemetry, that is the time without any message. HEARTBEAT is sent at 1 Hz:
-        it is overdue from one second after the last one on.
+        Any message shows that the link is alive; the mode has its own clock, ``mode_age``. Before
+        telemetry streams only HEARTBEAT may come, at 1 Hz, and single ones may be lost.
         """
-        overdue = now - self.heartbeat_time - HEARTBEAT_PERIOD
+        if self.dialect is None:
+            return math.inf
         streams = {'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION'} & self.newest.keys()
-        return max(0.0, overdue, now - self.message_time if streams else 0.0)
+        return max(0.0, now - self.message_time - (0.0 if streams else MODE_TIMEOUT))
+
+    def mode_age(self, now: float) -> float:
+        """Return the time since HEARTBEAT or CURRENT_MODE last showed the mode, s."""
+        return now - self.mode_time
 
     def alive(self, now: float, link_timeout: float) -> bool:
         """Return whether the autopilot has not been missing for longer than ``link_timeout``."""
         return self.silence(now) <= link_timeout
 
     def current(self, now: float, link_timeout: float) -> VehicleStatus | None:
-        """Return the vehicle's status, None while the link is not alive."""
-        return self.status if self.alive(now, link_timeout) else None
+        """Return the vehicle's status, None while the link is not alive or the mode unknown."""
+        known = self.alive(now, link_timeout) and self.mode_age(now) <= MODE_TIMEOUT
+        return self.status if known else None
 
     def flying(self, now: float) -> bool | None:
         """Return whether the vehicle reports that it is in the air; None without a report."""
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)
+
+    def transmitter_lost(self, now: float) -> bool:
+        """Return whether the autopilot reports that the pilot's transmitter is lost."""
+        message = self.recent('SYS_STATUS', LANDED_OLDEST, now)
+        return message is not None and bool(
+            message.onboard_control_sensors_enabled & _TRANSMITTER
+            & ~message.onboard_control_sensors_health)
 
     @property
     def landed(self) -> int | None:
@@ -252,12 +267,19 @@ class Telemetry:
             self.sensor_altitude = SensorAltitude(
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
+    def forget(self) -> None:
+        """Drop what was known of an autopilot that has rebooted, or was replaced."""
+        for kind in ('AUTOPILOT_VERSION', 'GPS_GLOBAL_ORIGIN', 'HOME_POSITION'):
+            self.newest.pop(kind, None)
+        self._boot_time_ms, self._fallen = 0, False
+
     def _notice_reboot(self, stamp: int) -> None:
         """Compare the stamp of an attitude, ms since boot, with the newest; 0: not set."""
         fallen = 0 < stamp < self._boot_time_ms - REBOOT_STEP_MS
         if fallen and self._fallen:  # a single one may have been delayed
             self.reboots += 1
-            fallen, self._boot_time_ms = False, stamp
+            self.forget()
+            fallen = False
         self._fallen = fallen
         self._boot_time_ms = max(self._boot_time_ms, stamp)
 

@@ -157,7 +157,8 @@ class Flight:
         elif due != self._question and reports.vehicle_known:
             self._question = due
             if due in self._requested and not self._confirm:
-                self.lines.append(f'{due} is due again, but --yes requests each step only once')
+                self.lines.append(f'{due} is due again ({reports.bridge}), but --yes requests '
+                                  'each step only once')
                 return self.end(1, reports)
             if due and not self._confirm:
                 return self._request(due)

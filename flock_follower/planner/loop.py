@@ -106,18 +106,21 @@ class PlannerLoop:
         """
         Take, and return, the state that the bridge reports; see ``modes``.
 
-        A pilot's takeover disengages the planner: it commands only after it is engaged again.
+        A takeover, by the pilot or a failsafe, disengages the planner: it commands only after it
+        is engaged again. The bridge may name the cause later.
 
         :param silence: time since the message before, s.
         """
         # If the vehicle does not fly now, the next tick or the next message finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
-        if self._require_bridge and self.engaged and self._bridge.name == TAKEN_OVER and (
-                before is None or before.name != TAKEN_OVER):
+        if not self._require_bridge or self._bridge.name != TAKEN_OVER:
+            return self._bridge
+        if begins := self.engaged and (before is None or before.name != TAKEN_OVER):
             self.engage(False)
+        if begins or self._disengaged_by:
             why = f' ({self._bridge.reason})' if self._bridge.reason else ''
-            self._disengaged_by = f'the pilot took over{why}: call planner/engage to follow again'
+            self._disengaged_by = f'taken over{why}: call planner/engage to follow again'
         return self._bridge
 
     def waiting(self, bridge_age: float = math.inf) -> str:

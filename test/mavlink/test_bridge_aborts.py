@@ -84,7 +84,8 @@ def test_a_switch_away_and_back_in_messages_that_arrive_together_is_seen():
         mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode]).pack(codec)
         for mode in ('POSCTL', 'OFFBOARD')]
     flight.fly(0.05)
-    assert flight.bridge.state(flight.now) == 'TAKEN_OVER: offboard was left for POSCTL'
+    assert flight.bridge.state(flight.now) == (
+        'TAKEN_OVER: offboard was left for POSCTL: the pilot took over')
 
 
 def test_a_line_that_delivers_late_gets_no_setpoint_while_nothing_is_received():
@@ -108,6 +109,65 @@ def test_an_abort_is_sent_though_nothing_is_heard(personality, what, arguments, 
     assert not outcome.success and 'no answer' in outcome.message
     assert len(flight.commands(command, since)) >= 3
     assert what != 'land' or flight.mode == flight.modes.land
+
+
+# The mode has its own clock.
+
+
+def mode_lost(at, personality='px4', duration=30.0):
+    return [Fault('drop', at, duration, 'sent', message=message)
+            for message in ('HEARTBEAT', 'CURRENT_MODE')]
+
+
+@BOTH
+def test_telemetry_without_the_mode_brakes_after_3_s_and_ends_the_permission(personality):
+    flight = Flight(personality, faults=mode_lost(4.0)).follow(1.0)
+    flight.fly_until(lambda: flight.bridge.telemetry.mode_age(flight.now) > 2.9, 10.0)
+    assert flight.kinds(5) == {'command'} and flight.mode == flight.modes.offboard
+    flight.fly(0.3)
+    assert flight.reason == 'mode unknown' and flight.kinds(3) == {'brake'}
+    assert flight.bridge.state(flight.now) == 'ACTIVE'  # the link is alive
+    flight.fly(1.7)
+    assert flight.kinds(30) == {'brake'} and flight.speed < 0.1
+    flight.fly(0.5)
+    assert flight.bridge.state(flight.now).startswith('READY: giving back: mode unknown for 5 s')
+    assert flight.bridge.gate.permission.phase is Phase.GIVING_BACK
+
+
+@BOTH
+def test_a_pilot_who_switched_unseen_bars_offboard(personality):
+    flight = Flight(personality, faults=mode_lost(4.0, duration=6.0)).follow(2.0)
+    flight.controller.pilot_switches(flight.modes.loiter)
+    flight.fly(6.5)
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
+    assert not flight.commands(SET_MODE, 4.5) and not flight.setpoints(flight.now - 0.1)
+    assert not flight.ask('offboard', True).success
+
+
+@pytest.mark.parametrize('share', [0.05, 0.2])
+@pytest.mark.parametrize('message', ['', 'HEARTBEAT'])
+def test_random_loss_is_no_loss_of_the_autopilot(share, message):
+    loss = Fault('drop', 0.0, 1e3, 'sent', share, message)
+    flight = Flight(faults=[loss], seed=5)
+    flight.fly(8.0)  # 20 parameters, one by one
+    flight.engage()
+    flight.planner = 0.0 * EAST
+    states, asked = set(), len(flight.bridge.housekeeping.parameters.values)
+    for _ in range(120):
+        flight.fly(0.5)
+        states.add(flight.bridge.state(flight.now))
+    assert states == {'ACTIVE'} and flight.kinds(1200) == {'command'}
+    assert len(flight.bridge.housekeeping.parameters.values) >= asked > 0
+
+
+def test_a_short_loss_forgets_no_answer_of_the_autopilot():
+    flight = Flight(faults=[Fault('drop', 8.0, 2.0, 'sent')]).follow(5.0)
+    bridge, values = flight.bridge, dict(flight.bridge.housekeeping.parameters.values)
+    assert flight.fly_until(lambda: not bridge.alive(flight.now), 5.0) < 5.0
+    flight.fly_until(lambda: bridge.alive(flight.now), 5.0)
+    assert values and bridge.housekeeping.parameters.values == values
+    assert 'HOME_POSITION' in bridge.telemetry.newest
+    assert flight.ask('offboard', True).success
 
 
 # Another flight, another vehicle.

@@ -175,9 +175,9 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         sent.append(setpoint)
         command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
         sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
-                           command_age=0.0, link_age=0.0, armed=True, airborne=False,
-                           place=gate.place(now), withheld='', unplaced='', held=Held(),
-                           relative=Relative(), offset=np.zeros(3)))
+                           command_age=0.0, link_age=0.0, mode_age=0.0, armed=True,
+                           airborne=False, place=gate.place(now), withheld='', unplaced='',
+                           held=Held(), relative=Relative(), offset=np.zeros(3)))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0
 

@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
+from flock_follower.mavlink import takeover
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import (
     FELL_SILENT,
@@ -29,6 +30,7 @@ from flock_follower.mavlink.permission import (
     NOT_REQUESTED,
     Permission,
     Phase,
+    STICK,
 )
 
 DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'fly.md'
@@ -92,8 +94,14 @@ def test_a_landing_ends_the_permission(events):
 def test_a_takeover_bars_offboard_for_ten_seconds():
     permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
     for now, seconds in ((4.0, 0), (5.0, 0), (11.0, 6)):
-        assert permission.taken_over(now).startswith(f'the pilot took over {seconds} s ago')
+        assert permission.taken_over(now).startswith(
+            f'the pilot, or a failsafe, took over {seconds} s ago')
+        assert permission.attributed(STICK, now).taken_over(now).startswith('the pilot took over')
     assert permission.taken_over(14.9)
+    failed = permission.attributed(takeover.failsafe('fence'), 6.0)
+    assert not failed.taken_over(6.0)
+    assert failed.announced() == 'TAKEN_OVER: offboard was left for POSCTL: failsafe: fence'
+    assert failed.attributed(takeover.PILOT, 16.0).taken_over(25.9)  # a later pilot
     assert not permission.taken_over(15.0) and not permission.taken_over(60.0)
     assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
@@ -161,7 +169,12 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert active.phase is Phase.ACTIVE
     lost = next_permission(active, seen(OURS, active.received + LONGEST_SILENCE + 0.1))
     assert lost.announced() == (
-        'READY: giving back: no HEARTBEAT for 5 s, the pilot may have taken over')
+        'READY: giving back: mode unknown for 5 s, the pilot may have taken over')
+    assert active.unseen(LONGEST_SILENCE) is active
+    assert active.unseen(LONGEST_SILENCE + 0.1).announced() == lost.announced()
+    # Somebody has changed the mode meanwhile; a disarmed vehicle was landed.
+    assert next_permission(lost, seen(PILOT, 20.0)).taken_over(20.0)
+    assert next_permission(lost, seen(DISARMED, 20.0)).phase is Phase.INACTIVE
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS, 2.0), seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS), seen(PILOT, 20.0)).phase is Phase.TAKEN_OVER
@@ -173,7 +186,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
 
 STATUSES = [VehicleStatus(armed, mode, mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [('requested', 1.0), ('blinded', 'no velocity'), ('failed', 'late'),
+EVENTS = [('requested', 1.0), ('unseen', 5.1), ('blinded', 'no velocity'), ('failed', 'late'),
           LANDED, ENDED, REBOOTED, SECOND,
           *(seen(status, received, airborne) for status in STATUSES for received in (0.5, 2.0, 9.0)
             for airborne in (False, True, None))]

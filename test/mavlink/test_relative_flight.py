@@ -48,8 +48,9 @@ MANUAL = VehicleStatus(True, 'POSCTL', False)
 def judge(limits=LIMITS, **changes):
     """Return the setpoint for a command on the marker alone, with some arguments changed."""
     arguments = {'known': known_motion(limits, *LOST), 'command': FORWARD,
-                 'command_age': 0.05, 'link_age': 0.1, 'armed': True, 'place': Location(2.0),
-                 'full': limits, 'relative': Relative(5.0, False, 0.2), 'airborne': True,
+                 'command_age': 0.05, 'link_age': 0.1, 'mode_age': 0.5, 'armed': True,
+                 'place': Location(2.0), 'full': limits, 'airborne': True,
+                 'relative': Relative(5.0, False, 0.2),
                  'withheld': '', 'unplaced': '', 'held': Held(),
                  'offset': (0.0, 0.0, 0.0)}
     return decide(limits, **{**arguments, **changes})

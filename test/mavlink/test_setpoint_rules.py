@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.envelope import GateLimits, Location
+from flock_follower.mavlink.permission import MODE_TIMEOUT
 from flock_follower.mavlink.relative_flight import Relative
 from flock_follower.mavlink.setpoint_rules import (
     BRAKE,
@@ -47,7 +48,7 @@ LIMITS = GateLimits()
 UNKNOWN = Motion()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
-USUAL = {'airborne': True, 'withheld': '', 'place': Location(), 'unplaced': '',
+USUAL = {'airborne': True, 'mode_age': 0.5, 'withheld': '', 'place': Location(), 'unplaced': '',
          'relative': Relative(), 'offset': (0.0, 0.0, 0.0)}
 """The arguments of a vehicle in the air of which nothing else is known."""
 KNOWN = ('odom', 'autopilot', 'source', 'disagreeing_for')
@@ -86,6 +87,7 @@ BRAKING = (-0.1 / 0.3, 0.0, 0.0)
 @pytest.mark.parametrize(('change', 'reason'), [
     ({'link_age': 1.001}, 'link lost'), ({'link_age': math.nan}, 'link lost'),
     ({'link_age': math.inf}, 'link lost'),
+    ({'mode_age': 3.01}, 'mode unknown'), ({'mode_age': math.nan}, 'mode unknown'),
     ({'odom': UNKNOWN}, 'no velocity from odom'),
     ({'odom': SLOW._replace(velocity_age=0.301)}, 'velocity from odom stale'),
     ({'odom': SLOW._replace(velocity_age=-0.101)}, 'velocity from odom stale'),
@@ -251,7 +253,8 @@ LIMIT_SETS = st.builds(
 ARGUMENTS = st.fixed_dictionaries({
     'command': st.none() | st.builds(
         lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR),
-    'command_age': AGE, 'link_age': AGE, 'armed': st.sampled_from([True, True, False]),
+    'command_age': AGE, 'link_age': AGE, 'mode_age': AGE,
+    'armed': st.sampled_from([True, True, False]),
     'airborne': st.sampled_from([True, True, False]),
     'withheld': st.sampled_from(['', '', '', 'x']),
     'place': st.builds(Location, st.none() | NUMBER, NUMBER,
@@ -299,6 +302,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
     if setpoint.kind == COMMAND:
         judged = both[both['source']]
         assert arguments['armed'] and arguments['link_age'] <= limits.link_timeout
+        assert arguments['mode_age'] <= MODE_TIMEOUT
         assert arguments['command_age'] <= limits.planner_timeout and usable(judged)
         assert command is not None and all(map(math.isfinite, command.acceleration))
     if not arguments['airborne']:
@@ -362,7 +366,7 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
     unit = None if axis is None else np.array(axis) / np.linalg.norm(axis)
     setpoint = decide(
         limits, full=full, known=known_motion(limits, motion, motion, ODOM),
-        link_age=0.1, armed=True, command_age=0.05,
+        link_age=0.1, mode_age=0.5, armed=True, command_age=0.05,
         command=Command(wanted, 0.5, 0.0, unit) if commanded else None,
         airborne=airborne, held=Held(0.5, 2.0), offset=(*wind[:2], offset), withheld='',
         unplaced='', relative=Relative(),

@@ -90,11 +90,12 @@ def test_the_battery_is_read_in_volts_amperes_and_fractions(fields, numbers):
 
 
 @pytest.mark.parametrize(('came', 'now', 'alive'), [
-    ([], 0.0, False), ([(BEAT, 1.0)], 2.9, True), ([(BEAT, 1.0)], 3.1, False),
-    # What streamed is missed after link_timeout, and HEARTBEAT beside other messages.
+    ([], 0.0, False), ([(PLACE, 1.0)], 1.0, False),  # of no autopilot yet
+    ([(BEAT, 1.0)], 4.9, True), ([(BEAT, 1.0)], 5.1, False),
+    # What streamed is missed after link_timeout; any message shows that the link is alive.
     ([(BEAT, 1.0), (PLACE, 1.1)], 2.05, True), ([(BEAT, 1.0), (PLACE, 1.1)], 2.15, False),
-    ([(BEAT, 1.0), (PLACE, 3.1)], 3.1, False)])
-def test_the_link_is_alive_while_messages_come_and_heartbeats_among_them(came, now, alive):
+    ([(BEAT, 1.0), (PLACE, 9.1)], 9.2, True)])
+def test_the_link_is_alive_while_any_message_comes(came, now, alive):
     telemetry = Telemetry()
     for kind, time in came:
         telemetry.update(heartbeat() if kind == BEAT else stamped(kind), time)
@@ -140,7 +141,8 @@ def test_current_mode_tells_the_mode_and_leaves_the_rest_to_heartbeat():
     assert telemetry.status == (True, 'POSCTL', False)
     assert telemetry.shown_time(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1.0
     assert telemetry.shown_time(mavlink.MAV_CMD_DO_SET_MODE) == 2.0
-    assert telemetry.silence(6.0) == 4.0  # it does not keep the link alive
+    assert telemetry.mode_age(6.0) == 4.0
+    assert telemetry.current(5.0, 9.0) and not telemetry.current(5.1, 9.0)  # 3 s after the mode
     telemetry.update(heartbeat('OFFBOARD', base_mode=0), 4.0)
     assert telemetry.status == (False, 'OFFBOARD', True) and telemetry.mode_time == 4.0
 

@@ -32,7 +32,8 @@ from flock_follower.nodes.flight_steps import (
 GROUND = {'armed': 'False', 'flying': 'False'}
 ARMED, AIR = {**GROUND, 'armed': 'True'}, {'armed': 'True', 'flying': 'True'}
 HOVER = 'INACTIVE: offboard was not requested'
-TAKEN_OVER = 'TAKEN_OVER: offboard was left for POSCTL'
+MODE_LEFT = 'offboard was left for POSCTL'
+TAKEN_OVER = f'TAKEN_OVER: {MODE_LEFT}'
 ALL = ['disengage', 'hand over']
 
 
@@ -85,6 +86,9 @@ def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> 
         line = desk.report(*after)
     assert line.startswith('the follower flies') and desk.flight.code is None
     assert desk.report(AIR, TAKEN_OVER) == f'{TAKEN_OVER}: press o for offboard'
+    # The bridge names a failsafe a little later than the mode.
+    assert desk.report(AIR, f'{TAKEN_OVER}: failsafe: fence') == ''
+    assert f'{MODE_LEFT}: failsafe: fence' in desk.reports.line(desk.now)
 
 
 def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight() -> None:
@@ -96,7 +100,8 @@ def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight(
         assert desk.flight._pending == {step}
         desk.answer(step)
     assert desk.report(AIR, 'ACTIVE', True).startswith('the follower flies')
-    assert 'only once' in desk.report(AIR, TAKEN_OVER) and desk.flight.code is not None
+    again = desk.report(AIR, TAKEN_OVER)
+    assert 'only once' in again and TAKEN_OVER in again and desk.flight.code is not None
     refused = Desk(GROUND, HOVER, False)
     refused.flight = Flight(refused.now, confirm=False)
     refused.report(GROUND, HOVER)

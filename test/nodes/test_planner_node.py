@@ -108,7 +108,7 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(ri
     assert rig.commands and rig.state == 'TRACK'
     rig.bridge_state = 'TAKEN_OVER: the pilot switched to Position'
     rig.run(0.2)
-    assert rig.state == 'IDLE' and 'not engaged: the pilot took over' in rig.values['reason']
+    assert rig.state == 'IDLE' and 'not engaged: taken over' in rig.values['reason']
     rig.bridge_state = 'ACTIVE'
     rig.commands.clear()
     rig.run(0.3)

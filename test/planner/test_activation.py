@@ -238,7 +238,10 @@ def test_after_a_takeover_it_has_to_be_engaged_once(early: bool) -> None:
         flight.loop.engage(True)
     for text in ('TAKEN_OVER: x', 'TAKEN_OVER: y', 'READY', 'ACTIVE'):
         flight.bridge(text)
-        assert (flight.tick()[1] is None) == (text != 'ACTIVE' or not early)
+        decision, command = flight.tick()
+        assert (command is None) == (text != 'ACTIVE' or not early)
+        if text.startswith('TAKEN_OVER') and not early:  # the bridge may name the cause later
+            assert f'taken over ({text[-1]})' in decision.reason
     flight.loop.engage(True)
     flight.commanded()
 

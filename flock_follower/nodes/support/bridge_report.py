@@ -40,7 +40,13 @@ from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
-from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
+from flock_follower.mavlink.permission import (
+    FELL_SILENT,
+    MODE_TIMEOUT,
+    MODE_UNKNOWN,
+    Phase,
+    TWO_COMMAND,
+)
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
@@ -231,7 +237,8 @@ class BridgeReport:
         status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
         result = bridge.housekeeping.parameters.result()
         values: dict[str, object] = {
-            'link': 'alive' if status else 'lost' if telemetry.status else 'never received',
+            'link': 'alive' if bridge.alive(now) else (
+                'lost' if telemetry.status else 'never received'),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
             'mode': status.mode if status else '', 'armed': status.armed if status else '',
             'flying': '' if flying is None else flying, 'state': bridge.state(now),
@@ -285,9 +292,12 @@ class BridgeReport:
     # Problems; '' or None without one.
 
     def _link_fault(self, now: float) -> str:
+        telemetry = self._bridge.telemetry
         if self._bridge.alive(now):
-            return self._bridge.housekeeping.unreceived(now)
-        transport, received = self._bridge.link.transport, self._bridge.telemetry.message_time
+            age = telemetry.mode_age(now)
+            return self._bridge.housekeeping.unreceived(now) or ('' if age <= MODE_TIMEOUT else (
+                f'{MODE_UNKNOWN}: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s'))
+        transport, received = self._bridge.link.transport, telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
         if math.isfinite(received):
