@@ -272,6 +272,37 @@ def test_a_parameter_is_read_in_the_encoding_of_its_autopilot(personality, name,
     assert (answer.param_id, answer.param_type, encoded) == (name, kind, value)
 
 
+VERSION = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+MISSING = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+
+
+def named(answers):
+    """Return the type of each answer, and the parameter that it is about."""
+    return [(m.get_type(), m.param_id) for m in answers]
+
+
+@pytest.mark.parametrize(('personality', 'options', 'version'), [
+    ('px4', {}, 0x011000FF), ('px4', {'version': '1.18'}, 0x011200FF),
+    ('arducopter', {}, 0x040700FF)])
+def test_the_version_of_the_firmware_is_reported_on_request(personality, options, version):
+    flight = Flight(personality, **options)
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, VERSION) == [0]
+    assert flight.last('AUTOPILOT_VERSION').flight_sw_version == version
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999.0) != [0]
+
+
+@pytest.mark.parametrize(('version', 'name', 'answer'), [
+    ('1.16', 'COM_RC_OVERRIDE', 'PARAM_VALUE'), ('1.16', 'MAN_OVERRIDE_SPD', None),
+    ('1.18', 'COM_RC_OVERRIDE', 'PARAM_ERROR'), ('1.18', 'MPC_USE_HTE', 'PARAM_ERROR'),
+    ('1.18', 'MAN_OVERRIDE_SPD', 'PARAM_VALUE')])
+def test_the_version_decides_which_parameters_exist(version, name, answer):
+    answers = Flight(version=version).send(
+        mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+    assert named(answers) == ([(answer, name)] if answer else [])
+    assert [m.error for m in answers if m.get_type() == 'PARAM_ERROR'] == [MISSING] * (
+        answer == 'PARAM_ERROR')
+
+
 @BOTH
 def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality):
     flight = Flight(personality, start='landed', parameters={},
