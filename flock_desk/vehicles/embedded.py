@@ -75,8 +75,7 @@ class EmbeddedAutopilot:
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, if the link is signed.
-    :raises ValueError: for an unknown parameter, or a value that it cannot have.
-    :raises KeyError: for an unknown version.
+    :raises ValueError: for an unknown version or parameter, or a value that it cannot have.
     """
 
     def __init__(self, personality: str = 'px4', *, now: float, start: str = 'airborne',
@@ -85,7 +84,7 @@ class EmbeddedAutopilot:
                  ready_after: float = 0.0, seed: int = 0, signing: Any = None,
                  version: str = '') -> None:
         self._profile = PROFILES[personality]
-        self._version = version or next(iter(self._profile.firmwares))
+        self._version = self._profile.version(version)
         self._parameters = Parameters(self._profile, self._version)
         for name, number in parameters.items():
             self._parameters.set(name, number)

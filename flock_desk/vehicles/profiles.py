@@ -122,6 +122,16 @@ class Profile:
         """Return whether it is PX4."""
         return self.autopilot == mavlink.MAV_AUTOPILOT_PX4
 
+    def version(self, name: str) -> str:
+        """
+        Return a key of ``firmwares``, the first for ''.
+
+        :raises ValueError: for another name.
+        """
+        if name and name not in self.firmwares:
+            raise ValueError(f'version = {name!r}: must be one of {", ".join(self.firmwares)}')
+        return name or next(iter(self.firmwares))
+
 
 def _px4(main: int, sub: int = 0) -> int:
     """Return a custom_mode: main mode in the third byte, sub mode in the fourth."""

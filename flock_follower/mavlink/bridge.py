@@ -120,7 +120,11 @@ class Bridge:
         self._takers: dict[str, Callable[[Any, float], object]] = {
             'STATUSTEXT': self.texts.add, 'EVENT': self.texts.add_event,
             'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
-            'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message)}
+            # Each reboot begins another check.
+            'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message),
+            'PARAM_ERROR': lambda message, _: self.housekeeping.parameters.take_error(message),
+            'AUTOPILOT_VERSION': lambda message, _: self.housekeeping.parameters.take_version(
+                message)}
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is connected."""

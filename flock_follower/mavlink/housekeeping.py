@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Requests beside the flight: telemetry rates, clock offset, parameters, reasons, origin.
+Requests beside the flight: telemetry rates, clock offset, version, parameters, reasons, origin.
 
 Every request is repeated after a reboot of the autopilot, and when a lost link returns.
 
@@ -171,7 +171,7 @@ class Housekeeping:
                  estimate_rate: float, origin: tuple[float, float, float] | None,
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
-        self.parameters = ParameterCheck(())
+        self.parameters = ParameterCheck()
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
@@ -205,6 +205,9 @@ class Housekeeping:
             self._timesync_sent = now
             self._link.send(self.timesync.request(to_nanoseconds(now)))
         self._send_origin(now)
+        if self.parameters.version_due(now):
+            self._link.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE,
+                                    (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,))
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
         status = self._link.telemetry.status
@@ -225,10 +228,10 @@ class Housekeeping:
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
         if dialect is None:
-            return ParameterCheck(())
+            return ParameterCheck()
         switch = dialect.gps_switch if self.without_gps else ''
         return ParameterCheck(
-            self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
+            self._recommendations.get(dialect.name, ()), dialect,
             needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
 

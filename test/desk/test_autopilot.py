@@ -340,6 +340,7 @@ def test_bad_parameters_are_named(parameters, message):
 @pytest.mark.parametrize(('arguments', 'complaint'), [
     (['--connect', '8.8.8.8:1'], 'must be a loopback address'),
     (['--connect', '127.0.0.1:99999'], 'must be HOST:PORT'),
+    (['--firmware', '1.17'], "version = '1.17': must be one of 1.16, 1.18"),
     (['--param', 'GUID_TIMEOUT'], "param = 'GUID_TIMEOUT': must be NAME=NUMBER")])
 def test_bad_arguments_are_one_line(arguments, complaint, capsys):
     assert autopilot.main(arguments) == 1
@@ -347,17 +348,19 @@ def test_bad_arguments_are_one_line(arguments, complaint, capsys):
     assert complaint in error and error.count('\n') == 1
 
 
-@pytest.mark.parametrize(('personality', 'file', 'name'), [
-    ('px4', 'config/px4.params', 'COM_OF_LOSS_T'),
-    ('arducopter', 'config/ardupilot.parm', 'GUID_TIMEOUT')])
-def test_the_recommended_parameters_can_be_set_from_their_file(personality, file, name):
-    options = autopilot.parser().parse_args(['--personality', personality, '--param-file', file])
+@pytest.mark.parametrize(('personality', 'version', 'file', 'name'), [
+    ('px4', '1.16', 'config/px4.params', 'COM_OF_LOSS_T'),
+    ('px4', '1.18', 'config/px4.params', 'COM_OF_LOSS_T'),
+    ('arducopter', '4.7', 'config/ardupilot.parm', 'GUID_TIMEOUT')])
+def test_the_recommended_parameters_can_be_set_from_their_file(personality, version, file, name):
+    options = autopilot.parser().parse_args(
+        ['--personality', personality, '--firmware', version, '--param-file', file])
     parameters = autopilot.settings(options)['parameters']
     options.param = [f'{name}=0.25']
     changed = autopilot.settings(options)['parameters']
     assert (parameters[name], changed[name]) == (0.5, 0.25)
     assert 'EKF2_GPS_CTRL' not in parameters
-    Flight(personality, parameters=parameters)
+    Flight(personality, parameters=parameters, version=version)
 
 
 @pytest.mark.ros
