@@ -9,6 +9,7 @@
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
 #   make site      build the pages of docs/ as a site, with every link checked (build/site)
+#   make px4-events  write config/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
 #   make bless     make the present result of the sample bag the golden one (test/frozen)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
 #   make frozen    compare with them, bit for bit (minutes; RUNS=4: the first 4 runs of each scenario)
@@ -66,7 +67,7 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless lint site figures flights \
+.PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless px4-events lint site figures flights \
 	bench-simulation bench-evaluate bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
 	seeded-bugs frozen freeze bags clean
 help:
@@ -110,6 +111,9 @@ lint: setup
 
 bless: setup
 	@$(RUN) test/frozen.py --write sample
+
+px4-events: setup
+	@$(RUN) test/px4_events.py $(PX4)
 
 frozen: setup
 	@$(RUN) test/frozen.py --runs $(RUNS)

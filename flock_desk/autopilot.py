@@ -37,6 +37,7 @@ from typing import Any
 from flock_desk.runs.console import guarded, within
 from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
 from flock_desk.vehicles.profiles import PROFILES
+from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
@@ -50,6 +51,9 @@ def parser() -> argparse.ArgumentParser:
                      help='where a bridge listens; loopback only (%(default)s)')
     new.add_argument('--personality', choices=tuple(PROFILES), default='px4',
                      help='whose modes, masks and answers (%(default)s)')
+    new.add_argument('--firmware', default='', metavar='VERSION', help='its version: ' + '; '.join(
+        f'{name} {", ".join(profile.firmwares)}' for name, profile in PROFILES.items())
+        + ' (the first)')
     new.add_argument('--start', choices=STARTS, default='airborne',
                      help='hovering, or on the ground armed or disarmed (%(default)s)')
     new.add_argument('--altitude', type=within(Range(0.1, 1000.0, 'm')), default=2.0, metavar='M',
@@ -105,13 +109,15 @@ def settings(options: argparse.Namespace) -> dict[str, Any]:
     """
     Return the parameters of ``EmbeddedAutopilot`` that the command line gives.
 
-    :raises ValueError: for a parameter without a number. :raises OSError: for an unreadable file.
+    :raises ValueError: for a parameter without a number, or an unknown version.
+    :raises OSError: for an unreadable file.
     """
     parameters = {}
+    version = PROFILES[options.personality].version(options.firmware)
     if options.param_file:
         text = Path(options.param_file).read_text(encoding='utf-8')
         parameters.update({entry.name: entry.value for entry in read_recommendations(
-            text, forwarding=False)})
+            text, forwarding=False) if entry.applies(Version(*map(int, version.split('.'))))})
     for text in options.param:
         name, _, value = text.partition('=')
         try:
@@ -120,7 +126,7 @@ def settings(options: argparse.Namespace) -> dict[str, Any]:
             raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
     return {'personality': options.personality, 'start': options.start,
             'altitude': options.altitude, 'yaw': math.radians(options.yaw),
-            'parameters': parameters}
+            'parameters': parameters, 'version': version}
 
 
 def loopback_address(text: str) -> tuple[str, int]:

@@ -65,6 +65,7 @@ class EmbeddedAutopilot:
     An autopilot with the personality of PX4 or ArduCopter.
 
     :param personality: a key of ``PROFILES``.
+    :param version: of its firmware, a key of the profile's ``firmwares``; '' for the first.
     :param now: monotonic time, s, of the start; messages carry times since then.
     :param start: one of ``STARTS``: 'airborne' (hovering in Hold or LOITER), 'armed' or 'landed'.
     :param altitude: m, of an airborne start.
@@ -74,15 +75,17 @@ class EmbeddedAutopilot:
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
     :param seed: of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, if the link is signed.
-    :raises ValueError: for an unknown parameter, or a value that it cannot have.
+    :raises ValueError: for an unknown version or parameter, or a value that it cannot have.
     """
 
     def __init__(self, personality: str = 'px4', *, now: float, start: str = 'airborne',
                  altitude: float = 2.0, yaw: float = 0.0, system_id: int = 1,
                  parameters: Mapping[str, float] = _NO_PARAMETERS, arming_denial: str = '',
-                 ready_after: float = 0.0, seed: int = 0, signing: Any = None) -> None:
+                 ready_after: float = 0.0, seed: int = 0, signing: Any = None,
+                 version: str = '') -> None:
         self._profile = PROFILES[personality]
-        self._parameters = Parameters(self._profile)
+        self._version = self._profile.version(version)
+        self._parameters = Parameters(self._profile, self._version)
         for name, number in parameters.items():
             self._parameters.set(name, number)
         self.log = FlightLog()
@@ -221,11 +224,12 @@ class EmbeddedAutopilot:
                 for text in texts]
 
     def _command(self, message: Any, now: float) -> list[Any]:
-        controller, returned = self.controller, []
+        controller = self.controller
+        answers: list[Any] = []
         match message.command:
             case mavlink.MAV_CMD_REQUEST_MESSAGE if controller.has_origin and (
                     message.param1 == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN):
-                results, returned = [ACCEPTED], [self._origin(now)]
+                results, answers = [ACCEPTED], [self._origin(now)]
             case mavlink.MAV_CMD_DO_SET_MODE:
                 results = controller.command_mode(
                     (message.param1, message.param2, message.param3), now)
@@ -235,6 +239,9 @@ class EmbeddedAutopilot:
                 results = [controller.take_off(message.param7, now)]
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 results = [self._set_interval(message.param1, message.param2, now)]
+            case mavlink.MAV_CMD_REQUEST_MESSAGE if (
+                    message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION):
+                answers, results = [self._autopilot_version()], [ACCEPTED]
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS if controller.armed and not self._profile.px4:
                 results = [int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)]
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
@@ -242,9 +249,16 @@ class EmbeddedAutopilot:
                 results = [ACCEPTED]
             case _:
                 results = [int(mavlink.MAV_RESULT_UNSUPPORTED)]
-        return [*self._status_texts(), *returned, *(mavlink.MAVLink_command_ack_message(
+        return [*answers, *self._status_texts(), *(mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
             for result in results)]
+
+    def _autopilot_version(self) -> Any:
+        major, minor = map(int, self._version.split('.'))
+        version = major << 24 | minor << 16 | mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+        return mavlink.MAVLink_autopilot_version_message(
+            mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2, version, version, 0, 0, bytes(8), bytes(8),
+            bytes(8), 0, 0, 0)
 
     def _set_interval(self, message_id: float, microseconds: float, now: float) -> int:
         # The HEARTBEAT of PX4 stays at 1 Hz.

@@ -62,6 +62,17 @@ class Mode(NamedTuple):
     arms: bool = True
 
 
+class Firmware(NamedTuple):
+    """What differs in one version of an autopilot."""
+
+    added: Mapping[str, tuple[int, float]] = {}
+    """Type and default by name of the parameters that only this version has."""
+    removed: frozenset[str] = frozenset()
+    """The parameters that it lacks."""
+    reports_missing: bool = False
+    """Whether it answers a request of a missing parameter by PARAM_ERROR."""
+
+
 @dataclass(frozen=True)
 class Profile:
     """One autopilot."""
@@ -75,6 +86,8 @@ class Profile:
     """The mode in which it takes off."""
     parameters: Mapping[str, tuple[int, float]]
     """Type and default by name."""
+    firmwares: Mapping[str, Firmware]
+    """By version; the first is the default."""
     landing_speed: tuple[str, float]
     """Its parameter, and the unit of that, m/s."""
     rates: Mapping[int, float]
@@ -108,6 +121,16 @@ class Profile:
     def px4(self) -> bool:
         """Return whether it is PX4."""
         return self.autopilot == mavlink.MAV_AUTOPILOT_PX4
+
+    def version(self, name: str) -> str:
+        """
+        Return a key of ``firmwares``, the first for ''.
+
+        :raises ValueError: for another name.
+        """
+        if name and name not in self.firmwares:
+            raise ValueError(f'version = {name!r}: must be one of {", ".join(self.firmwares)}')
+        return name or next(iter(self.firmwares))
 
 
 def _px4(main: int, sub: int = 0) -> int:
@@ -159,6 +182,11 @@ PX4: Final = Profile(
         'NAV_DLL_ACT': (INT32, 0),            # without a ground station; 0: nothing
         'NAV_RCL_ACT': (INT32, 2),            # without a transmitter; 1: Hold, 2: Return, 3: Land
     },
+    firmwares={
+        '1.16': Firmware(),
+        '1.18': Firmware(added={'MAN_OVERRIDE_SPD': (FLOAT, 1.0)},  # stick travel per s; < 0: off
+                         removed=frozenset({'COM_RC_OVERRIDE', 'MPC_USE_HTE'}),
+                         reports_missing=True)},
     landing_speed=('MPC_LAND_SPEED', 1.0),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
@@ -212,6 +240,7 @@ ARDUCOPTER: Final = Profile(
         'VISO_TYPE': (INT8, 0),               # 1: vision by MAVLink
         'WPNAV_SPEED': (FLOAT, 1000.0),       # cm/s, not applied to acceleration setpoints
     },
+    firmwares={'4.7': Firmware()},
     landing_speed=('LAND_SPEED', 1e-2),
     rates={**_RATES, mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
            mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.0},
@@ -229,11 +258,19 @@ _UNKNOWN_INDEX: Final[int] = 65535
 
 
 class Parameters(dict[str, float]):
-    """The parameters of an autopilot by name, and their MAVLink protocol."""
+    """
+    The parameters of an autopilot by name, and their MAVLink protocol.
 
-    def __init__(self, profile: Profile) -> None:
-        super().__init__({name: float(value) for name, (_, value) in profile.parameters.items()})
-        self._profile = profile
+    :param version: a key of the profile's ``firmwares``.
+    """
+
+    def __init__(self, profile: Profile, version: str) -> None:
+        self._firmware = profile.firmwares[version]
+        table = {**profile.parameters, **self._firmware.added}
+        self._types = {name: kind for name, (kind, _) in table.items()
+                       if name not in self._firmware.removed}
+        super().__init__({name: float(table[name][1]) for name in self._types})
+        self._px4 = profile.px4
 
     def set(self, name: str, value: float) -> None:
         """
@@ -243,19 +280,21 @@ class Parameters(dict[str, float]):
         """
         if name not in self:
             raise ValueError(f'{name}: must be one of {", ".join(self)}')
-        if self._profile.parameters[name][0] == FLOAT:
+        if self._types[name] == FLOAT:
             Range().check(name, value)
         else:
             _WHOLE.check(name, int(value) if float(value).is_integer() else value)
         self[name] = float(value)
 
     def answer(self, message: Any) -> list[Any]:
-        """Answer PARAM_REQUEST_READ by name; an unknown one is not answered."""
+        """Answer PARAM_REQUEST_READ by name; older firmware does not answer an unknown one."""
         name = str(message.param_id)
         if name not in self:
-            return []
-        value, kind = self[name], self._profile.parameters[name][0]
-        bytewise = self._profile.px4 and kind != FLOAT
+            return [mavlink.MAVLink_param_error_message(
+                message.get_srcSystem(), message.get_srcComponent(), name.encode(), -1,
+                mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST)] if self._firmware.reports_missing else []
+        value, kind = self[name], self._types[name]
+        bytewise = self._px4 and kind != FLOAT
         return [mavlink.MAVLink_param_value_message(
             name.encode(),
             struct.unpack('<f', struct.pack('<i', int(value)))[0] if bytewise else value,

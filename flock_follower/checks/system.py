@@ -47,6 +47,8 @@ DEAD_SEGMENTS = 20
 YOUNG = 10.0
 #: Keys of the bridge's diagnostics.
 PARAMETER: Final = 'parameter '
+MISSING: Final = 'missing parameter '
+UNPROVEN: Final = 'unproven firmware'
 NOT_READY: Final = 'not ready to arm'
 REFUSED: Final = 'offboard would be refused'
 #: The action for a status of a node, by a part of its text.
@@ -148,6 +150,14 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
             yield Finding(WARNING, 'autopilot parameter',
                           f'{key.removeprefix(PARAMETER)} {values[key]}', 'as config/ recommends',
                           'set it in the ground station, or accept it')
+        elif key.startswith(MISSING):
+            yield Finding(WARNING, 'autopilot parameter',
+                          f'{key.removeprefix(MISSING)} {values[key]}', 'as config/ recommends',
+                          'cannot be set: look up in the release notes of this firmware what '
+                          'replaces it')
+    if UNPROVEN in values:
+        yield Finding(WARNING, 'autopilot firmware', values[UNPROVEN], 'known',
+                      'compare its parameters with the recommended values by hand')
     if 'parameters' not in values:
         yield Finding(UNMEASURED, 'autopilot parameters', 'not compared yet: check again in '
                       'some seconds', 'as config/ recommends')

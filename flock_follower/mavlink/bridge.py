@@ -127,7 +127,11 @@ class Bridge:
             'COMMAND_ACK': self.requests.acknowledge, 'TIMESYNC': self.housekeeping.take_timesync,
             **dict.fromkeys(KINDS, lambda message, now: self.sticks.take(
                 message, now, self.telemetry.transmitter_lost(now))),
-            'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message)}
+            # Each reboot begins another check.
+            'PARAM_VALUE': lambda message, _: self.housekeeping.parameters.take(message),
+            'PARAM_ERROR': lambda message, _: self.housekeeping.parameters.take_error(message),
+            'AUTOPILOT_VERSION': lambda message, _: self.housekeeping.parameters.take_version(
+                message)}
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is connected."""

@@ -45,6 +45,24 @@ def enum_name(enum: str, value: int | None) -> str:
     return entry.name.removeprefix(f'{enum}_') if entry else f'{enum} {value}'
 
 
+class Version(NamedTuple):
+    """The version of a firmware."""
+
+    major: int
+    minor: int
+    patch: int = 0
+
+    def __str__(self) -> str:
+        return '.'.join(map(str, self))
+
+
+def firmware_version(message: Any) -> Version | None:
+    """Return the version in an AUTOPILOT_VERSION, None if it names none (0)."""
+    number = message.flight_sw_version
+    version = Version(number >> 24 & 0xFF, number >> 16 & 0xFF, number >> 8 & 0xFF)
+    return version if any(version) else None
+
+
 class VehicleStatus(NamedTuple):
     """The vehicle's state by HEARTBEAT, or by a CURRENT_MODE after it."""
 
@@ -121,6 +139,8 @@ class Dialect:
     """File of recommended parameters in ``config/``."""
     rules: tuple[Rule, ...]
     """The parameters that forbid offboard."""
+    versions: tuple[tuple[int, int], tuple[int, int]]
+    """The oldest and the newest firmware, major and minor, for which both are known."""
     hover_thrust: str
     """Parameter of the hover thrust."""
     mode_message: int
@@ -139,6 +159,12 @@ class Dialect:
     """Whether it answers MAV_CMD_RUN_PREARM_CHECKS by EVENTs that name the failed checks."""
     no_reason: str = ''
     """Advice if a refusal comes without a reason."""
+
+    @property
+    def known_versions(self) -> str:
+        """Return the range of ``versions``, for people."""
+        oldest, newest = ('.'.join(map(str, version)) for version in self.versions)
+        return f'{self.title} {oldest} to {newest}'
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its number if it has none."""
@@ -206,7 +232,7 @@ PX4: Final[Dialect] = Dialect(
     # vision is gone, the first only after 5 s.
     velocity_flags=(mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, 0),
     gps_switch='EKF2_GPS_CTRL', origin_has_height=False, recommendations='px4.params',
-    rules=(  # with the values of 1.14 to 1.16
+    versions=((1, 14), (1, 18)), rules=(
         Rule('COM_OF_LOSS_T', lambda value: value > LONGEST, _TOO_LONG),
         Rule('COM_OBL_RC_ACT', lambda value: value in (6, 7),
              ': it would stop its motors in the air (6: terminate, 7: disarm) if the bridge died; '
@@ -246,7 +272,7 @@ ARDUPILOT: Final[Dialect] = Dialect(
     velocity_flags=(mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE),
     gps_switch='',  # an origin of zeros makes its firmware panic
     origin_has_height=True, recommendations='ardupilot.parm',
-    rules=(  # with the values of ArduCopter 4.6 and 4.7
+    versions=((4, 6), (4, 7)), rules=(
         Rule('GUID_TIMEOUT', lambda value: value > LONGEST, _TOO_LONG),
         Rule('VISO_TYPE', lambda value: value == 0, f'{_NOT_FUSED}set it to 1 (MAVLink)',
              forwarding=True),

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Requests beside the flight: telemetry rates, clock offset, parameters, reasons.
+Requests beside the flight: telemetry rates, clock offset, version, parameters, reasons.
 
 Every request is repeated after a reboot of the autopilot and with another vehicle; when a lost
 link returns only the telemetry is requested again, the answers are kept.
@@ -138,8 +138,6 @@ RATES: Final[Mapping[int, float]] = MappingProxyType({
 #: The requested rates of the pilot's sticks, Hz.
 STICK_RATES: Final[Mapping[int, float]] = MappingProxyType({
     mavlink.MAVLINK_MSG_ID_MANUAL_CONTROL: 10.0, mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 10.0})
-#: The version is requested again after this, s, until the autopilot reports it.
-VERSION_PERIOD: Final[float] = 5.0
 #: An estimate at less than this share of the requested rate is reported, and a longer pause in all
 #: messages, s: the largest age of a velocity for braking.
 FEW: Final[float] = 0.5
@@ -177,14 +175,14 @@ class Housekeeping:
                  estimate_rate: float, origin: tuple[float, float, float] | None,
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
-        self.parameters = ParameterCheck(())
+        self.parameters = ParameterCheck()
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
         self.origin = GlobalOrigin(link, origin, without_gps)
         self.without_gps = without_gps
         self._heartbeat_sent = -math.inf
-        self._timesync_sent = self._why_asked = self._version_asked = -math.inf
+        self._timesync_sent = self._why_asked = -math.inf
         self._vehicle = -1, 0  # reboots, and changes of the vehicle; none was connected
         self._alive_since = math.inf  # s; infinite: it is not connected
         self._requested: dict[int, float] = {}  # when each message was requested last, s
@@ -219,11 +217,9 @@ class Housekeeping:
             self._link.send(self.timesync.request(to_nanoseconds(now)))
         self.origin.step(None if dialect is None else self.parameters.values.get(
             dialect.gps_switch), now)
-        if 'AUTOPILOT_VERSION' not in telemetry.newest and (
-                now - self._version_asked >= VERSION_PERIOD):
-            self._version_asked = now
-            self._link.send_command(
-                mavlink.MAV_CMD_REQUEST_MESSAGE, (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,))
+        if self.parameters.version_due(now):
+            self._link.send_command(mavlink.MAV_CMD_REQUEST_MESSAGE,
+                                    (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,))
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
         status = self._link.telemetry.status
@@ -233,7 +229,7 @@ class Housekeeping:
 
     def watches_sticks(self) -> bool:
         """Return whether the bridge hands over if the pilot moves a stick."""
-        return take_over_slowly(self._link.telemetry, self.parameters)
+        return take_over_slowly(self._link.telemetry.dialect, self.parameters)
 
     def request_reasons(self) -> None:
         """Request the autopilot's reasons for its last refusal."""
@@ -248,10 +244,10 @@ class Housekeeping:
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
         if dialect is None:
-            return ParameterCheck(())
+            return ParameterCheck()
         switch = dialect.gps_switch if self.without_gps else ''
         return ParameterCheck(
-            self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
+            self._recommendations.get(dialect.name, ()), dialect,
             needed=[*(rule.name for rule in rules(dialect, self.without_gps)),
                     *filter(None, (dialect.minimum_takeoff, switch))])
 

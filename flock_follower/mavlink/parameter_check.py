@@ -17,7 +17,9 @@ Reads the autopilot's parameters that the bridge depends on, and reports differe
 
 The bridge writes no parameter. The recommendations are the files in ``config/`` that
 QGroundControl (``.params``) and MAVProxy (``.parm``) load; the comment before an entry gives its
-reason. If the comment begins with ``Any but 0``, the entry differs only if the value is 0: off.
+reason. Two lines of that comment have a fixed form: ``Good: 1, 3 to 5`` lists the values that are
+as good as the recommended one, without it no other is; ``Versions: 1.18 and later``, ``Versions:
+up to 1.17`` or ``Versions: 1.15 to 1.17`` names the firmware that has the parameter.
 
 ``obstacle`` returns the parameter that forbids ``offboard``, and the reason.
 """
@@ -32,7 +34,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import Dialect, Rule
+from flock_follower.mavlink.dialects import Dialect, firmware_version, Rule, Version
 
 #: An unanswered request is repeated after this, s.
 RETRY_PERIOD: Final[float] = 2.0
@@ -40,10 +42,17 @@ RETRY_PERIOD: Final[float] = 2.0
 PATIENCE: Final[float] = 5.0
 #: Entries after this comment matter only if odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
-#: Beginning of the comment of an entry that admits any value but 0.
-ANY_BUT_ZERO: Final[str] = 'Any but 0'
+#: MAV_PARAM_ERROR_DOES_NOT_EXIST, which older releases of pymavlink lack.
+DOES_NOT_EXIST: Final[int] = 1
+#: The firmware of an entry without ``Versions:``, major and minor.
+_FIRST, _LAST = (0, 0), (255, 255)
 _ENTRY: Final = re.compile(
     r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')
+_NUMBER: Final[str] = r'(-?\d+(?:\.\d+)?)'
+_RANGE: Final = re.compile(rf'{_NUMBER}(?: to {_NUMBER})?')
+_SERIES: Final[str] = r'(\d+)\.(\d+)'
+_VERSIONS: Final = re.compile(
+    rf'up to {_SERIES}|{_SERIES} and later|{_SERIES} to {_SERIES}')
 _INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT8: '<Bxxx', mavlink.MAV_PARAM_TYPE_INT8: '<bxxx',
     mavlink.MAV_PARAM_TYPE_UINT16: '<Hxx', mavlink.MAV_PARAM_TYPE_INT16: '<hxx',
@@ -56,12 +65,22 @@ class Recommendation(NamedTuple):
     name: str
     value: float
     why: str
+    good: tuple[tuple[float, float], ...] = ()
+    """Ranges of the values that are as good; empty: no other is."""
+    since: tuple[int, int] = _FIRST
+    until: tuple[int, int] = _LAST
+    """The first and last firmware that has it, major and minor."""
 
     def differs(self, value: float) -> bool:
-        """Return whether a value differs from the recommended one."""
-        if self.why.startswith(ANY_BUT_ZERO):
-            return value == 0.0
-        return not math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9)
+        """Return whether a value is neither the recommended one nor known to be as good."""
+        return not (any(low <= value <= high for low, high in self.good)
+                    or math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9))
+
+    def applies(self, version: Version | None) -> bool:
+        """Return whether a firmware has it; one of unknown version (None) might not."""
+        if version is None:
+            return (self.since, self.until) == (_FIRST, _LAST)
+        return self.since <= version[:2] <= self.until
 
 
 def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]:
@@ -69,26 +88,52 @@ def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]
     Return the entries of a ``.params`` or ``.parm`` file.
 
     :param forwarding: whether to return those that matter only with forwarded odometry, too.
-    :raises ValueError: naming the first line that is neither an entry, a comment, nor empty.
+    :raises ValueError: naming the first line that is malformed.
     """
     found: list[Recommendation] = []
     comments: list[str] = []
+    extent: dict[str, Any] = {}
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if line.startswith('#'):
-            comments.append(line.lstrip('# '))
-            if comments[-1] == FORWARDING_SECTION and not forwarding:
+            comment = line.lstrip('# ')
+            if comment == FORWARDING_SECTION and not forwarding:
                 break
+            if read := _read_extent(comment, number):
+                extent |= read
+            else:
+                comments.append(comment)
             continue
         # NAME VALUE, or as in QGroundControl's files: SYSTEM COMPONENT NAME VALUE TYPE.
         entry = _ENTRY.fullmatch(line)
         if entry:
-            found.append(Recommendation(entry[1], float(entry[2]), ' '.join(comments)))
+            found.append(Recommendation(entry[1], float(entry[2]), ' '.join(comments), **extent))
         elif line:
             raise ValueError(f'line {number} = {line!r}: must be NAME VALUE, or SYSTEM COMPONENT '
                              'NAME VALUE TYPE')
-        comments = []
+        comments, extent = [], {}
     return found
+
+
+def _read_extent(comment: str, number: int) -> dict[str, Any]:
+    """Return the fields of a Recommendation in a comment, line ``number``; empty if none."""
+    kind, _, text = comment.partition(': ')
+    if kind == 'Good':
+        ranges = [_RANGE.fullmatch(each) for each in text.split(', ')]
+        if all(ranges):
+            return {'good': tuple((float(each[1]), float(each[2] or each[1]))
+                                  for each in ranges if each)}
+        raise ValueError(f'line {number} = {comment!r}: must be Good: VALUE, VALUE to VALUE, ...')
+    if kind != 'Versions':
+        return {}
+    if match := _VERSIONS.fullmatch(text):
+        last, first, begin, end = (
+            tuple(map(int, match.group(k, k + 1))) if match[k] else () for k in (1, 3, 5, 7))
+        since, until = first or begin or _FIRST, last or end or _LAST
+        if since <= until:
+            return {'since': since, 'until': until}
+    raise ValueError(f'line {number} = {comment!r}: must be Versions: up to 1.17, 1.18 and later, '
+                     'or 1.15 to 1.17')
 
 
 def parameter_value(message: Any, *, bytewise: bool) -> float:
@@ -111,58 +156,122 @@ class CheckResult(NamedTuple):
     unanswered: int
     lines: tuple[str, ...]
     """For people: each difference, and its reason."""
+    missing: tuple[str, ...] = ()
+    """For people: each parameter that does not exist."""
+    unproven: str = ''
+    """For people: the firmware, if no recommendation is known for it."""
 
 
 class ParameterCheck:
     """
-    Reads parameters; ``step`` returns the one to request now, one at a time.
+    Reads the firmware's version and parameters; ``step`` returns the parameter to request now.
 
-    ``values`` holds the autopilot's answers. ``result`` may be called from any thread, everything
-    else from one.
+    ``values`` holds the autopilot's answers, ``missing`` the parameters that do not exist.
+    ``result`` may be called from any thread, everything else from one.
 
+    :param recommended: those that ``version`` does not have are not requested.
+    :param dialect: of the autopilot; None: it is not known yet, and nothing is requested.
     :param needed: names to read, and not to compare.
     """
 
-    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool = False,
-                 needed: Sequence[str] = ()) -> None:
+    def __init__(self, recommended: Sequence[Recommendation] = (), dialect: Dialect | None = None,
+                 *, needed: Sequence[str] = ()) -> None:
         self.values: dict[str, float] = {}
-        self._recommended = {entry.name: entry for entry in recommended}
-        self._bytewise = bytewise
-        self._asked = dict.fromkeys((*needed, *self._recommended), -math.inf)  # when last, s
+        self.missing: set[str] = set()
+        self.version: Version | None = None
+        self._dialect = dialect
+        self._recommended = tuple(recommended)
+        self._needed = tuple(needed)
+        self._wanted = {*needed, *(entry.name for entry in recommended)}
+        self._asked: dict[str, float] = {}  # when last, s
+        self._version_asked = -math.inf  # s
         self._begun = math.inf
         self._patient = True
+
+    @property
+    def firmware(self) -> str:
+        """Return the name and the version of the firmware, for people."""
+        title = self._dialect.title if self._dialect is not None else 'autopilot'
+        return f'{title} {self.version or "of unknown version"}'
+
+    def version_due(self, now: float) -> bool:
+        """Return whether to request AUTOPILOT_VERSION at ``now``, s."""
+        due = (self._dialect is not None and self.version is None
+               and now - self._version_asked >= RETRY_PERIOD)
+        if due:
+            self._version_asked = now
+        return due
 
     def step(self, now: float) -> str:
         """Return the name to request at ``now``, s, or ''."""
         self._begun = min(self._begun, now)
         self._patient = now - self._begun < PATIENCE
-        due = [name for name, asked in self._asked.items()
-               if name not in self.values and now - asked >= RETRY_PERIOD]
+        due = [name for name in self._names(self.version) if self._open(name)
+               and now - self._asked.get(name, -math.inf) >= RETRY_PERIOD]
         for name in due[:1]:
             self._asked[name] = now
         return ''.join(due[:1])
 
+    def _names(self, version: Version | None) -> list[str]:
+        """Return the names to read, those that are needed by rules first."""
+        return list(dict.fromkeys((*self._needed, *(
+            entry.name for entry in self._recommended if entry.applies(version)))))
+
+    def _open(self, name: str) -> bool:
+        return name not in self.values and name not in self.missing
+
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""
-        name = message.param_id
-        name = (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
-        if name in self._asked:
-            self.values[name] = parameter_value(message, bytewise=self._bytewise)
+        name = _name_of(message)
+        if name in self._wanted and self._dialect is not None:
+            self.values[name] = parameter_value(
+                message, bytewise=self._dialect.bytewise_parameters)
+            self.missing.discard(name)
+
+    def take_error(self, message: Any) -> None:
+        """Take a PARAM_ERROR: a parameter that does not exist is not requested again."""
+        name = _name_of(message)
+        if message.error == DOES_NOT_EXIST and name in self._wanted and name not in self.values:
+            self.missing.add(name)
+
+    def take_version(self, message: Any) -> None:
+        """Take an AUTOPILOT_VERSION; more parameters may have to be read then."""
+        version = firmware_version(message)
+        if version is not None and version != self.version:
+            self.version = version
+            self._begun, self._patient = math.inf, True
 
     def result(self) -> CheckResult | None:
         """Return the differences, None until every parameter is answered or PATIENCE is over."""
-        values = self.values.copy()
-        unanswered = [name for name in self._asked if name not in values]
-        if not self._asked or (unanswered and self._patient):
+        values, missing, version = self.values.copy(), self.missing.copy(), self.version
+        dialect, names = self._dialect, self._names(version)
+        recommended = {entry.name: entry for entry in self._recommended if entry.applies(version)}
+        unanswered = [name for name in names if name not in values and name not in missing]
+        if version is None:
+            unanswered.append('AUTOPILOT_VERSION')
+        if dialect is None or (unanswered and self._patient):
             return None
         lines = [f'{name} = {values[name]:g}, recommended {entry.value:g}: {entry.why}'
-                 for name, entry in self._recommended.items()
+                 for name, entry in recommended.items()
                  if name in values and entry.differs(values[name])]
         differing = len(lines)
         if unanswered:
             lines.append(f'no answer about {", ".join(unanswered)}: '
                          'compare them with the recommended values by hand')
-        return CheckResult(len(values), differing, len(unanswered), tuple(lines))
+        known = version is None or dialect.versions[0] <= version[:2] <= dialect.versions[1]
+        return CheckResult(
+            len(values), differing, len(unanswered), tuple(lines),
+            tuple(f'{name} does not exist in {self.firmware}' + (
+                f', recommended {recommended[name].value:g}: {recommended[name].why}'
+                if name in recommended else '') for name in names if name in missing),
+            '' if known else
+            f'{self.firmware}: the recommended values are known for {dialect.known_versions}')
+
+
+def _name_of(message: Any) -> str:
+    """Return the name of the parameter in a message."""
+    name = message.param_id
+    return (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
 
 
 _ANYWAY: Final[str] = 'require_failsafe:=false'
@@ -179,7 +288,11 @@ def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> 
     for rule in applicable:
         if rule.name in values and rule.forbidden(values[rule.name]):
             return f'{rule.name} = {values[rule.name]:g}{rule.advice} (or {_ANYWAY})'
+    doubt = f'{dialect.title} might not be safe without the bridge, or not fuse forwarded odometry'
+    missing = [rule.name for rule in applicable if rule.name in parameters.missing]
+    if missing:  # no setting helps
+        return (f'{", ".join(missing)} {"does" if len(missing) == 1 else "do"} not exist in '
+                f'{parameters.firmware}: {doubt}; its rules are known for '
+                f'{dialect.known_versions}')
     unread = ', '.join(rule.name for rule in applicable if rule.name not in values)
-    return unread and (
-        f'{unread} could not be read: {dialect.title} might not be safe without the bridge, or '
-        f'not fuse forwarded odometry ({_ANYWAY} flies all the same)')
+    return unread and f'{unread} could not be read: {doubt} ({_ANYWAY} flies all the same)'

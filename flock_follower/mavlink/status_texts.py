@@ -21,7 +21,7 @@ PX4 sends STATUSTEXT only to links on which it receives a ground station, and no
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
 with the modes concerned, between two summaries. PX4 sends them after a change, and after
 MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``config/px4_events.txt`` has
-the names and texts. Measured on 1.16.
+the names and texts of several versions. An event without a name there is reported by its number.
 
 ``GroundStationReport`` reports the planner's state as STATUSTEXT and the distance as a number.
 They are broadcast on the autopilot's link. ArduPilot forwards them to the ground station; PX4 does
@@ -41,6 +41,10 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.files import resource
 
+#: Kinds of the rows of ``config/px4_events.txt``, see there.
+CHECK, COMMANDER, ACTION, OTHER = 'check', 'commander', 'action', 'other'
+#: The upper byte of the number of an event of the autopilot.
+_AUTOPILOT_EVENTS: Final[int] = 1
 #: Id of EVENT: in common.xml, and not in pymavlink yet.
 MESSAGE_ID: Final[int] = 410
 #: The end of a report that names more checks than this was lost.
@@ -70,17 +74,28 @@ def event_number(name: str) -> int:
     return value % 2**24
 
 
-def _read_texts() -> dict[str, str]:
-    """Return the text of each event by its name."""
+class EventRow(NamedTuple):
+    """A row of ``config/px4_events.txt``."""
+
+    versions: tuple[str, ...]
+    """The versions of PX4 that send it."""
+    kind: str
+    """CHECK, COMMANDER, ACTION or OTHER."""
+    text: str
+    """For people."""
+
+
+def read_events() -> dict[str, EventRow]:
+    """Return the rows of ``config/px4_events.txt`` by the names of the events."""
     lines = resource('config/px4_events.txt').read_text(encoding='utf-8').splitlines()
-    found = (line.partition(': ') for line in lines if not line.startswith('#'))
-    return {name: text or name.removeprefix('check_').replace('_', ' ')
-            for name, _, text in found}
+    rows = (line.split(' | ') for line in lines if not line.startswith('#'))
+    return {name: EventRow(tuple(versions.split()), kind, text)
+            for name, versions, kind, text in rows}
 
 
-_TEXTS: Final[Mapping[str, str]] = MappingProxyType(_read_texts())
+_EVENTS: Final[Mapping[str, EventRow]] = MappingProxyType(read_events())
 _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
-    {event_number(name): name for name in (*_TEXTS, *_ENTERS, _BEGIN, _END)})
+    {event_number(name): name for name in _EVENTS})
 
 
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
@@ -169,7 +184,10 @@ class StatusTexts:
 
     def _check(self, message: Any) -> str:
         """Take an EVENT; return its text if it has one by itself, or ''."""
-        name = _BY_NUMBER.get(message.number % 2**24, '')
+        number = message.number % 2**24
+        name = _BY_NUMBER.get(number, '')
+        known = _EVENTS.get(name)
+        text = f'event {number}' if known is None else known.text
         level, arguments = message.log_levels & 0xF, bytes(message.arguments)
         if name == _BEGIN:
             self._coming = []
@@ -179,12 +197,16 @@ class StatusTexts:
             self._coming = None
         elif name in _ENTERS:
             action = arguments[4]
-            return f'failsafe: {_TEXTS.get(f"failsafe_action_{action}", f"action {action}")}'
-        elif name.startswith('commander_'):
-            return _TEXTS[name]
-        elif self._coming is not None and len(self._coming) < MOST_FAILURES:
-            self._coming.append(Failure(_TEXTS.get(name, f'event {message.number % 2**24}'),
-                                        int.from_bytes(arguments[:4], 'little'), level))
+            row = _EVENTS.get(f'failsafe_action_{action}')
+            return f'failsafe: {f"action {action}" if row is None else row.text}'
+        elif known is not None and known.kind != CHECK:
+            return text if known.kind == COMMANDER else ''
+        elif self._coming is not None:
+            if len(self._coming) < MOST_FAILURES:
+                self._coming.append(
+                    Failure(text, int.from_bytes(arguments[:4], 'little'), level))
+        elif known is None and message.number >> 24 == _AUTOPILOT_EVENTS:
+            return text
         return ''
 
     def _end(self) -> None:
@@ -203,7 +225,7 @@ class StatusTexts:
                 # Reports for every mode include warnings, which prevent none,
                 and (failure.modes != _EVERY_MODE or failure.level < _WARNING
                      # and this one, which prevents the pilot's modes.
-                     or (failure.text == _TEXTS[_STICKS] and mode in _PILOT_MODES))]
+                     or (failure.text == _EVENTS[_STICKS].text and mode in _PILOT_MODES))]
 
     def why(self, time: float, mode: str) -> list[str]:
         """Return the texts since ``time``, and the newest failed checks for a mode."""

@@ -26,8 +26,8 @@ from __future__ import annotations
 import math
 from typing import Any, Final, NamedTuple
 
+from flock_follower.mavlink.dialects import Dialect
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.telemetry import Telemetry
 
 #: From this version on PX4 takes over for fast sticks only.
 FAST_STICKS_SINCE: Final[tuple[int, int]] = (1, 18)
@@ -55,21 +55,13 @@ class Sticks(NamedTuple):
     throttle: float
 
 
-def firmware_version(telemetry: Telemetry) -> tuple[int, int] | None:
-    """Return major and minor version of the autopilot; None if it is not known."""
-    message = telemetry.recent('AUTOPILOT_VERSION', math.inf, 0.0)
-    if message is None or not message.flight_sw_version:
-        return None
-    return message.flight_sw_version >> 24 & 0xFF, message.flight_sw_version >> 16 & 0xFF
-
-
-def take_over_slowly(telemetry: Telemetry, parameters: ParameterCheck) -> bool:
+def take_over_slowly(dialect: Dialect | None, parameters: ParameterCheck) -> bool:
     """Return whether a slow stick does not take over by itself, so that the bridge hands over."""
-    dialect, version = telemetry.dialect, firmware_version(telemetry)
+    version = parameters.version
     if dialect is None or not dialect.stick_speed:
         return False
     return dialect.stick_speed in parameters.values if version is None else (
-        version >= FAST_STICKS_SINCE)
+        version[:2] >= FAST_STICKS_SINCE)
 
 
 def read_sticks(message: Any) -> Sticks | None:

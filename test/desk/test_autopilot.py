@@ -275,6 +275,37 @@ def test_a_parameter_is_read_in_the_encoding_of_its_autopilot(personality, name,
     assert (answer.param_id, answer.param_type, encoded) == (name, kind, value)
 
 
+VERSION = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+MISSING = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+
+
+def named(answers):
+    """Return the type of each answer, and the parameter that it is about."""
+    return [(m.get_type(), m.param_id) for m in answers]
+
+
+@pytest.mark.parametrize(('personality', 'options', 'version'), [
+    ('px4', {}, 0x011000FF), ('px4', {'version': '1.18'}, 0x011200FF),
+    ('arducopter', {}, 0x040700FF)])
+def test_the_version_of_the_firmware_is_reported_on_request(personality, options, version):
+    flight = Flight(personality, **options)
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, VERSION) == [0]
+    assert flight.last('AUTOPILOT_VERSION').flight_sw_version == version
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999.0) != [0]
+
+
+@pytest.mark.parametrize(('version', 'name', 'answer'), [
+    ('1.16', 'COM_RC_OVERRIDE', 'PARAM_VALUE'), ('1.16', 'MAN_OVERRIDE_SPD', None),
+    ('1.18', 'COM_RC_OVERRIDE', 'PARAM_ERROR'), ('1.18', 'MPC_USE_HTE', 'PARAM_ERROR'),
+    ('1.18', 'MAN_OVERRIDE_SPD', 'PARAM_VALUE')])
+def test_the_version_decides_which_parameters_exist(version, name, answer):
+    answers = Flight(version=version).send(
+        mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+    assert named(answers) == ([(answer, name)] if answer else [])
+    assert [m.error for m in answers if m.get_type() == 'PARAM_ERROR'] == [MISSING] * (
+        answer == 'PARAM_ERROR')
+
+
 @BOTH
 def test_a_reboot_is_silent_forgets_and_starts_its_clock_anew(personality):
     flight = Flight(personality, start='landed', parameters={},
@@ -312,6 +343,7 @@ def test_bad_parameters_are_named(parameters, message):
 @pytest.mark.parametrize(('arguments', 'complaint'), [
     (['--connect', '8.8.8.8:1'], 'must be a loopback address'),
     (['--connect', '127.0.0.1:99999'], 'must be HOST:PORT'),
+    (['--firmware', '1.17'], "version = '1.17': must be one of 1.16, 1.18"),
     (['--param', 'GUID_TIMEOUT'], "param = 'GUID_TIMEOUT': must be NAME=NUMBER")])
 def test_bad_arguments_are_one_line(arguments, complaint, capsys):
     assert autopilot.main(arguments) == 1
@@ -319,17 +351,19 @@ def test_bad_arguments_are_one_line(arguments, complaint, capsys):
     assert complaint in error and error.count('\n') == 1
 
 
-@pytest.mark.parametrize(('personality', 'file', 'name'), [
-    ('px4', 'config/px4.params', 'COM_OF_LOSS_T'),
-    ('arducopter', 'config/ardupilot.parm', 'GUID_TIMEOUT')])
-def test_the_recommended_parameters_can_be_set_from_their_file(personality, file, name):
-    options = autopilot.parser().parse_args(['--personality', personality, '--param-file', file])
+@pytest.mark.parametrize(('personality', 'version', 'file', 'name'), [
+    ('px4', '1.16', 'config/px4.params', 'COM_OF_LOSS_T'),
+    ('px4', '1.18', 'config/px4.params', 'COM_OF_LOSS_T'),
+    ('arducopter', '4.7', 'config/ardupilot.parm', 'GUID_TIMEOUT')])
+def test_the_recommended_parameters_can_be_set_from_their_file(personality, version, file, name):
+    options = autopilot.parser().parse_args(
+        ['--personality', personality, '--firmware', version, '--param-file', file])
     parameters = autopilot.settings(options)['parameters']
     options.param = [f'{name}=0.25']
     changed = autopilot.settings(options)['parameters']
     assert (parameters[name], changed[name]) == (0.5, 0.25)
     assert 'EKF2_GPS_CTRL' not in parameters
-    Flight(personality, parameters=parameters)
+    Flight(personality, parameters=parameters, version=version)
 
 
 @pytest.mark.ros

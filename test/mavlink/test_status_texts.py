@@ -14,14 +14,22 @@
 
 """Texts of the autopilot, joined from their chunks, and reports to the ground station."""
 
+import json
 import math
 
+import px4_events
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.status_texts import (
+    ACTION,
+    CHECK,
     CHUNK_TIMEOUT,
+    event_number,
+    EventMessage,
     GroundStationReport,
+    OTHER,
+    read_events,
     StatusTexts,
 )
 
@@ -65,6 +73,94 @@ def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_ag
         texts.add(statustext(text), time)
     assert [texts.unready(now, 'STABILIZE') for now in (30.0, 36.5, 40.0)] == [
         'Hardware safety switch; RC not found', 'RC not found', '']
+
+
+# Events of PX4.
+
+AUTOPILOT, COMMON = 1 << 24, 0
+
+
+def event(name, level=CRITICAL, component=AUTOPILOT, arguments=()):
+    """Return an EVENT, by its name or its number."""
+    number = event_number(name) if isinstance(name, str) else name
+    return EventMessage(
+        component | number, 0, 0, 0, 0, level, bytes([*arguments]).ljust(40, b'\0'))
+
+
+def told(*events):
+    """Return the texts of events, and the failed checks against offboard."""
+    texts = StatusTexts()
+    for each in events:
+        texts.add_event(each, 1.0)
+    return [text.text for text in texts.new(1.0)], texts.against('OFFBOARD')
+
+
+OTHERS = sorted(name for name, row in read_events().items() if row.kind == OTHER)
+BEGIN, END = 'commander_arming_check_summary', 'commander_health_summary'
+OFFBOARD_BIT = (1 << 14).to_bytes(4, 'little')
+
+
+@pytest.mark.parametrize(('name', 'reason'), [
+    ('check_modes_offboard_signal', 'no setpoint stream'),
+    ('check_modes_offboard_signal_lost', 'no setpoint stream'),  # 1.18
+    ('check_modes_offboard_no_local_velocity', 'no velocity estimate for offboard'),
+    ('check_motor_overcurrent', 'motor overcurrent'), (4711, 'event 4711')])
+def test_a_failed_check_has_its_text_or_its_number(name, reason):
+    report = event(BEGIN), event(name, arguments=OFFBOARD_BIT), event(END)
+    assert told(*report) == ([], [reason])
+
+
+@pytest.mark.parametrize(('number', 'component', 'texts'), [
+    ('commander_arm_denied_throttle_unsafe', AUTOPILOT,
+     ['arming denied: throttle not where it is safe']),
+    ('check_estimator_position_failure_imminent', AUTOPILOT,
+     ['estimator position failure imminent']),
+    (4711, AUTOPILOT, ['event 4711']), (1100, COMMON, []), (OTHERS[0], AUTOPILOT, [])])
+def test_an_event_of_the_commander_is_told_by_its_text_or_its_number(number, component, texts):
+    assert told(event(number, component=component)) == (texts, [])
+
+
+def test_another_event_within_a_report_is_no_failed_check():
+    other = event(OTHERS[0], arguments=OFFBOARD_BIT)
+    assert told(event(BEGIN), other, event(END)) == ([], [])
+
+
+def metadata(folder, *names, action='hold'):
+    """Write the metadata of a version of PX4; return what is read of it."""
+    path = folder / px4_events.METADATA
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({'components': {'1': {
+        'event_groups': {'health': {'events': {
+            str(event_number(name)): {'name': name} for name in names}}},
+        'enums': {'failsafe_action_t': {'entries': {'5': {'name': action}}}}}}}))
+    return px4_events.read_version(folder)
+
+
+def test_the_events_are_read_from_the_sources_of_each_version(tmp_path):
+    old = metadata(tmp_path, 'check_baro_missing', 'check_modes_offboard_signal')
+    new = metadata(tmp_path, 'check_baro_missing', 'navigator_x')
+    lines = px4_events.render({'1.16': old, '1.18': new}).splitlines()
+    assert [line for line in lines if not line.startswith('#')] == [
+        'check_baro_missing | 1.16 1.18 | check | baro missing',
+        'check_modes_offboard_signal | 1.16 | check | no setpoint stream',
+        'failsafe_action_5 | 1.16 1.18 | action | Hold',
+        'navigator_x | 1.18 | other | navigator x']
+    with pytest.raises(ValueError, match="failsafe_action_5: .*'Hold'.*, but .*'Land'.* in 1.18"):
+        px4_events.render({'1.16': old, '1.18': metadata(tmp_path, action='land')})
+
+
+def test_the_shipped_events_are_those_that_the_script_writes():
+    rows = read_events()
+    versions = {version: {name: (row.kind, row.text) for name, row in rows.items()
+                          if version in row.versions} for version in ('1.16', '1.18')}
+    # No text was changed by hand.
+    assert px4_events.render(versions) == px4_events.PATH.read_text(encoding='utf-8')
+    assert {name: row.text for name, row in rows.items() if row.kind != ACTION} == {
+        name: px4_events.row_of(name, '')[1] for name, row in rows.items() if row.kind != ACTION}
+    assert {*px4_events.TEXTS} <= {*rows}
+    for found in versions.values():
+        kinds = [kind for kind, _ in found.values()]
+        assert kinds.count(CHECK) > 120 and kinds.count(ACTION) == 11
 
 
 # Reports to the ground station.

@@ -193,10 +193,10 @@ def test_it_acts_where_slow_sticks_do_not_take_over(autopilot, reported, known, 
     telemetry.update(mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_QUADROTOR, autopilot, 1, 0, 4, 3), 0.0)
     if reported:
-        telemetry.update(version(*reported), 0.1)
+        parameters.take_version(version(*reported))
     if known:
         parameters.values['MAN_OVERRIDE_SPD'] = 3.0
-    assert take_over_slowly(telemetry, parameters) is watched
+    assert take_over_slowly(telemetry.dialect, parameters) is watched
 
 
 def sticks_in_flight(minor, accepts):
@@ -239,7 +239,7 @@ def test_on_116_px4_decides_about_sticks_by_itself():
 @pytest.mark.slow
 def test_no_program_undoes_a_stick_that_no_mode_has_answered():
     flight = Flight().follow(1.0)
-    flight.bridge.telemetry.newest['AUTOPILOT_VERSION'] = 0.0, version(1, 18)
+    flight.bridge.housekeeping.parameters.take_version(version(1, 18))
     flight.bridge.sticks.moved = True
     flight.fly(0.1)
     assert flight.bridge.gate.permission.phase is Phase.GIVING_BACK

@@ -35,6 +35,7 @@ from std_srvs.srv import SetBool, Trigger
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
 from flock_follower.mavlink.commands import Outcome
+from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import CheckResult
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command, to_array, trajectory
@@ -369,12 +370,15 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
     bench = make_bench()
     line = 'COM_OF_LOSS_T = 1, recommended 0.5: why'
     results = [CheckResult(0, 0, 3, ()), CheckResult(1, 1, 2, (line,)),
-               CheckResult(3, 2, 0, (line, 'COM_ARM = 0, recommended 1: why'))]
+               CheckResult(3, 2, 0, (line, 'COM_ARM = 0, recommended 1: why'),
+                           ('COM_RC does not exist in PX4 1.20.0',), 'PX4 1.20.0: known for 1.18')]
     for result in results:  # one by one, over a slow line
-        bench.bridge.housekeeping.parameters = SimpleNamespace(result=lambda result=result: result)
+        bench.bridge.housekeeping.parameters = SimpleNamespace(
+            result=lambda result=result: result, version=Version(1, 20))
         bench.problems()
-    assert [text for text in bench.log if 'parameter' in text] == [
-        f'parameter {each}' for each in results[-1].lines]
+    said = [text for text in bench.log if 'parameter' in text or 'PX4' in text]
+    assert said == [f'parameter {each}' for each in (*results[-1].lines, *results[-1].missing)] + [
+        results[-1].unproven]
     for values, said in (
             ({'v_max': 0.5, 'a_max': 2.5}, ''), ({'v_max': None}, ''),
             ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge')):
@@ -383,3 +387,6 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
         assert said in found and bool(said) == ('of the planner' in found)
     assert bench.values['parameters'] == '2 of 3 differ, 0 unanswered'
     assert bench.values['parameter COM_OF_LOSS_T'] == '= 1, recommended 0.5: why'
+    assert bench.values['missing parameter COM_RC'] == 'does not exist in PX4 1.20.0'
+    assert bench.values['unproven firmware'] == results[-1].unproven
+    assert bench.values['firmware'] == '1.20.0'

@@ -35,7 +35,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
+from flock_follower.checks.system import MISSING, NOT_READY, PARAMETER, REFUSED, UNPROVEN
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
@@ -221,10 +221,12 @@ class BridgeReport:
             self._events.popleft()()
         result = self._bridge.housekeeping.parameters.result()
         # While some are unanswered, more lines may follow.
-        good = result is not None and not (result.differing or result.unanswered)
         lines = () if result is None else (
-            (f'{result.answered} parameters of the autopilot are as recommended',) if good else
-            tuple(f'parameter {line}' for line in result.lines))
+            *(f'parameter {line}' for line in (*result.lines, *result.missing)),
+            *filter(None, (result.unproven,)))
+        good = result is not None and not (lines or result.unanswered)
+        if result is not None and good:
+            lines = (f'{result.answered} parameters of the autopilot are as recommended',)
         for line in lines:
             if line not in self._lines:
                 (self._info if good else self._warn)(line)
@@ -240,6 +242,7 @@ class BridgeReport:
             'link': 'alive' if bridge.alive(now) else (
                 'lost' if telemetry.status else 'never received'),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
+            'firmware': str(bridge.housekeeping.parameters.version or ''),
             'mode': status.mode if status else '', 'armed': status.armed if status else '',
             'flying': '' if flying is None else flying, 'state': bridge.state(now),
             'handed_over': bridge.end.why,
@@ -249,8 +252,11 @@ class BridgeReport:
         if result is not None:
             values['parameters'] = (f'{result.differing} of {result.answered} differ, '
                                     f'{result.unanswered} unanswered')
-            values |= {PARAMETER + name: rest for name, _, rest in (
-                line.partition(' ') for line in result.lines)}
+            for key, texts in ((PARAMETER, result.lines), (MISSING, result.missing)):
+                values |= {key + name: rest for name, _, rest in (
+                    text.partition(' ') for text in texts)}
+            if result.unproven:
+                values[UNPROVEN] = result.unproven
         return values
 
     def _gate_values(self, now: float) -> dict[str, object]:
