@@ -194,8 +194,10 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
 def test_after_a_reboot_or_with_another_vehicle_nothing_is_sent_before_a_new_request(what, why):
     flight = Flight('arducopter').follow(1.0)
     owner = flight.bridge.telemetry if what == 'reboots' else flight.bridge.link
+    checked = flight.bridge.housekeeping.parameters
     setattr(owner, what, getattr(owner, what) + 1)
     flight.fly(1.0)
+    assert flight.bridge.housekeeping.parameters is not checked  # they are read again
     assert flight.kinds(15) == {'none'} and why in flight.bridge.state(flight.now)
     assert flight.ask('offboard', True).success
     request = flight.bridge.requests.land(flight.now)
