@@ -95,7 +95,7 @@ class EndParams(Checked):
         'after that', live=False)
     battery_action: str = parameter(HOLD, ACTIONS, 'action at a low battery', live=False)
     stick_override: float = parameter(
-        0.3, Range(0.1, 0.6),
+        0.3, Range(0.2, 0.6),
         'share of full deflection by which a stick must move from its position at offboard, so '
         'that the bridge requests the Position mode; on PX4 1.18 and later, whose own takeover '
         'ignores slow sticks', live=False)

@@ -145,10 +145,12 @@ def test_a_pilot_who_switched_unseen_bars_offboard(personality):
 
 
 @pytest.mark.parametrize('share', [0.05, 0.2])
-@pytest.mark.parametrize('message', ['', 'HEARTBEAT'])
+@pytest.mark.parametrize('message', ['', 'HEARTBEAT', 'HEARTBEAT alone'])
 def test_random_loss_is_no_loss_of_the_autopilot(share, message):
-    loss = Fault('drop', 0.0, 1e3, 'sent', share, message)
-    flight = Flight(faults=[loss], seed=5)
+    message, _, alone = message.partition(' ')
+    loss = [Fault('drop', 0.0, 1e3, 'sent', share, message),
+            *([Fault('drop', 0.0, 1e3, 'sent', 1.0, 'CURRENT_MODE')] if alone else [])]
+    flight = Flight(faults=loss, seed=5)
     flight.fly(8.0)  # 20 parameters, one by one
     flight.engage()
     flight.planner = 0.0 * EAST
@@ -156,7 +158,9 @@ def test_random_loss_is_no_loss_of_the_autopilot(share, message):
     for _ in range(120):
         flight.fly(0.5)
         states.add(flight.bridge.state(flight.now))
-    assert states == {'ACTIVE'} and flight.kinds(1200) == {'command'}
+    assert states == {'ACTIVE'}
+    # Without CURRENT_MODE three lost HEARTBEATs in a row brake.
+    assert alone or flight.kinds(1190) == {'command'}
     assert len(flight.bridge.housekeeping.parameters.values) >= asked > 0
 
 
@@ -190,8 +194,10 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
 def test_after_a_reboot_or_with_another_vehicle_nothing_is_sent_before_a_new_request(what, why):
     flight = Flight('arducopter').follow(1.0)
     owner = flight.bridge.telemetry if what == 'reboots' else flight.bridge.link
+    checked = flight.bridge.housekeeping.parameters
     setattr(owner, what, getattr(owner, what) + 1)
     flight.fly(1.0)
+    assert flight.bridge.housekeeping.parameters is not checked  # they are read again
     assert flight.kinds(15) == {'none'} and why in flight.bridge.state(flight.now)
     assert flight.ask('offboard', True).success
     request = flight.bridge.requests.land(flight.now)

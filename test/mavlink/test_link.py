@@ -103,6 +103,19 @@ def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent()
     assert bench.link.ignored['second sender'] == 1 and bench.link.peer_changes == 1
 
 
+def test_a_vehicle_that_loses_only_its_heartbeats_is_not_replaced():
+    bench = Bench()
+    bench.beats('first', now=1.0)
+    home = mavlink.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+    bench.sends('first', home)
+    bench.link.receive(4.0)
+    assert bench.beats('second', now=5.0) == [] and bench.link.transport.peer == 'first'
+    assert 'HOME_POSITION' in bench.link.telemetry.newest
+    # Another vehicle has another home.
+    assert bench.beats('second', now=6.1) == ['HEARTBEAT']
+    assert 'HOME_POSITION' not in bench.link.telemetry.newest
+
+
 def test_garbage_and_floods_of_another_sender_cost_the_vehicle_nothing():
     bench = Bench()
     assert bench.beats('vehicle') == ['HEARTBEAT']

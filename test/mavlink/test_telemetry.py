@@ -110,8 +110,11 @@ def test_the_link_is_alive_while_any_message_comes(came, now, alive):
 def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
     telemetry = Telemetry()
     for boot_ms, reboots in stamps:
+        known = telemetry.newest['HOME_POSITION'] = 1.0, None
+        before = telemetry.reboots
         telemetry.update(stamped('ATTITUDE_QUATERNION', boot_ms), 1.0)
         assert telemetry.reboots == reboots, boot_ms
+        assert telemetry.newest.get('HOME_POSITION') == (known if before == reboots else None)
 
 
 @pytest.mark.parametrize(('state', 'flying'), [
