@@ -56,6 +56,8 @@ TRUTH ?=
 FORWARD ?=
 LEADER ?=
 DURATION ?= 0
+# Frozen flights are 25 runs of each scenario, unless RUNS is given.
+FROZEN_RUNS := $(if $(RUNS),--runs $(RUNS))
 RUNS ?= 200
 BYTES ?= 1000000
 MESSAGES ?= 100000
@@ -116,10 +118,10 @@ px4-events: setup
 	@$(RUN) test/px4_events.py $(PX4)
 
 frozen: setup
-	@$(RUN) test/frozen.py --runs $(RUNS)
+	@$(RUN) test/frozen.py $(FROZEN_RUNS)
 
 freeze: setup
-	@$(RUN) test/frozen.py --runs $(RUNS) --write
+	@$(RUN) test/frozen.py $(FROZEN_RUNS) --write
 
 figures: setup
 	@$(RUN) -m flock_desk.figures

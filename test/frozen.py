@@ -213,7 +213,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Compare with frozen results, or freeze them.')
     parser.add_argument('parts', nargs='*', metavar='PART', help=f'{", ".join(PARTS)} (all)')
     parser.add_argument('--write', action='store_true', help='freeze instead of comparing')
-    parser.add_argument('--runs', type=int, default=200, help='of each scenario (%(default)s)')
+    parser.add_argument('--runs', type=int, default=25, help='of each scenario (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
                         help='processes (one per processor)')
     options = parser.parse_args()

@@ -43,7 +43,7 @@ AFTER: Final[float] = 2.0
 #: The bridge stops its stream when the mode is left: a later report of a missing stream, s, is
 #: its effect.
 STREAM_AFTER: Final[float] = 0.3
-#: PX4's ``failsafe_cause_t``; 0 is any other cause. Measured on 1.16; 6 is new in 1.17.
+#: PX4's ``failsafe_cause_t``; 0 is any other cause (sources of 1.16 and 1.18).
 _CAUSES: Final[Mapping[int, str]] = MappingProxyType({
     1: TRANSMITTER, 2: STATION, 3: BATTERY, 4: BATTERY, 5: BATTERY, 6: BATTERY})
 #: Place of the cause in the arguments of PX4's failsafe events.
