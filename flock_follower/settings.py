@@ -37,6 +37,9 @@ NEAREST: Final[float] = 0.6
 NARROWEST: Final[float] = 0.45
 #: Width of the band, m, below which a leader that reverses leaves it.
 NARROW: Final[float] = 1.0
+#: Largest sine of the elevation at which the neighbor is followed. With 0.42 and more a neighbor
+#: that walks at random came near to 0.55 m out of the image, with 0.34 to 1.66 m.
+STEEPEST: Final[float] = 0.3
 #: Width of a marker, px, below which it is lost.
 MARKER_LOST_WIDTH: Final[float] = 12.0
 #: Images that may be lost in a row before the neighbor is not followed any more.
@@ -81,7 +84,8 @@ def judge(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgement
 
     :param values: of one node or of several, by name; a rule about a missing one is left out.
     """
-    found = [*_stop(values), *_band(values), *_sight(values, camera), *_hidden(values)]
+    found = [*_stop(values), *_band(values), *_sight(values, camera), *_height(values, camera),
+             *_hidden(values)]
     return sorted(found, key=lambda each: not each.dangerous)
 
 
@@ -148,13 +152,18 @@ def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
                 yield Judgement(
                     dangerous, name, values[name], f'at least {math.ceil(100 * least) / 100:g} s '
                     f'for images at {camera.rate:.1f} Hz', why)
-    if camera.half_height is not None and {'altitude_offset', 'd0', 'd1'} <= values.keys():
-        middle = 0.5 * (math.sqrt(float(values['d0'])) + math.sqrt(float(values['d1'])))
-        most = middle * math.sin(camera.half_height)
-        if abs(float(values['altitude_offset'])) > most:
-            yield Judgement(False, 'altitude_offset', values['altitude_offset'],
-                            f'within {math.floor(100.0 * most) / 100.0:g} m',
-                            'the neighbor is above or below the image')
+
+
+def _height(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
+    if not {'altitude_offset', 'd0', 'd1'} <= values.keys():
+        return
+    middle = 0.5 * (math.sqrt(float(values['d0'])) + math.sqrt(float(values['d1'])))
+    view = 1.0 if camera.half_height is None else math.sin(camera.half_height)
+    most = middle * min(STEEPEST, view)
+    if abs(float(values['altitude_offset'])) > most:
+        yield Judgement(True, 'altitude_offset', values['altitude_offset'],
+                        f'within {math.floor(100.0 * most) / 100.0:g} m',
+                        'the neighbor leaves the image above or below and comes near unseen')
 
 
 def _hidden(values: Mapping[str, Any]) -> Iterator[Judgement]:

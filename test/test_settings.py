@@ -27,7 +27,7 @@ from flock_follower.parameters.spec import specs_of
 from flock_follower.parameters.tables import gate_limits, planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import A_MAX, V_MAX
-from flock_follower.settings import Camera, judge, NARROWEST, NEAREST, refuse
+from flock_follower.settings import Camera, judge, NARROWEST, NEAREST, refuse, UNKNOWN
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULTS = {spec.name: spec.default for spec in (*specs_of(PlannerParams()),
@@ -69,7 +69,8 @@ def test_every_scenario_can_fly(path):
     ({'d1': 2.25}, USUAL, ('d1', False)),
     ({'predict_timeout': 0.3}, USUAL._replace(rate=5.0), ('predict_timeout', True)),
     ({}, USUAL._replace(rate=5.0), ('perception_timeout', False)),
-    ({'altitude_offset': 1.0}, USUAL, ('altitude_offset', False)),
+    ({'altitude_offset': 0.6}, UNKNOWN, ('altitude_offset', True)),
+    ({'altitude_offset': -0.6}, USUAL, ('altitude_offset', True)),
     ({'leader_acceleration_max': 5.0}, USUAL, ('leader_acceleration_max', False))])
 def test_what_cannot_fly_is_named(changes, camera, expected):
     assert expected in found(camera, **changes)
