@@ -447,7 +447,7 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, cou
 
 @pytest.mark.parametrize(('change', 'message'), [
     ({'a_max': -1.0}, r'^a_max = -1\.0: must be a number in \[1\.5, 20\] m/s\^2$'),
-    ({'v_max': math.nan}, r'^v_max = nan: must be a number in \[0\.05, 5\] m/s$'),
+    ({'v_max': math.nan}, r'^v_max = nan: must be a number in \[0\.1, 5\] m/s$'),
     ({'coast_timeout': 0.4},
      r'^coast_timeout = 0\.4: must be at least predict_timeout = 0\.5$'),
     ({'yaw_mode': 'spin'}, r"^yaw_mode = 'spin': must be one of leader, hold$"),
