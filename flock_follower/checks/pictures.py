@@ -27,7 +27,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
-SMALL = 18.0
+NOISY_MARKER_WIDTH = 18.0
 #: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
 #: Largest distance of the optical axis from the middle, share of the image: K for images of
@@ -116,7 +116,7 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     others = sorted({number for picture in pictures for number in picture.markers})
     unseen = f'not in sight in {len(pictures)} images'
     return first(
-        'marker', f'{ours}, {SMALL:.0f} px, most of the time',
+        'marker', f'{ours}, {NOISY_MARKER_WIDTH:.0f} px, most of the time',
         (share == 0.0 and bool(others), WARNING,
          f'{unseen}, but {", ".join(map(str, others))}',
          'set marker_id in neighbors_file, or show the right print'),
@@ -125,7 +125,7 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
          'margin white?'),
         (side < MARKER_LOST_WIDTH, ERROR, measured,
          'come nearer, print it larger, or use a longer lens or a finer image'),
-        (side < SMALL, WARNING, measured,
+        (side < NOISY_MARKER_WIDTH, WARNING, measured,
          'come nearer, or print the marker larger: a small marker is lost easily'),
         (share < SELDOM, WARNING, measured,
          'keep the marker in sight; check light, blur and the white margin'),

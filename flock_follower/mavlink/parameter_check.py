@@ -45,7 +45,8 @@ FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
 #: MAV_PARAM_ERROR_DOES_NOT_EXIST, which older releases of pymavlink lack.
 DOES_NOT_EXIST: Final[int] = 1
 #: The firmware of an entry without ``Versions:``, major and minor.
-_FIRST, _LAST = (0, 0), (255, 255)
+_FIRST_VERSION = (0, 0)
+_LAST_VERSION = (255, 255)
 _ENTRY: Final = re.compile(
     r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')
 _NUMBER: Final[str] = r'(-?\d+(?:\.\d+)?)'
@@ -67,8 +68,8 @@ class Recommendation(NamedTuple):
     why: str
     good: tuple[tuple[float, float], ...] = ()
     """Ranges of the values that are as good; empty: no other is."""
-    since: tuple[int, int] = _FIRST
-    until: tuple[int, int] = _LAST
+    since: tuple[int, int] = _FIRST_VERSION
+    until: tuple[int, int] = _LAST_VERSION
     """The first and last firmware that has it, major and minor."""
 
     def differs(self, value: float) -> bool:
@@ -79,7 +80,7 @@ class Recommendation(NamedTuple):
     def applies(self, version: Version | None) -> bool:
         """Return whether a firmware has it; one of unknown version (None) might not."""
         if version is None:
-            return (self.since, self.until) == (_FIRST, _LAST)
+            return (self.since, self.until) == (_FIRST_VERSION, _LAST_VERSION)
         return self.since <= version[:2] <= self.until
 
 
@@ -129,7 +130,7 @@ def _read_extent(comment: str, number: int) -> dict[str, Any]:
     if match := _VERSIONS.fullmatch(text):
         last, first, begin, end = (
             tuple(map(int, match.group(k, k + 1))) if match[k] else () for k in (1, 3, 5, 7))
-        since, until = first or begin or _FIRST, last or end or _LAST
+        since, until = first or begin or _FIRST_VERSION, last or end or _LAST_VERSION
         if since <= until:
             return {'since': since, 'until': until}
     raise ValueError(f'line {number} = {comment!r}: must be Versions: up to 1.17, 1.18 and later, '

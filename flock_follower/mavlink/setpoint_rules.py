@@ -180,11 +180,8 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     offset = _sane_offset(offset)
-    reason = first_reason(
-        # Written so that NaN fails.
-        (not link_age <= limits.link_timeout, 'link lost'),
-        (not mode_age <= MODE_TIMEOUT, MODE_UNKNOWN),
-    ) or _refusal(limits, known, command, command_age, unplaced, relative, place, airborne)
+    reason = _refusal(limits, known, command, command_age, link_age, mode_age, unplaced, relative,
+                      place, airborne)
     if not reason and command is not None and command.relative:
         return _relative(full, command, offset, place)
     velocity = known.velocity
@@ -222,8 +219,13 @@ def _sane_offset(offset: ArrayLike) -> Array:
 
 
 def _refusal(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-             unplaced: str, relative: Relative, place: Location, airborne: bool) -> str:
+             link_age: float, mode_age: float, unplaced: str, relative: Relative,
+             place: Location, airborne: bool) -> str:
     """Return why a command may not pass, or ''."""
+    if not link_age <= limits.link_timeout:  # written so that NaN fails
+        return 'link lost'
+    if not mode_age <= MODE_TIMEOUT:
+        return MODE_UNKNOWN
     if command is not None and command.relative:
         reason = _marker_refusal(limits, relative, place, airborne)
     else:

@@ -268,8 +268,8 @@ class Telemetry:
                 now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
     def forget(self) -> None:
-        """Drop what was known of an autopilot that has rebooted, or was replaced."""
-        for kind in ('AUTOPILOT_VERSION', 'GPS_GLOBAL_ORIGIN', 'HOME_POSITION'):
+        """Drop origin, home and clock of an autopilot that has rebooted or was replaced."""
+        for kind in ('GPS_GLOBAL_ORIGIN', 'HOME_POSITION'):
             self.newest.pop(kind, None)
         self._boot_time_ms, self._fallen = 0, False
 

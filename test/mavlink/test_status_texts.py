@@ -126,7 +126,7 @@ def test_another_event_within_a_report_is_no_failed_check():
 
 
 def metadata(folder, *names, action='hold'):
-    """Write the metadata of a version of PX4; return what is read of it."""
+    """Write the metadata of a version of PX4; return the version as the script reads it."""
     path = folder / px4_events.METADATA
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({'components': {'1': {
