@@ -37,20 +37,32 @@ def received(name, until=math.inf, **options):
     return bridge
 
 
-@pytest.mark.parametrize('name', ['px4_refusals', 'px4_vision_lost'])
+@pytest.mark.parametrize('name', [
+    'px4_refusals', 'px4_vision_lost', 'px4_1.18_refusals', 'px4_1.18_vision_lost',
+    'px4_1.18_fence', 'px4_1.18_stick'])
 def test_every_message_of_px4_is_understood(name):
     assert not {*received(name).link.ignored} - {
         'before HEARTBEAT', 'LOCAL_POSITION_NED is invalid according to its estimator'}
 
 
-@pytest.mark.parametrize(('time', 'mode', 'reasons'), [
-    (3.0, 'AUTO.LOITER', ['no valid position estimate',
-                          'no global position (neither GPS nor an origin)']),
-    (5.0, 'AUTO.LOITER', []), (5.0, 'OFFBOARD', ['no setpoint stream']),
-    (36.0, 'AUTO.LAND', ['it does not arm in this mode']),
-    (58.4, 'OFFBOARD', []), (60.7, 'OFFBOARD', ['no setpoint stream'])])
-def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, reasons):
-    assert received('px4_refusals', time).texts.against(mode) == reasons
+UNPLACED = ['no valid position estimate', 'no global position (neither GPS nor an origin)']
+
+
+@pytest.mark.parametrize(('name', 'time', 'mode', 'reasons'), [
+    ('px4_refusals', 3.0, 'AUTO.LOITER', UNPLACED),
+    ('px4_refusals', 5.0, 'AUTO.LOITER', []),
+    ('px4_refusals', 5.0, 'OFFBOARD', ['no setpoint stream']),
+    ('px4_refusals', 36.0, 'AUTO.LAND', ['it does not arm in this mode']),
+    ('px4_refusals', 58.4, 'OFFBOARD', []),
+    ('px4_refusals', 60.7, 'OFFBOARD', ['no setpoint stream']),
+    ('px4_1.18_refusals', 5.0, 'AUTO.LOITER', ['estimator heading no source', *UNPLACED]),
+    ('px4_1.18_refusals', 20.0, 'AUTO.LOITER', []),
+    ('px4_1.18_refusals', 37.9, 'OFFBOARD', ['no setpoint stream']),
+    ('px4_1.18_refusals', 26.0, 'AUTO.LAND', ['it does not arm in this mode']),
+    ('px4_1.18_refusals', 44.0, 'OFFBOARD', []),
+    ('px4_1.18_refusals', 50.0, 'OFFBOARD', ['no setpoint stream'])])
+def test_px4_reports_what_it_would_refuse_without_a_ground_station(name, time, mode, reasons):
+    assert received(name, time).texts.against(mode) == reasons
 
 
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
