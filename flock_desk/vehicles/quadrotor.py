@@ -140,9 +140,21 @@ class Quadrotor:
 
 def attitude(axis: Array, yaw: Any) -> Array:
     """Return rotations (..., 3, 3) FLU to ENU with z axes (..., 3), heading along yaw (...)."""
-    left = np.cross(axis, np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1))
-    left /= np.linalg.norm(left, axis=-1, keepdims=True)
-    return np.stack([np.cross(left, axis), left, axis], axis=-1)
+    rotation = np.empty((*axis.shape, 3))
+    left = _cross(axis, np.cos(yaw), np.sin(yaw), 0.0)
+    left /= np.sqrt(np.sum(left * left, axis=-1, keepdims=True))
+    rotation[..., 0] = _cross(left, axis[..., 0], axis[..., 1], axis[..., 2])
+    rotation[..., 1], rotation[..., 2] = left, axis
+    return rotation
+
+
+def _cross(a: Array, x: Any, y: Any, z: Any) -> Array:
+    """Return vector products (..., 3) with vectors (x, y, z): np.cross takes ten times as long."""
+    product = np.empty(a.shape)
+    product[..., 0] = a[..., 1] * z - a[..., 2] * y
+    product[..., 1] = a[..., 2] * x - a[..., 0] * z
+    product[..., 2] = a[..., 0] * y - a[..., 1] * x
+    return product
 
 
 def _turn(axis: Array, target: Array, fraction: float) -> Array:

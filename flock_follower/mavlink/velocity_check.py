@@ -29,8 +29,10 @@ Vectors are ENU. Time is an argument; no clock is read.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 import math
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -317,8 +319,13 @@ class Source:
         """Standard deviation of the position, m."""
 
     def take_yaw(self, yaw: float, time: float) -> None:
-        """Take a yaw, rad, at a time, s."""
-        if math.isfinite(yaw) and (not self.yaws or time >= self.yaws[-1][0]):
+        """Take a yaw, rad, at a time, s; it replaces one of the same time."""
+        newest = self.yaws[-1][0] if self.yaws else -math.inf
+        if not math.isfinite(yaw) or not time >= newest:
+            return
+        if time == newest:
+            self.yaws[-1] = time, wrap_angle(yaw)
+        else:
             self.yaws.append((time, wrap_angle(yaw)))
             while time - self.yaws[0][0] > YAW_MEMORY:
                 self.yaws.popleft()
@@ -328,8 +335,9 @@ class Source:
         yaws = tuple(self.yaws)  # a copy: diagnostics read it from another thread
         if not yaws:
             return 0.0, -math.inf
-        time = min(time, yaws[-1][0])
-        return min(reversed(yaws), key=lambda known: abs(known[0] - time))[::-1]
+        after = bisect_right(yaws, time, key=itemgetter(0))
+        near = yaws[max(after - 1, 0):after + 1]
+        return min(reversed(near), key=lambda known: abs(known[0] - time))[::-1]
 
 
 def displaced(odom: Source, autopilot: Source | None, turn: float, height: Path,
