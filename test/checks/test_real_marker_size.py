@@ -36,7 +36,7 @@ if not (FOLDER / 'truth.yaml').exists():
     pytest.skip('the recordings (../shared/data/real) are not here', allow_module_level=True)
 pytestmark = pytest.mark.slow
 VISIT = 8e9  # ns: sightings of a tag are judged for so long
-USED = 30  # of the sightings of a visit
+USED = 15  # of the sightings of a visit
 
 
 def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:

@@ -74,7 +74,9 @@ LAST = {'duration': 12.0}
     ('short', 0, {'flock': {'formation': 'ring', 'faces': ('back', 'front', 'left', 'right')}},
      1.0),
     # The first follower fails, or the leader is hidden: the others turned to each other here.
-    ('flock_line', 87_000, {'duration': 50.0, 'flock': {'fails': FollowerFailure(1, 12.0)}}, 0.0),
+    pytest.param('flock_line', 87_000, {
+        'duration': 50.0, 'flock': {'fails': FollowerFailure(1, 12.0)}}, 0.0,
+        marks=pytest.mark.sweep),
     ('flock_line', 51_000_001, {'duration': 35.0, 'outages': (Outage('marker', 20.0, 5.0),)},
      0.0)])
 def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[str, Any],

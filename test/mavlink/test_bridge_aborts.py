@@ -144,9 +144,11 @@ def test_a_pilot_who_switched_unseen_bars_offboard(personality):
     assert not flight.ask('offboard', True).success
 
 
-@pytest.mark.parametrize('share', [0.05, 0.2])
-@pytest.mark.parametrize('message', ['', 'HEARTBEAT', 'HEARTBEAT alone'])
-def test_random_loss_is_no_loss_of_the_autopilot(share, message):
+@pytest.mark.parametrize(('message', 'share'), [
+    ('', 0.2), ('HEARTBEAT', 0.2), ('HEARTBEAT alone', 0.05),
+    *(pytest.param(*each, marks=pytest.mark.sweep) for each in (
+        ('', 0.05), ('HEARTBEAT', 0.05), ('HEARTBEAT alone', 0.2)))])
+def test_random_loss_is_no_loss_of_the_autopilot(message, share):
     message, _, alone = message.partition(' ')
     loss = [Fault('drop', 0.0, 1e3, 'sent', share, message),
             *([Fault('drop', 0.0, 1e3, 'sent', 1.0, 'CURRENT_MODE')] if alone else [])]
@@ -155,12 +157,12 @@ def test_random_loss_is_no_loss_of_the_autopilot(share, message):
     flight.engage()
     flight.planner = 0.0 * EAST
     states, asked = set(), len(flight.bridge.housekeeping.parameters.values)
-    for _ in range(120):
+    for _ in range(50):
         flight.fly(0.5)
         states.add(flight.bridge.state(flight.now))
     assert states == {'ACTIVE'}
     # Without CURRENT_MODE three lost HEARTBEATs in a row brake.
-    assert alone or flight.kinds(1190) == {'command'}
+    assert alone or flight.kinds(490) == {'command'}
     assert len(flight.bridge.housekeeping.parameters.values) >= asked > 0
 
 
