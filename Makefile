@@ -32,6 +32,7 @@
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
 #   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
+#   ROS=kilted          ROS 2 Kilted instead of Jazzy
 #   VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
 #   TESTS=test/mavlink  what `make test` runs
 #   MARKERS='not ros'   which of its tests: an expression of unit, ros, slow and sweep
@@ -44,9 +45,11 @@
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
 #                       LEADER=udpin:127.0.0.1:19411 where a second autopilot, that of the leader, sends the truth
 
+ROS ?= jazzy
+$(if $(filter jazzy kilted,$(ROS)),,$(error ROS = $(ROS): must be jazzy or kilted))
 VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
-VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
+VENV := .venv$(patsubst %,-%,$(filter-out jazzy,$(ROS)))$(patsubst %,-opencv-%,$(filter-out 5,$(VISION)))
 TESTS ?= test
 MARKERS ?=
 SCENARIO ?= indoor
@@ -76,7 +79,7 @@ help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
 setup:
-	@requirements/make_venv.sh $(VENV) requirements/lock.txt requirements/vision-$(VISION).txt
+	@requirements/make_venv.sh $(VENV) requirements/lock-$(ROS).txt requirements/vision-$(VISION).txt
 
 demo: setup
 	@$(RUN) -m flock_desk.demo --output $(or $(OUTPUT),build/demo)
@@ -171,5 +174,5 @@ bags: setup
 	@$(RUN) -m flock_desk.sample_bag --variant all
 
 clean:
-	rm -rf .venv .venv-opencv-* .venv-mutation build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-* build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

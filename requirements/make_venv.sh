@@ -65,5 +65,5 @@ install() {
 requirements=$(printf -- '-r %s ' "$@")
 # shellcheck disable=SC2086
 install $requirements
-case $* in *lock.txt*) install --no-build-isolation -e . ;; esac
+case $* in */lock-*) install --no-build-isolation -e . ;; esac
 printf '%s\n' "$wanted" > "$stamp"

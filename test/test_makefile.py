@@ -29,7 +29,7 @@ def make(*arguments):
     # Settings of the `make test` that runs these tests are no settings of this make.
     outside = {name: value for name, value in os.environ.items()
                if name not in ('MAKEFLAGS', 'MAKELEVEL', 'MAKEOVERRIDES', 'MFLAGS', 'TESTS',
-                               'MARKERS', 'VISION')}
+                               'MARKERS', 'ROS', 'VISION')}
     return subprocess.run(['make', '--dry-run', *arguments], cwd=ROOT, capture_output=True,
                           text=True, timeout=20.0, env=outside)
 
@@ -41,12 +41,25 @@ def test_a_version_of_opencv_that_has_no_lock_is_refused_with_those_that_have(ve
     assert f'VISION = {version}: must be 5 or 4.10.  Stop.' in ended.stderr
 
 
-@pytest.mark.parametrize('version', ['5', '4.10'])
-def test_every_version_that_is_offered_has_a_lock(version):
-    ended = make('test', f'VISION={version}')
+def test_a_distribution_of_ros_that_has_no_lock_is_refused_with_those_that_have():
+    ended = make('test', 'ROS=lyrical')
+    assert ended.returncode == 2
+    assert 'ROS = lyrical: must be jazzy or kilted.  Stop.' in ended.stderr
+
+
+@pytest.mark.parametrize(('settings', 'environment', 'locks'), [
+    ([], '.venv', ('lock-jazzy', 'vision-5')),
+    (['VISION=4.10'], '.venv-opencv-4.10', ('lock-jazzy', 'vision-4.10')),
+    (['ROS=kilted'], '.venv-kilted', ('lock-kilted', 'vision-5')),
+    (['ROS=kilted', 'VISION=4.10'], '.venv-kilted-opencv-4.10', ('lock-kilted', 'vision-4.10'))])
+@pytest.mark.parametrize('command', ['setup', 'test', 'demo'])
+def test_each_ros_and_opencv_has_an_environment_of_its_own(command, settings, environment, locks):
+    ended = make(command, *settings)
+    files = [f'requirements/{lock}.txt' for lock in locks]
     assert ended.returncode == 0
-    assert f'requirements/vision-{version}.txt' in ended.stdout
-    assert (ROOT / 'requirements' / f'vision-{version}.txt').is_file()
+    assert f'requirements/make_venv.sh {environment} {" ".join(files)}\n' in ended.stdout
+    assert command == 'setup' or f'{environment}/bin/python ' in ended.stdout
+    assert all((ROOT / file).is_file() for file in files)
 
 
 @pytest.mark.parametrize(('command', 'default'), [('demo', 'build/demo'), ('fly', 'build/fly')])

@@ -47,7 +47,7 @@ from flock_follower.checks.processor import (
     threads_of,
 )
 from flock_follower.checks.system import dead_segments
-from flock_follower.files import resource
+from flock_follower.fast_dds import profile_variables
 
 TOO_BUSY_EXIT_CODE = 3
 LONGEST_STOP = 60.0  # s until a process is killed, however long it waits for a processor
@@ -91,7 +91,7 @@ def private_environment(domain_id: int | None = None) -> dict[str, str]:
         **os.environ,
         'ROS_DOMAIN_ID': str(_own_domain() if domain_id is None else domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(resource('config/fastdds.xml')),
+        **profile_variables('config/fastdds.xml'),
         'PYTHONUNBUFFERED': '1',
     }
 

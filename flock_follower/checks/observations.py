@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from flock_follower.checks.processor import Load
+from flock_follower.checks.reach import Reach
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
@@ -98,17 +99,16 @@ class Machine:
 
     ``load``: of our nodes, None if it is unknown;
     ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
-    ``shares_memory``: whether images may come through shared memory; ``segment``: its size, bytes.
-    ``open_nodes``: our nodes on this computer that others on the network can reach; 'check' if
-    those are unknown and others can reach ``check`` itself.
+    ``segment``: the size, bytes, of the shared memory through which images may come; 0: none.
+    ``reach``: from where our nodes on this computer are reached, None if that is unknown; that of
+    'check' itself if it sees none of them.
     """
 
     load: Load | None = None
     shared_memory_free: float | None = None
-    shares_memory: bool = False
-    segment: int = 512 * 1024
+    segment: int = 0
     domain: str = '0'
-    open_nodes: list[str] = field(default_factory=list)
+    reach: list[tuple[str, Reach | None]] = field(default_factory=list)
     dead_segments: int = 0
 
 

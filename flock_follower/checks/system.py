@@ -36,6 +36,7 @@ from flock_follower.checks.findings import (
 from flock_follower.checks.observations import Machine, Observations, OURS
 from flock_follower.checks.processor import BUSY
 from flock_follower.checks.topic_names import full_name
+from flock_follower.fast_dds import PROFILE_VARIABLES, SEGMENT_PREFIXES
 
 STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.
@@ -79,7 +80,7 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
     elif seen.live:
         yield Finding(UNMEASURED, 'processor', 'our nodes do not run on this computer, or its '
                       'kernel does not count for how long they wait', wanted)
-    if machine.shares_memory:
+    if machine.segment:
         yield _shared_memory(machine, max((p.bytes for p in seen.pictures), default=0))
 
 
@@ -88,14 +89,15 @@ def _shared_memory(machine: Machine, image: int) -> Finding:
     free = math.inf if machine.shared_memory_free is None else machine.shared_memory_free
     return first(
         'shared memory', f'{ROOM:.0f} MB, images that fit into {machine.segment // 1024} kB',
-        (free < ROOM, ERROR, f'{free:.0f} MB free in /dev/shm', 'delete /dev/shm/fastrtps_* of '
-         'processes that are gone; in a container, --shm-size'),
+        (free < ROOM, ERROR, f'{free:.0f} MB free in /dev/shm', 'delete /dev/shm/fastrtps_* and '
+         'fastdds_* of processes that are gone; in a container, --shm-size'),
         (machine.dead_segments >= DEAD_SEGMENTS, WARNING,
          f'{machine.dead_segments} segments of processes that were killed slow every node',
          'fastdds shm clean'),
         (image > machine.segment, WARNING,
          f'images of {image / 1024:.0f} kB, of which some may be lost',
-         'export FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml for every node'),
+         ' and '.join(f'{name}=.../config/fastdds.xml' for name in PROFILE_VARIABLES)
+         + ' for every node'),
         (True, OK, f'images of {image / 1024:.0f} kB', ''))
 
 
@@ -106,7 +108,7 @@ def dead_segments(folder: Path = Path('/dev/shm')) -> list[Path]:
     A process locks the file ``NAME_el`` beside each of its segments, and removes both at its end.
     """
     dead = []
-    for path in folder.glob('fastrtps_*_el'):
+    for path in (path for prefix in SEGMENT_PREFIXES for path in folder.glob(f'{prefix}*_el')):
         with contextlib.suppress(OSError), open(path, 'rb') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if time.time() - path.stat().st_mtime > YOUNG:

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
@@ -25,12 +25,12 @@ from flock_follower.checks.findings import (
     ERROR,
     Finding,
     first,
-    judged,
     OK,
     UNMEASURED,
     WARNING,
 )
 from flock_follower.checks.observations import Observations, OURS, TopicSeen
+from flock_follower.checks.reach import Reach
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
@@ -189,10 +189,21 @@ def _publishers(seen: Observations) -> Iterator[Finding]:
         if len(nodes) > 1:
             yield Finding(ERROR, name, f'{len(nodes)} publishers on {seen.names[name]}: '
                           f'{", ".join(nodes)}', 'one', 'end all but one, or remap them')
-    nodes = seen.machine.open_nodes
-    yield judged(False, bool(nodes), 'network', 'any computer on it can command: '
-                 f'{", ".join(nodes)} started without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'
-                 if nodes else
-                 'ROS stays on this computer, or with named peers',
-                 'the network does not reach the nodes',
-                 'start every node with it, see docs/deploy.md')
+    yield _check_network(seen.machine.reach)
+
+
+def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
+    """Check that our nodes are reached from this computer alone."""
+    found, addressed, unknown = (
+        ', '.join(sorted({node for node, its in reach if its is wanted}))
+        for wanted in (Reach.NETWORK, Reach.ADDRESS, None))
+    return first(
+        'network', 'the network does not reach the nodes',
+        (found, WARNING, f'any computer on it can command: it finds {found}',
+         'start every node with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST and config/fastdds.xml, '
+         'see docs/deploy.md'),
+        (addressed, WARNING, 'a computer that names the address of this one as a peer can '
+         f'command: it reaches {addressed}', 'start every node with config/fastdds.xml; a flock '
+         'with peers needs a firewall: see docs/deploy.md'),
+        (unknown, UNMEASURED, f'no socket of DDS is seen in {unknown}', ''),
+        (True, OK, 'ROS stays on this computer', ''))

@@ -76,7 +76,7 @@ from flock_follower.nodes.support.inputs import (
     LATCHED_QOS,
     OwnOdometry,
 )
-from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
+from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.spec import filled
@@ -160,7 +160,7 @@ class MavlinkBridge(FlockNode):
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
-        if shares_memory():
+        if shared_memory_size():
             self.get_logger().warning(
                 'Fast DDS shares memory with other processes here: connecting to one can '
                 'stop the setpoints for up to 1 s; config/fastdds_udp.xml prevents that')

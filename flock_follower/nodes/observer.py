@@ -38,6 +38,7 @@ from rosgraph_msgs.msg import Clock
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LoadMeter, PERIOD
+from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import (
     COMPRESSED,
@@ -55,11 +56,7 @@ from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
-from flock_follower.nodes.support.middleware import (
-    open_to_network,
-    segment_size,
-    shares_memory,
-)
+from flock_follower.nodes.support.middleware import shared_memory_size
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.reader import read_odometry
@@ -222,17 +219,17 @@ def _machine(load: Load | None) -> Machine:
         room = os.statvfs('/dev/shm')
         free = room.f_bavail * room.f_frsize / 1e6
     return Machine(
-        load, free, shares_memory(), segment_size(os.environ),
-        os.environ.get('ROS_DOMAIN_ID', '0'), _open_nodes(),
+        load, free, shared_memory_size(), os.environ.get('ROS_DOMAIN_ID', '0'), _find_reach(),
         len(dead_segments()))
 
 
-def _open_nodes() -> list[str]:
-    """Return our nodes on this computer that the network reaches; if none is known, for check."""
+def _find_reach() -> list[tuple[str, Reach | None]]:
+    """Return from where our nodes on this computer are reached; if it sees none, ``check``."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    found = {node: environment for _, node, environment in processes()
-             if environment.get('ROS_DOMAIN_ID', '0') == domain} or {'check': dict(os.environ)}
-    return sorted(node for node, environment in found.items() if open_to_network(environment))
+    ours = [(node, process) for process, node, environment in processes()
+            if environment.get('ROS_DOMAIN_ID', '0') == domain]
+    return [(node, find_reach(process, int(domain)))
+            for node, process in ours or [('check', os.getpid())]]
 
 
 def observe(seconds: float, namespace: str, remaps: dict[str, str], camera: str

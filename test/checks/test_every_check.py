@@ -41,6 +41,7 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.processor import Load
+from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
 from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import TYPES
@@ -311,9 +312,16 @@ FAULTS: list[Fault] = [
     Fault('two planners', LIVE, ERROR, 'command/trajectory',
           '2 publishers on /command/trajectory: /joystick, /planner', 'end all but one',
           publisher('command/trajectory', '/joystick')),
-    Fault('ROS open to the network', LIVE, WARNING, 'network', 'mavlink_bridge, planner started '
-          'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'docs/deploy.md',
-          machine(open_nodes=['mavlink_bridge', 'planner'])),
+    Fault('ROS open to the network', LIVE, WARNING, 'network',
+          'it finds mavlink_bridge, planner', 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
+          machine(reach=[('planner', Reach.NETWORK), ('mavlink_bridge', Reach.NETWORK),
+                         ('relative_pose', Reach.ADDRESS)])),
+    Fault('ROS open to those that know the address', LIVE, WARNING, 'network',
+          'it reaches relative_pose', 'config/fastdds.xml',
+          machine(reach=[('planner', Reach.COMPUTER), ('relative_pose', Reach.ADDRESS),
+                         ('mavlink_bridge', None)])),
+    Fault('ROS by other means', LIVE, UNMEASURED, 'network', 'seen in planner', '',
+          machine(reach=[('mavlink_bridge', Reach.COMPUTER), ('planner', None)])),
     Fault('two odometries', LIVE, ERROR, 'odom', '2 publishers on /odom', 'end all but one',
           publisher('odom', '/wheels')),
     Fault('odometry read differently', LIVE, ERROR, 'odom_child_rpy',
@@ -462,14 +470,16 @@ def test_an_image_without_an_encoding_is_a_fault() -> None:
 
 
 def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:
-    free, locked, young = (tmp_path / f'fastrtps_{name}_el' for name in ('a', 'b', 'c'))
-    for path in (free, locked, young):
+    free, locked, young, other = (
+        tmp_path / f'{name}_el' for name in ('fastrtps_a', 'fastrtps_b', 'fastrtps_c', 'other'))
+    kilted = tmp_path / 'fastdds_a_el'
+    for path in (free, locked, young, other, kilted):
         path.touch()
         if path is not young:
             os.utime(path, (1.0, 1.0))
     with open(locked, 'rb') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert dead_segments(tmp_path) == [free]
+        assert sorted(dead_segments(tmp_path)) == [kilted, free]
 
 
 def test_an_empty_graph_is_one_line() -> None:

@@ -31,6 +31,7 @@ import sys
 import pytest
 
 from flock_desk.runs.processes import wait_until
+from flock_follower.checks.reach import find_reach, Reach
 
 ROOT = Path(__file__).resolve().parents[2]
 ADDRESSES = {'drone': '10.213.7.1', 'laptop': '10.213.7.2'}
@@ -61,6 +62,7 @@ class Machines:
         self.folder = folder
         self.names = {name: f'{name}{os.getpid()}' for name in ADDRESSES}
         self.running: list[subprocess.Popen[str]] = []
+        self.followers: dict[str, subprocess.Popen[str]] = {}
 
     def connect(self) -> None:
         """Make the machines, and lay the cable."""
@@ -97,8 +99,13 @@ class Machines:
         return (self.folder / log).read_text()
 
     def follower(self, which: str, environment: dict[str, str]) -> None:
-        self.start('drone', which, {**environment, 'ROS_DOMAIN_ID': DOMAINS[which]},
-                   'flock_follower.nodes.planner')
+        self.followers[which] = self.start(
+            'drone', which, {**environment, 'ROS_DOMAIN_ID': DOMAINS[which]},
+            'flock_follower.nodes.planner')
+
+    def reach(self, which: str) -> Reach | None:
+        """Return from where the follower is reached, as ``check`` finds it."""
+        return find_reach(self.followers[which].pid, int(DOMAINS[which]))
 
     def engage(self, machine: str, which: str, environment: dict[str, str],
                log: str) -> subprocess.Popen[str]:
@@ -130,6 +137,7 @@ def test_an_engage_from_another_machine_arrives_only_where_ros_is_left_open(
     machines.follower('closed', CLOSED)
     machines.follower('open', OPEN)
     wait_until(lambda: all('IDLE' in machines.reported(which) for which in DOMAINS), 20.0, 'both')
+    assert machines.reach('closed') == Reach.COMPUTER and machines.reach('open') == Reach.NETWORK
     # Discovery between two machines now and then takes longer than a call waits: once more, then.
     wait_until(
         lambda: machines.engage('laptop', 'open', OPEN, 'into the open one').wait(20.0) == 0,

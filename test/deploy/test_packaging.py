@@ -91,7 +91,7 @@ def test_what_package_xml_asks_for_is_in_the_extra_and_not_required(
         if key in ON_PYPI:
             assert ON_PYPI[key] in extra
     # The same ROS as the suite runs with.
-    locked = (ROOT / 'requirements' / 'requirements.in').read_text().splitlines()
+    locked = (ROOT / 'requirements' / 'jazzy.in').read_text().splitlines()
     for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'):
         assert extra[name] in locked
 

@@ -22,6 +22,8 @@ import subprocess
 
 import pytest
 
+from flock_follower.fast_dds import PROFILE_VARIABLES
+
 DEPLOY = Path(__file__).resolve().parents[2] / 'deploy'
 
 
@@ -38,7 +40,7 @@ def workspace(tmp_path: Path) -> Path:
     (tmp_path / 'install' / 'setup.bash').write_text(f'export PATH={tmp_path}:$PATH\n')
     (tmp_path / 'ros2').write_text(
         f'#!/bin/sh\n[ "$1" = pkg ] && echo {tmp_path} && exit\nprintf "%s\\n" "$@"\n'
-        '[ -z "$FASTRTPS_DEFAULT_PROFILES_FILE" ] || echo "$FASTRTPS_DEFAULT_PROFILES_FILE"\n')
+        'echo "$FASTDDS_DEFAULT_PROFILES_FILE"\necho "$FASTRTPS_DEFAULT_PROFILES_FILE"\n')
     (tmp_path / 'ros2').chmod(0o755)
     return tmp_path
 
@@ -49,17 +51,20 @@ def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: 
         "bridge_prefix:='taskset -c 3'"))
     assert ended.stdout.splitlines() == [
         'launch', 'flock_follower', 'camera.launch.py', 'recipe:=t265', 'odom:=/vio/odom',
-        'camera_rpy:=[0.0, 0.2, 0.0]', 'bridge_prefix:=taskset -c 3'], ended.stderr
+        'camera_rpy:=[0.0, 0.2, 0.0]', 'bridge_prefix:=taskset -c 3', '', ''], ended.stderr
 
 
 def test_without_peers_ros_keeps_to_the_loopback(workspace: Path) -> None:
     profile = workspace / 'config' / 'fastdds.xml'
     profile.parent.mkdir()
     profile.touch()
-    assert start(workspace).stdout.splitlines()[-1] == str(profile)
-    mine = start(workspace, FASTRTPS_DEFAULT_PROFILES_FILE='/mine.xml')
-    assert mine.stdout.splitlines()[-1] == '/mine.xml'
-    assert str(profile) not in start(workspace, ROS_STATIC_PEERS='10.0.0.2').stdout
+    kilted, jazzy = PROFILE_VARIABLES
+    for variables, profiles in (
+            ({}, [str(profile)] * 2), ({jazzy: '/mine.xml'}, ['/mine.xml'] * 2),
+            ({kilted: '/mine.xml'}, ['/mine.xml'] * 2),
+            ({kilted: '/mine.xml', jazzy: '/old.xml'}, ['/mine.xml', '/old.xml']),
+            ({'ROS_STATIC_PEERS': '10.0.0.2'}, ['', ''])):
+        assert start(workspace, **variables).stdout.splitlines()[-2:] == profiles
 
 
 def test_a_workspace_that_is_not_built_is_named_with_the_file_that_says_so(tmp_path: Path) -> None:

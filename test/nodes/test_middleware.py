@@ -21,33 +21,35 @@ from unittest import mock
 
 import pytest
 
+from flock_follower.checks.reach import Reach
+from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
 from flock_follower.files import resource
 from flock_follower.nodes import mavlink_bridge, planner
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
     avoid_shared_memory_for_images,
-    DEFAULT_SEGMENT,
     IMAGES_BUFFER,
-    open_to_network,
-    segment_size,
 )
 
-PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+KILTED, JAZZY = PROFILE_VARIABLES
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-UDP_IMAGES, IMAGES = (str(resource(f'config/{name}')) for name in (
-    'fastdds_udp_images.xml', 'fastdds_images.xml'))
-OWN, UDP = (str(resource(f'config/{name}')) for name in ('fastdds.xml', 'fastdds_udp.xml'))
+OWN, UDP, UDP_IMAGES, IMAGES = (profile_variables(f'config/{name}.xml') for name in (
+    'fastdds', 'fastdds_udp', 'fastdds_udp_images', 'fastdds_images'))
+NO_PROFILE = dict.fromkeys(PROFILE_VARIABLES)
+#: Of the user; whichever variable he sets is the one that his distribution reads.
+JAZZYS, KILTEDS = ({name: '/of/the/user.xml'} for name in (JAZZY, KILTED))
 LOOK = """
 import os
 import sys
-from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
+from flock_follower.checks.reach import find_reach
+from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
 if sys.argv[1] == 'avoid':
     avoid_shared_memory(os.environ)
 import rclpy
 rclpy.init()
 node = rclpy.create_node('looks')
-print(shares_memory())
+print(shared_memory_size() // 1024, find_reach(os.getpid(), int(os.environ['ROS_DOMAIN_ID'])))
 node.destroy_node()
 rclpy.shutdown()
 """
@@ -56,17 +58,18 @@ rclpy.shutdown()
 @pytest.mark.parametrize(('given', 'changed'), [
     ({}, {TRANSPORTS: 'UDPv4'}),
     ({RANGE: 'SUBNET', 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'}, {TRANSPORTS: 'UDPv4'}),
-    ({RANGE: 'localhost'}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
+    ({RANGE: 'localhost'}, {RANGE: 'SYSTEM_DEFAULT', **UDP}),
     ({'ROS_LOCALHOST_ONLY': '1'},
-     {'ROS_LOCALHOST_ONLY': None, RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
-    ({RANGE: 'LOCALHOST', PROFILE: OWN}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
-    ({PROFILE: OWN}, {PROFILE: UDP}),
+     {'ROS_LOCALHOST_ONLY': None, RANGE: 'SYSTEM_DEFAULT', **UDP}),
+    ({RANGE: 'LOCALHOST', **OWN}, {RANGE: 'SYSTEM_DEFAULT', **UDP}),
+    (OWN, UDP), ({JAZZY: OWN[JAZZY]}, UDP), ({KILTED: OWN[KILTED]}, UDP),
     ({RANGE: 'LOCALHOST', TRANSPORTS: 'LARGE_DATA'}, {}),
     ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, {}),
     ({'ROS_STATIC_PEERS': '10.0.0.2'}, {TRANSPORTS: 'UDPv4'}),
-    ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'}),
-    ({PROFILE: '/of/the/user.xml', RANGE: 'LOCALHOST'}, {}),
-    ({PROFILE: str(resource('config/follower.yaml')), RANGE: 'LOCALHOST'}, {}),
+    (JAZZYS, {TRANSPORTS: 'UDPv4'}), (KILTEDS, {TRANSPORTS: 'UDPv4'}),
+    ({**JAZZYS, RANGE: 'LOCALHOST'}, {}), ({**KILTEDS, RANGE: 'LOCALHOST'}, {}),
+    ({**OWN, **KILTEDS, RANGE: 'LOCALHOST'}, {}),
+    ({JAZZY: str(resource('config/follower.yaml')), RANGE: 'LOCALHOST'}, {}),
     ({'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', RANGE: 'LOCALHOST'}, {})])
 def test_only_what_the_user_left_open_is_set(given, changed):
     environment = dict(given)
@@ -76,9 +79,9 @@ def test_only_what_the_user_left_open_is_set(given, changed):
 
 
 @pytest.mark.parametrize(('given', 'changed'), [
-    ({}, {TRANSPORTS: 'UDPv4', PROFILE: IMAGES}),
-    ({RANGE: 'LOCALHOST'}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP_IMAGES}),
-    ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'})])
+    ({}, {TRANSPORTS: 'UDPv4', **IMAGES}),
+    ({RANGE: 'LOCALHOST'}, {RANGE: 'SYSTEM_DEFAULT', **UDP_IMAGES}),
+    (JAZZYS, {TRANSPORTS: 'UDPv4'}), (KILTEDS, {TRANSPORTS: 'UDPv4'})])
 def test_images_come_without_where_the_kernel_has_room_for_them(given, changed):
     environment = dict(given)
     assert not avoid_shared_memory_for_images(environment, 212_992)
@@ -87,44 +90,29 @@ def test_images_come_without_where_the_kernel_has_room_for_them(given, changed):
     assert environment == {**given, **changed}
 
 
-@pytest.mark.parametrize(('avoid', 'range_', 'shares'), [
-    ('avoid', 'LOCALHOST', False), ('avoid', 'OFF', False), ('no', 'LOCALHOST', True)])
-def test_fast_dds_opens_no_shared_memory(avoid, range_, shares):
+@pytest.mark.parametrize(('avoid', 'changed', 'found'), [
+    ('avoid', {}, (0, Reach.COMPUTER)),
+    ('no', {}, (16 * 1024, Reach.COMPUTER)),
+    ('no', NO_PROFILE, (512, Reach.ADDRESS)),
+    ('no', {**NO_PROFILE, 'ROS_STATIC_PEERS': '127.0.0.1'},
+     (512, Reach.ADDRESS)),
+    # OFF: as for the whole subnet, without being heard there.
+    ('avoid', {**NO_PROFILE, RANGE: 'OFF'}, (0, Reach.ADDRESS))])
+def test_the_shared_memory_and_the_reach_of_a_process_are_found(avoid, changed, found):
     # Another test of this worker may have set the transport.
-    environment = {**os.environ, RANGE: range_, PROFILE: OWN}
-    environment.pop(TRANSPORTS, None)
-    if range_ == 'OFF':  # as for the whole subnet, without being heard there
-        del environment[PROFILE]
-    looked = subprocess.run([sys.executable, '-c', LOOK, avoid], env=environment, text=True,
-                            capture_output=True, timeout=30.0)
-    assert looked.stdout == f'{shares}\n', looked.stderr
+    environment = {**os.environ, RANGE: 'LOCALHOST', **profile_variables('config/fastdds.xml'),
+                   TRANSPORTS: None, **changed}
+    looked = subprocess.run(
+        [sys.executable, '-c', LOOK, avoid], text=True, capture_output=True, timeout=30.0,
+        env={name: value for name, value in environment.items() if value is not None})
+    assert looked.stdout == f'{found[0]} {found[1]}\n', looked.stderr
 
 
 @pytest.mark.parametrize('module', [mavlink_bridge, planner])
 def test_the_bridge_and_the_planner_run_without(module, monkeypatch):
-    profiles = []
+    seen = {}
     monkeypatch.setattr(module, 'never_block_output', list, raising=False)
-    monkeypatch.setattr(module, 'run', lambda *_: profiles.append(os.environ[PROFILE]))
-    with mock.patch.dict(os.environ, {PROFILE: OWN}):
+    monkeypatch.setattr(module, 'run', lambda *_: seen.update(os.environ))
+    with mock.patch.dict(os.environ, OWN):
         module.main([])
-    assert profiles == [UDP]
-
-
-@pytest.mark.parametrize(('given', 'found'), [
-    ({}, True), ({RANGE: 'SUBNET'}, True), ({RANGE: 'SYSTEM_DEFAULT'}, True),
-    ({'ROS_STATIC_PEERS': '10.0.0.2'}, True),
-    ({RANGE: 'SUBNET', PROFILE: '/of/the/user.xml'}, True),
-    ({PROFILE: OWN, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}, True),
-    ({'ROS_LOCALHOST_ONLY': '0'}, True),
-    ({RANGE: 'LOCALHOST'}, False), ({RANGE: 'localhost'}, False), ({RANGE: 'OFF'}, False),
-    ({'ROS_LOCALHOST_ONLY': '1'}, False), ({PROFILE: OWN}, False),
-    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, False),
-    ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, False)])
-def test_how_far_ros_reaches(given, found):
-    assert open_to_network(given) == found
-
-
-def test_the_size_of_the_shared_memory_is_that_of_the_profile(tmp_path):
-    assert segment_size({PROFILE: OWN}) == 16 * 1024 * 1024
-    assert segment_size({PROFILE: UDP}) == segment_size({}) == DEFAULT_SEGMENT == 512 * 1024
-    assert segment_size({PROFILE: str(tmp_path / 'none.xml')}) == DEFAULT_SEGMENT
+    assert seen.items() >= UDP.items()

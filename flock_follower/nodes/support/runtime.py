@@ -344,7 +344,11 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         except RuntimeError as error:  # malformed --ros-args
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
-        on_signal(rclpy.get_default_context().try_shutdown)
+        context = rclpy.get_default_context()
+        # From Kilted on a shutdown destroys the tracked nodes: in the handler of a signal, while
+        # the same thread may hold their locks, and nodes whose constructor raised. `run` does it.
+        context.track_node = lambda node: None
+        on_signal(context.try_shutdown)
         FlockNode.parameter_files = files_in(arguments)
         try:
             node = factory()
