@@ -35,6 +35,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Machine, Observations, OURS
 from flock_follower.checks.processor import BUSY
+from flock_follower.checks.shared_memory import UNDELIVERED
 from flock_follower.checks.topic_names import full_name
 
 STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
@@ -58,6 +59,8 @@ ADVICE: Final[Mapping[str, str]] = {
     'no autopilot': 'check cable, connection and baud rate; is the autopilot on?',
     'autopilot lost': 'check cable and power of the autopilot',
     'no publisher': 'start its publisher, or connect its name (above)',
+    UNDELIVERED: 'run publisher and nodes as one user with one /dev/shm; restart the nodes whose '
+                 'shared memory was removed (docs/deploy.md)',
     'none sending': 'look at the log of its publisher',
     'not in sight': 'hold the leader before the camera',
     'QoS mismatch': 'change the QoS of the publisher',
