@@ -402,3 +402,13 @@ def test_the_timestamps_of_signatures_follow_a_clock_that_is_set_after_the_start
         bench = make_bench(signing_key_file=str(tmp_path / 'key'))
         assert bench.bridge.link.signing.state.timestamp < 1e6
     bench.wait(lambda: bench.bridge.link.signing.state.timestamp > 3e13)  # 10 years of 10 us
+
+
+def test_a_line_that_cannot_send_is_named_while_the_autopilot_is_received(make_bench):
+    bench = make_bench()
+    bench.beat()
+    bench.wait(lambda: bench.bridge.alive(time.monotonic()))
+    bench.bridge.link.transport.write = lambda _: False
+    bench.bridge.link.transport.fault = 'Network is unreachable (ENETUNREACH)'
+    assert bench.values['link fault'] == 'Network is unreachable (ENETUNREACH)'
+    assert 'cannot send on udpin:127.0.0.1:0: Network is unreachable' in bench.problems()
