@@ -16,8 +16,9 @@
 Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
 An argument left empty leaves its parameter as the parameter files have it. A file that is missing
-and a value that no node takes end the launch; a node that ends later is started again. camera.launch.py includes it with the topics and the mounting of a known camera and
-odometry (docs/sensors.md).
+and a value that no node takes end the launch; a node that ends later is started again.
+camera.launch.py includes it with the topics and the mounting of a known camera and odometry
+(docs/sensors.md).
 """
 
 import sys
