@@ -47,6 +47,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from flock_follower.files import read_text
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
@@ -339,6 +340,12 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
                       if argument.startswith('-') or ':=' in argument), ''):
         print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
               file=sys.stderr)
+        return 1
+    try:  # rclpy names neither the cause nor, for a folder, the file
+        for path in files_in(arguments):
+            read_text(path)
+    except (OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
         return 1
     node: Node | None = None
     code: int | None = 0
