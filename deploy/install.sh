@@ -6,7 +6,7 @@ usage() {
   cat <<'END'
 usage: deploy/install.sh [--dry-run] [--undo] [--user USER] [--name NAME] [--workspace FOLDER] [--root FOLDER]
 
-Installs flock_follower@.service, its programs, the udev rule of the flight controller, a kernel setting, and
+Installs flock_follower@.service, its programs, the udev rule of the flight controller, a kernel setting, a setting of logins, and
 /etc/flock_follower/NAME.env, which belongs to you: it is never overwritten. Starts and enables nothing. Run it again after an update.
 
   --dry-run           print the actions, change nothing
@@ -42,6 +42,7 @@ root=${root%/}
 unit=$root/etc/systemd/system/flock_follower@.service
 rule=$root/etc/udev/rules.d/61-flight-controller.rules
 kernel=$root/etc/sysctl.d/05-flock_follower.conf
+logins=$root/etc/systemd/logind.conf.d/05-flock_follower.conf
 programs=$root/usr/local/lib/flock_follower
 settings=$root/etc/flock_follower
 
@@ -66,10 +67,12 @@ put() {
   [ -n "$dry" ] || printf '%s\n' "$2" | install -D -m "$1" /dev/stdin "$3"
 }
 
-# Makes systemd and udev read the new files; not below another root.
+# Makes systemd, logind and udev read the new files; not below another root.
 reload() {
   [ -z "$root" ] || return 0
   try systemctl daemon-reload
+  # It reads its settings again, and ends no login.
+  try systemctl kill --signal=HUP systemd-logind
   try udevadm control --reload
   try udevadm trigger --subsystem-match=tty --subsystem-match=usb
 }
@@ -89,6 +92,7 @@ install_all() {
   put 755 "$(cat "$here/prefer_realtime")" "$programs/prefer_realtime"
   put 644 "$(cat "$here/61-flight-controller.rules")" "$rule"
   put 644 "$(cat "$here/05-flock_follower.conf")" "$kernel"
+  put 644 "$(cat "$here/logind.conf")" "$logins"
   # Its number is low, so a larger value set by another file (Cyclone DDS) wins.
   if [ -z "$root" ] && [ "$(sysctl -n net.core.rmem_max)" -lt 4194304 ]; then try sysctl --quiet --load "$kernel"; fi
   if [ -e "$settings/$name.env" ]; then
@@ -118,7 +122,7 @@ undo_all() {
       echo "  yours, unchanged: $file"
     fi
   done
-  for file in "$unit" "$rule" "$kernel" "$programs"/start "$programs"/prefer_realtime "$programs"/*.env; do
+  for file in "$unit" "$rule" "$kernel" "$logins" "$programs"/start "$programs"/prefer_realtime "$programs"/*.env; do
     if [ -e "$file" ]; then act rm "$file"; fi
   done
   for folder in "$programs" "$settings"; do

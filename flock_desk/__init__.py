@@ -18,3 +18,5 @@ The desk: simulators and commands that prove the follower before it flies.
 It imports ``flock_follower``, which never imports the desk. Modules beside the folders are the
 commands (``python -m flock_desk.NAME``), the embedded autopilot and two nodes.
 """
+
+from flock_follower import signals  # noqa: F401  # first: Ctrl-C during the other imports

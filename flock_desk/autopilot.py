@@ -41,6 +41,7 @@ from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
+from flock_follower.signals import ending
 
 
 def parser() -> argparse.ArgumentParser:
@@ -71,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the embedded autopilot until SIGINT or SIGTERM; return the exit code."""
+    """Run the embedded autopilot until a signal ends it; return the exit code."""
     return guarded(partial(_fly, parser().parse_args(args)))
 
 
@@ -84,12 +85,12 @@ def _fly(options: argparse.Namespace) -> int:
 
 def serve(log: str, autopilot: EmbeddedAutopilot, ends: Sequence[Endpoint]) -> None:
     """
-    Fly in real time until SIGINT or SIGTERM; write the log to a file, if one is named.
+    Fly in real time until a signal ends it; write the log to a file, if one is named.
 
     :param ends: the links; the first is that of ``autopilot``.
     """
     stop: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending():
         signal.signal(number, lambda number, _: stop.append(number))
     while not stop:
         ends[0].receive(autopilot.next_step - time.monotonic())

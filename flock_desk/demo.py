@@ -32,7 +32,7 @@ import time
 
 import numpy as np
 
-from flock_desk.runs.console import guarded
+from flock_desk.runs.console import guarded, logs_in
 from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import COUNTED, RECORDED, start
 from flock_desk.runs.plots import chapters
@@ -75,7 +75,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default='build/demo',
                         help='folder for report and logs (%(default)s)')
     out = parser.parse_args(args).output
-    return guarded(partial(_demonstrate, out), hint=f'; the logs of every process are in {out}')
+    return guarded(partial(_demonstrate, out), hint=partial(logs_in, out))
 
 
 def _demonstrate(out: Path) -> int:

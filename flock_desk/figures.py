@@ -64,7 +64,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Draw the figures and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='figures', description='Redraw the figures of the paper, or one larger flock.')
-    parser.add_argument('--out', type=Path, default='build/figures', help='%(default)s')
+    parser.add_argument('--output', '--out', type=Path, default='build/figures',
+                        help='folder of the pictures (default: %(default)s)')
     parser.add_argument('--campaign', type=Path, default='build/flights/flights.json',
                         metavar='FILE', help='results of flights; %(default)s')
     parser.add_argument('--agents', type=int, metavar='N',
@@ -76,12 +77,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _draw(options: argparse.Namespace) -> int:
-    options.out.mkdir(parents=True, exist_ok=True)
+    options.output.mkdir(parents=True, exist_ok=True)
     if options.agents is not None:
-        written = one_flock(options.out, options.agents, options.dim, options.seed)
+        written = one_flock(options.output, options.agents, options.dim, options.seed)
     else:
-        written = [*redraw(options.out), *redraw_controllers(options.out, options.campaign)]
-    print(f'written to {options.out}: {", ".join(written)}')
+        written = [*redraw(options.output), *redraw_controllers(options.output, options.campaign)]
+    print(f'written to {options.output}: {", ".join(written)}')
     return 0
 
 

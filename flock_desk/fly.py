@@ -43,7 +43,7 @@ from typing import Any
 import numpy as np
 
 from flock_desk.closed_loop.real_time_flight import SKIPPED
-from flock_desk.runs.console import guarded, within
+from flock_desk.runs.console import guarded, logs_in, within
 from flock_desk.runs.figure_table import bounds, LATE
 from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
 from flock_desk.runs.judge import FigureBound
@@ -113,8 +113,7 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error('--followers: not with --autopilot')
     if options.moving and options.followers > 1:
         parser.error('--moving: not with --followers')
-    return guarded(partial(_fly, options),
-                   hint=f'; the logs of every process are in {options.output}')
+    return guarded(partial(_fly, options), hint=partial(logs_in, options.output))
 
 
 def _fly(options: argparse.Namespace) -> int:

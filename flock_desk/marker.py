@@ -48,6 +48,7 @@ from flock_follower.perception.markers import draw_marker, marker_cells, SIDE_LE
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}
 #: Sides of a panel, m: the first is seen from 1 to 8 m, the second from 0.3 to 2 m (640x480,
 #: 611 px).
+SIZE = 0.16  # m, side of the marker of config/neighbors.yaml
 SIZES = (0.3, 0.06)
 # White around the black border is a cell wide, and no less than this share of the side: OpenCV 4.6
 # drops a square with another, here the paper's edge, within 0.05 of its perimeter.
@@ -96,13 +97,13 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='marker', description='Draw ArUco markers to scale, ready to print.')
     parser.add_argument('--id', type=int, nargs='+', default=[], metavar='N',
-                        help='of the marker; several make several pages')
+                        help='of the marker (0); several make several pages')
     parser.add_argument('--panel', action='store_true',
                         help='all markers on one page, for one leader: seen from far by the large '
                         'one, from near by the small (sizes 0.3 0.06, ids 0 1)')
     parser.add_argument('--dictionary', default='DICT_4X4_50', help='one of OpenCV; %(default)s')
     parser.add_argument('--size', type=float, nargs='+', default=[], metavar='M',
-                        help='side of the black square, m; of a panel one for each id')
+                        help='side of the black square, m (0.16); of a panel one for each id')
     parser.add_argument('--output', type=pathlib.Path, default='marker.pdf', metavar='FILE',
                         help='.pdf; %(default)s')
     return guarded(partial(_write, parser.parse_args(args)), refused=2)
@@ -111,10 +112,9 @@ def main(args: Sequence[str] | None = None) -> int:
 def _write(options: argparse.Namespace) -> int:
     """Write the file and print the neighbours file."""
     ids, sizes = options.id, options.size
-    if options.panel:
-        sizes = sizes or [*SIZES]
-        ids = ids or [*range(len(sizes))]
-    if not ids or len(set(ids)) < len(ids):
+    sizes = sizes or ([*SIZES] if options.panel else [SIZE])
+    ids = ids or [*range(len(sizes))]
+    if len(set(ids)) < len(ids):
         raise ValueError(f'--id = {ids}: must name each marker once')
     if len(sizes) != (len(ids) if options.panel else 1):
         raise ValueError(f'--size = {sizes}: must be one side, of a panel one for each of {ids}')

@@ -266,7 +266,8 @@ def main(args: Sequence[str] | None = None) -> int:
         epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items()))
     parser.add_argument('--variant', nargs='+', choices=[*VARIANTS, 'all'], default=['sample'],
                         metavar='NAME', help=f'{", ".join(VARIANTS)} or all (default: sample)')
-    parser.add_argument('--out', type=Path, help='folder that will hold the bags (default: bags '
+    parser.add_argument('--output', '--out', type=Path,
+                        help='folder that will hold the bags (default: bags '
                         'for sample, build/bags for the others)')
     parser.add_argument('--seed', type=int, default=1, help='of all that is random (%(default)s)')
     parser.add_argument('--jobs', type=within(Range(1, whole=True)), default=os.cpu_count() or 1,
@@ -275,7 +276,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     def render() -> int:
         for name in VARIANTS if 'all' in options.variant else options.variant:
-            folder = options.out or repository / ('bags' if name == 'sample' else 'build/bags')
+            folder = options.output or repository / ('bags' if name == 'sample' else 'build/bags')
             write(VARIANTS[name], options.seed, folder / name, options.jobs)
         return 0
     return guarded(render)

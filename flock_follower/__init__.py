@@ -19,4 +19,6 @@ This package is all that flies. ``flock_desk`` simulates it. ``test/test_rooms.p
 folder may import.
 """
 
+from flock_follower import signals  # noqa: F401  # first: Ctrl-C during the other imports
+
 __version__ = '0.1.0'

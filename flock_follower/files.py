@@ -45,6 +45,19 @@ def resource(relative: str) -> Path:
     raise FileNotFoundError(f'{relative} is not installed: looked for {places}')
 
 
+def read_text(path: str | Path) -> str:
+    """
+    Return the text of a file.
+
+    :raises OSError: naming the file, also if the disk fails while it is read.
+    :raises ValueError: if it is not UTF-8.
+    """
+    try:
+        return Path(path).read_text(encoding='utf-8')
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     """

@@ -15,9 +15,10 @@
 """
 Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
-An argument left empty leaves its parameter as the parameter files have it. A node that ends is
-started again. camera.launch.py includes it with the topics and the mounting of a known camera and
-odometry (docs/sensors.md).
+An argument left empty leaves its parameter as the parameter files have it. A file that is missing
+and a value that no node takes end the launch; a node that ends later is started again.
+camera.launch.py includes it with the topics and the mounting of a known camera and odometry
+(docs/sensors.md).
 """
 
 import sys
@@ -30,6 +31,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
 
+from flock_follower.parameters.files import refuse_start
 from flock_follower.parameters.spec import END_WITH_LAUNCH, refuse_arguments
 
 ARGUMENTS = {
@@ -96,15 +98,17 @@ def yes(values: dict[str, str], name: str) -> bool:
 def start(context: LaunchContext) -> list[Node]:
     """Return the nodes as the arguments say."""
     values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    started = []
+    started, given = [], {}
+    own, neighbors = (f'{values["config"]}/{name}.yaml' for name in ('follower', 'neighbors'))
     for node, names in PARAMETERS.items():
         if node in BY_CHOICE and not yes(values, BY_CHOICE[node]):
             continue
         parameters = {name: value(name, values[name]) for name in names if values[name]}
         parameters['use_sim_time'] = yes(values, 'use_sim_time')
         if node in ('relative_pose', 'planner'):
-            parameters['neighbors_file'] = f'{values["config"]}/neighbors.yaml'
-        files = [] if node in BY_CHOICE else [f'{values["config"]}/follower.yaml']
+            parameters['neighbors_file'] = neighbors
+        given[node] = parameters
+        files = [] if node in BY_CHOICE else [own]
         if values['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
             files.append(values['cameras'])
         prefix = values['bridge_prefix'] if node == 'mavlink_bridge' else ''
@@ -116,6 +120,8 @@ def start(context: LaunchContext) -> list[Node]:
             remappings=[('image_raw', values['image']),
                         ('image_raw/compressed', f'{values["image"]}/compressed'),
                         ('camera_info', values['camera_info']), ('odom', values['odom'])]))
+    # launch_ros skips a parameter file that is missing: the defaults would fly.
+    refuse_start([own, *filter(None, [values['cameras']])], given, neighbors)
     return started
 
 

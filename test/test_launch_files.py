@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+import re
 import runpy
 import sys
 from typing import Any
@@ -113,15 +115,55 @@ def test_a_column_gives_out_namespaces_ids_and_ports() -> None:
             column(followers=followers)
 
 
-def test_an_argument_left_empty_leaves_its_parameter_to_the_files() -> None:
-    nodes, _ = launched(FOLLOWER, config='/mine', cameras='/mine/two.yaml')
-    own, two = '/mine/follower.yaml', '/mine/two.yaml'
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """Return a copy of the folder of parameters, with the file of two cameras."""
+    for name in ('follower.yaml', 'neighbors.yaml', 'two_cameras.yaml'):
+        (tmp_path / name).write_text((LAUNCH.parent / 'config' / name).read_text())
+    return tmp_path
+
+
+@pytest.mark.parametrize('name', ['follower.yaml', 'neighbors.yaml', 'two_cameras.yaml'])
+@pytest.mark.parametrize('fault', ['missing', 'unreadable', 'a folder', 'no YAML'])
+def test_a_parameter_file_is_refused_by_name_never_replaced_by_defaults(
+        config: Path, name: str, fault: str) -> None:
+    path = config / name
+    arguments = {'config': str(config), 'cameras': str(config / 'two_cameras.yaml')}
+    launched(FOLLOWER, **arguments)
+    path.unlink()
+    if fault == 'unreadable':
+        path.symlink_to('/proc/self/mem')
+    elif fault == 'a folder':
+        path.mkdir()
+    elif fault == 'no YAML':
+        path.write_text('{')
+    with pytest.raises((OSError, ValueError)) as error:
+        launched(FOLLOWER, **arguments)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(('argument', 'text', 'said'), [
+    ('connection', 'udp:nowhere', "connection = 'udp:nowhere': must be udpin:"),
+    ('connection', '/dev/ttyACM0:1234567', 'baud rate must be one of'),
+    ('v_max', '-1.0', 'v_max = -1.0: must be'), ('camera_rpy', '[0.0]', 'camera_rpy = '),
+    ('image_transport', 'jpg', "image_transport = 'jpg': must be one of"),
+    ('target_system', '300', 'target_system = 300: must be')])
+def test_a_value_that_no_node_takes_ends_the_launch_instead_of_starting_nodes_for_ever(
+        argument: str, text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        launched(FOLLOWER, **{argument: text})
+
+
+def test_an_argument_left_empty_leaves_its_parameter_to_the_files(config: Path) -> None:
+    own, two = str(config / 'follower.yaml'), str(config / 'two_cameras.yaml')
+    nodes, _ = launched(FOLLOWER, config=str(config), cameras=two)
+    neighbors = str(config / 'neighbors.yaml')
     assert {name: node.parameters for name, node in nodes.items()} == {
         'relative_pose': [own, two, {
-            'image_transport': 'raw', 'neighbors_file': '/mine/neighbors.yaml',
+            'image_transport': 'raw', 'neighbors_file': neighbors,
             'use_sim_time': False}],
         'planner': [own, two, {
-            'neighbors_file': '/mine/neighbors.yaml', 'use_sim_time': False}],
+            'neighbors_file': neighbors, 'use_sim_time': False}],
         'mavlink_bridge': [own, {
             'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}],
         'black_box': [two, {'image_transport': 'raw', 'use_sim_time': False}]}

@@ -34,7 +34,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings'}
+SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),

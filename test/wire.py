@@ -34,6 +34,8 @@ class Wire:
 
     def __init__(self, port: int, system: int = 1) -> None:
         self.setpoints: list[tuple[float, Any]] = []
+        self.modes: list[tuple[float, Any]] = []
+        """Requests of a mode, each with its time, s."""
         self._link = mavutil.mavlink_connection(
             f'udpout:127.0.0.1:{port}', source_system=system, source_component=1, dialect='common')
         self._running = True
@@ -62,8 +64,13 @@ class Wire:
                     steps * 20, 0.0, 0.0, -2.0, V_NORTH, 0.0, 0.0)
                 steps += 1
             message = self._link.recv_match(blocking=True, timeout=0.005)
-            if message is not None and message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
+            if message is None:
+                continue
+            if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
                 self.setpoints.append((time.monotonic(), message))
+            elif message.get_type() == 'COMMAND_LONG' and (
+                    message.command == mavlink.MAV_CMD_DO_SET_MODE):
+                self.modes.append((time.monotonic(), message))
 
     def close(self) -> None:
         self._running = False

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
@@ -44,12 +45,13 @@ def within(valid: Range) -> Callable[[str], float]:
     return number
 
 
-def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int:
+def guarded(command: Callable[[], int], refused: int = 1,
+            hint: Callable[[], str] = str) -> int:
     """
     Run a command and return its exit code; an error is one line on stderr.
 
     :param refused: the exit code of an error: a wrong file, an option, a machine that is too busy.
-    :param hint: where to look for more, if the error is not a wrong value.
+    :param hint: returns where to look for more, or '', if the error is not a wrong value.
     """
     below = '\n' if sys.stderr.isatty() else ''  # the live line
     try:
@@ -58,12 +60,17 @@ def guarded(command: Callable[[], int], refused: int = 1, hint: str = '') -> int
         print(f'\ntoo busy: {error}', file=sys.stderr)
         return TOO_BUSY_EXIT_CODE
     except (ImportError, OSError, RuntimeError, ValueError) as error:
-        more = '' if isinstance(error, ValueError) else hint
+        more = '' if isinstance(error, ValueError) else hint()
         print(f'{below}error: {explained(error)}{more}', file=sys.stderr)
         return refused
     except KeyboardInterrupt:
         print(f'{below}interrupted', file=sys.stderr)
         return 130
+
+
+def logs_in(folder: Path) -> str:
+    """Return where the logs are, or '' if there are none, as in a folder that is read-only."""
+    return f'; the logs of every process are in {folder}' if any(folder.rglob('*.log')) else ''
 
 
 def explained(error: Exception) -> str:

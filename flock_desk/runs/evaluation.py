@@ -28,6 +28,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 import math
 from pathlib import Path
+import sys
 import tempfile
 import time
 from typing import Any, Final
@@ -36,6 +37,7 @@ import numpy as np
 
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
+from flock_follower.bags.live_line import LiveLine
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
@@ -348,7 +350,14 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
     follower, message, pixels, began = evaluation.follower, None, None, False
+    line = LiveLine(sys.stderr)
+    line.due(time.monotonic())  # a short bag needs no line
+    shown = False
     for topic, msgtype, stamp, data in bag.messages([*used, *(system.topics if system else ())]):
+        if line.due(time.monotonic()):
+            done = (stamp - bag.start_ns) / max(bag.end_ns - bag.start_ns, 1)
+            line.show(f'{done:4.0%} of {bag.path.name}')
+            shown = True
         if system is not None:
             message, pixels = system.take(topic, msgtype, stamp, data)
         name, camera = used.get(topic, ('', ''))
@@ -362,6 +371,8 @@ def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
                 follower.permit(stamp, -math.inf)
                 follower.vehicle(stamp, FLYING)
             evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
+    if shown:
+        line.end()
     follower.finish()
 
 

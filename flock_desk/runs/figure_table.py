@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
+import re
 from typing import Final, NamedTuple
 
 from flock_desk.runs.judge import FigureBound
@@ -170,9 +171,14 @@ FIGURES: Final[dict[str, Figure]] = {
     'p99': Figure('99 % below')}
 
 
+def parts_of(key: str) -> list[str]:
+    """Return the groups of a key, and its figure; a dot between digits is that of a number."""
+    return re.split(r'\.(?!\d)|(?<!\d)\.', key)
+
+
 def words(key: str) -> str:
     """Return name and unit of a figure or group; of one that is not in the table, its key."""
-    last = key.rpartition('.')[2]
+    last = parts_of(key)[-1]
     for known in (key, last):
         if known in FIGURES:
             return FIGURES[known].words
@@ -181,7 +187,7 @@ def words(key: str) -> str:
 
 def shown(key: str) -> bool:
     """Return whether a figure, or a group that it is in, is printed on the console."""
-    parts = key.split('.')
+    parts = parts_of(key)
     groups = ('.'.join(parts[:n + 1]) for n in range(len(parts)))
     return any(group in FIGURES and FIGURES[group].shown for group in groups)
 

@@ -76,12 +76,10 @@ class External(NamedTuple):
 
 def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
     """
-    Return the links to an autopilot, ``udp:`` meaning ``udpin:``; without a truth the usual one.
+    Return the links to an autopilot; without a truth the usual one.
 
     :raises ValueError: for a URL that is invalid. :raises OSError: if it cannot be opened.
     """
-    autopilot, truth, leader = (
-        re.sub('^udp:', 'udpin:', url) for url in (autopilot, truth, leader))
     if not truth:
         tcp = re.fullmatch(r'(tcp:.*:)(\d+)', autopilot)
         truth = f'{tcp[1]}{int(tcp[2]) + 2}' if tcp else SIH_TRUTH

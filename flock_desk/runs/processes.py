@@ -48,6 +48,7 @@ from flock_follower.checks.processor import (
 )
 from flock_follower.checks.system import dead_segments
 from flock_follower.fast_dds import profile_variables
+from flock_follower.signals import ending
 
 TOO_BUSY_EXIT_CODE = 3
 LONGEST_STOP = 60.0  # s until a process is killed, however long it waits for a processor
@@ -310,7 +311,7 @@ class Processes:
         # Python lets only the main thread handle signals.
         main = threading.current_thread() is threading.main_thread()
         self._handlers = {number: signal.signal(number, _end)
-                          for number in (signal.SIGTERM, signal.SIGHUP) if main}
+                          for number in ending() if main and number != signal.SIGINT}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,

@@ -31,7 +31,7 @@ import textwrap
 from typing import Any, NamedTuple
 
 from flock_desk.runs.console import WIDTH
-from flock_desk.runs.figure_table import shown, words
+from flock_desk.runs.figure_table import parts_of, shown, words
 from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
 from flock_desk.runs.summary import consistency, write_summary
@@ -52,6 +52,9 @@ table { border-collapse: collapse; width: 100%; break-inside: avoid; margin-bott
 caption { text-align: left; font-weight: 600; padding: .2em 0; }
 td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: right;
      font-variant-numeric: tabular-nums; padding-left: 1em; }
+body { overflow-wrap: anywhere; }
+@media (max-width: 700px) { figure { width: 100%; margin: 0 0 1em; } .bounds td + td { white-space:
+       normal; } .bounds code { display: none; } }
 .ok { color: #00734d; } .FAILED { color: #b03a00; font-weight: 600; }
 """
 
@@ -168,7 +171,7 @@ def _verdict(key: str, value: Any) -> str:
 
 def _label(key: str, depth: int = 0) -> str:
     """Return the words of a key's groups, without the outer ``depth``, and of the figure."""
-    parts = key.split('.')
+    parts = parts_of(key)
     return escape(': '.join(words('.'.join(parts[:n + 1])) for n in range(depth, len(parts))))
 
 
@@ -211,7 +214,7 @@ def text(value: Any) -> str:
     if isinstance(value, bool):
         return 'yes' if value else 'no'
     if isinstance(value, list):
-        return ', '.join(map(str, value))
+        return ', '.join(map(str, value)) or 'none'
     if not isinstance(value, float):
         return str(value)
     return f'{value:.4g}' if abs(value) >= 1e-3 else f'{round(value, 5) + 0.0:g}'

@@ -165,6 +165,7 @@ PX4: Final = Profile(
         'EKF2_EV_CTRL': (INT32, 0),           # parts of vision that are fused; 15: all
         'EKF2_EV_DELAY': (FLOAT, 0.0),
         'EKF2_EV_NOISE_MD': (INT32, 0),
+        'EKF2_EV_QMIN': (INT32, 0),           # %, quality below which vision is refused
         'EKF2_GPS_CTRL': (INT32, 7),          # 0: fly without GPS
         'EKF2_HGT_REF': (INT32, 1),           # 0: barometer, 1: GPS, 2: rangefinder, 3: vision
         'EKF2_MAG_TYPE': (INT32, 0),          # 0: automatic, 5: no compass
@@ -237,6 +238,7 @@ ARDUCOPTER: Final = Profile(
         'GUID_OPTIONS': (INT32, 0),
         'GUID_TIMEOUT': (FLOAT, 3.0),         # s without setpoints until GUIDED stops
         'LAND_SPEED': (INT16, 50),            # cm/s
+        'VISO_QUAL_MIN': (INT8, 0),           # %, quality below which vision is refused
         'VISO_TYPE': (INT8, 0),               # 1: vision by MAVLink
         'WPNAV_SPEED': (FLOAT, 1000.0),       # cm/s, not applied to acceleration setpoints
     },

@@ -35,6 +35,7 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Machine, Observations, OURS
 from flock_follower.checks.processor import BUSY
+from flock_follower.checks.shared_memory import UNDELIVERED
 from flock_follower.checks.topic_names import full_name
 from flock_follower.fast_dds import PROFILE_VARIABLES, SEGMENT_PREFIXES
 
@@ -52,13 +53,17 @@ MISSING: Final = 'missing parameter '
 UNPROVEN: Final = 'unproven firmware'
 NOT_READY: Final = 'not ready to arm'
 REFUSED: Final = 'offboard would be refused'
+LINK_FAULT: Final = 'link fault'
 #: The action for a status of a node, by a part of its text.
 ADVICE: Final[Mapping[str, str]] = {
     'cannot keep up': 'fly behind a slower leader, or raise v_max',
     'not aligned': 'let the autopilot fuse this odometry (forward_odometry:=true)',
+    'cannot send on': 'do as it says',
     'no autopilot': 'check cable, connection and baud rate; is the autopilot on?',
     'autopilot lost': 'check cable and power of the autopilot',
     'no publisher': 'start its publisher, or connect its name (above)',
+    UNDELIVERED: 'run publisher and nodes as one user with one /dev/shm; restart the nodes whose '
+                 'shared memory was removed (docs/deploy.md)',
     'none sending': 'look at the log of its publisher',
     'not in sight': 'hold the leader before the camera',
     'QoS mismatch': 'change the QoS of the publisher',
@@ -139,12 +144,12 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
     link = values.get('link', 'not reported')
-    alive = link == 'alive'
+    alive, fault = link == 'alive', values.get(LINK_FAULT, '')
     yield judged(
-        not alive, False, 'autopilot', ', '.join(
+        not alive, bool(fault), 'autopilot', ', '.join(
             values.get(key) or f'no {key}' for key in ('autopilot', 'mode')) if alive else
-        f'not received ({link})', 'received', 'check cable, connection and baud rate; is the '
-        'autopilot on, is its MAVLink port set up?')
+        f'not received ({link})', 'received', fault or 'check cable, connection and baud rate; is '
+        'the autopilot on, is its MAVLink port set up?')
     if not alive:
         return
     for key in values:

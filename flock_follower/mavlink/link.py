@@ -165,15 +165,27 @@ class Signing:
         self.state.secret_key = key
         self.state.sign_outgoing = True
         self.state.link_id = link_id
-        self.state.timestamp = max(0, int((unix_time - _SIGNING_EPOCH) * _SIGNING_TICKS))
-        self._first = self.state.timestamp
-        self._first_time: float | None = None
+        self.state.timestamp = _timestamp(unix_time)
+        self._reference = self.state.timestamp, math.nan  # a timestamp, and its time, s
 
     def latest(self, now: float) -> int:
         """Return the latest timestamp to accept; the first ``now``, s, is that of the start."""
-        if self._first_time is None:
-            self._first_time = now
-        return self._first + int((now - self._first_time + MOST_AHEAD) * _SIGNING_TICKS)
+        timestamp, since = self._reference
+        if math.isnan(since):
+            self._reference = timestamp, now
+            since = now
+        return timestamp + int((now - since + MOST_AHEAD) * _SIGNING_TICKS)
+
+    def set_clock(self, unix_time: float, now: float) -> None:
+        """
+        Follow the system clock, which may be set after the start, but never back.
+
+        A timestamp must not decrease, and the autopilot's has followed ours.
+        """
+        timestamp = _timestamp(unix_time)
+        if timestamp > self.latest(now) - int(MOST_AHEAD * _SIGNING_TICKS):
+            self._reference = timestamp, now
+        self.state.timestamp = max(self.state.timestamp, timestamp)
 
     @classmethod
     def from_file(cls, path: str, unix_time: float) -> Signing:
@@ -195,6 +207,10 @@ class Signing:
         if len(data) != SIGNING_KEY_SIZE:
             raise ValueError(f'signing_key_file = {path!r}: must hold {SIGNING_KEY_SIZE} bytes')
         return cls(data, unix_time)
+
+
+def _timestamp(unix_time: float) -> int:
+    return max(0, int((unix_time - _SIGNING_EPOCH) * _SIGNING_TICKS))
 
 
 class Link:

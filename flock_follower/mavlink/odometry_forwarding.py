@@ -55,6 +55,8 @@ FORWARDING_GAP: Final[float] = 0.1
 OLDEST: Final[float] = 0.3
 #: An attitude further than this, rad, from the prediction has jumped (a loop closure, a restart).
 ATTITUDE_JUMP: Final[float] = 0.2
+#: Quality sent for a covariance that is unknown, %.
+UNKNOWN_QUALITY: Final[int] = 50
 _R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
 _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
@@ -110,7 +112,8 @@ class OdometryForwarder:
         if lost := len(self._queue) - len(fresh):
             self.counters['too old to send'] += lost
         self._queue.clear()
-        return [encode_odometry(state, time, dialect, count) for state, time, count in fresh]
+        return [encode_odometry(state, time, dialect, count, now - time)
+                for state, time, count in fresh]
 
     def sent(self, success: bool, now: float) -> None:
         """Record that a message was sent, or that the link had no room for it."""
@@ -137,8 +140,25 @@ def jumped(before: OdometryState, then: float, after: OdometryState, now: float)
                 or np.linalg.norm(turned) > ATTITUDE_JUMP)
 
 
-def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_counter: int
-                    ) -> Any:
+def quality(state: OdometryState, age: float) -> int:
+    """
+    Return the quality of a state of an age, s, %, which autopilots compare with a parameter.
+
+    PX4 refuses ODOMETRY below EKF2_EV_QMIN, ArduPilot below VISO_QUAL_MIN; 0 means unknown. The
+    quality falls in proportion to the deviation of the velocity beyond that of ODOMETRY_STD, and
+    with the age. An unknown covariance counts half.
+    """
+    expected = ODOMETRY_STD[2]
+    if _is_known(state.velocity_covariance):
+        deviation = math.sqrt(float(np.diag(state.velocity_covariance).max()))
+        best = 100.0 * min(1.0, expected / deviation)
+    else:
+        best = UNKNOWN_QUALITY
+    return max(1, round(best * min(1.0, max(0.0, 1.0 - age / OLDEST))))
+
+
+def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_counter: int,
+                    age: float = 0.0) -> Any:
     """
     Return the ODOMETRY message of a state, at a time, s, in the frames of the autopilot.
 
@@ -163,14 +183,17 @@ def encode_odometry(state: OdometryState, time: float, dialect: Dialect, reset_c
         *flu_to_frd(R_enu_flu.T @ state.velocity).tolist(),
         *flu_to_frd(state.angular_velocity).tolist(),
         pose_covariance[_UPPER].tolist(), twist_covariance[_UPPER].tolist(),
-        reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO)
+        reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO, quality(state, age))
 
 
 def _valid(covariance: Array, deviations: list[float]) -> Array:
     """Return the covariance, or a diagonal of the deviations if it is invalid."""
-    known = np.all(np.abs(covariance) < SANE) and np.all(np.diag(covariance) > 0.0)
+    return covariance if _is_known(covariance) else np.diag(np.square(deviations))
+
+
+def _is_known(covariance: Array) -> bool:
     # The comparison refuses NaN, too.
-    return covariance if known else np.diag(np.square(deviations))
+    return bool(np.all(np.abs(covariance) < SANE) and np.all(np.diag(covariance) > 0.0))
 
 
 def _transformed(covariance: Array, rotation: Array) -> Array:

@@ -213,7 +213,10 @@ class StatusTexts:
         """End the text that has begun."""
         if self._begun is not None:
             # PX4 ends texts with a tab if it also sends them as events.
-            whole = self._begun._replace(text=self._begun.text.strip('\x00\t\n '))
+            text = self._begun.text.strip('\x00\t\n ')
+            # An escape sequence would act on the terminal that shows the log.
+            whole = self._begun._replace(text=''.join(
+                character if character.isprintable() else '?' for character in text))
             self._texts.append(whole)
             self._new.append(whole)
         self._begun = None

@@ -13,30 +13,27 @@
 # limitations under the License.
 
 """
-Bytes to and from an autopilot: UDP, TCP and serial, opened from a pymavlink URL.
+Bytes to and from an autopilot: UDP, TCP and serial, opened from a URL (see ``connection``).
 
-``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
-``/dev/DEVICE[,BAUD]`` is a serial port. All calls are non-blocking, and none reads a clock.
-``reopen`` opens a device that was unplugged, a connection that was closed, or one that is not
-there yet.
+All calls are non-blocking, and none reads a clock. ``reopen`` opens a device that was unplugged, a
+connection that was closed, or one that is not there yet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import contextlib
 import errno
 import fcntl
 import math
 import os
-import re
 import socket
 import struct
 import termios
 import tty
 from typing import Any, Final, TypeVar
 
-from flock_follower.ranges import Range
+from flock_follower.mavlink.connection import BAUD_RATES, explain_error, parse_connection
 
 T = TypeVar('T')
 #: Time between two attempts to reopen a lost port, s.
@@ -52,11 +49,10 @@ TCP_BACKLOG: Final[float] = 1000.0
 MOST_READ: Final[int] = 2048
 #: Bits on a serial line for each byte, with its start and stop bit.
 BITS_PER_BYTE: Final[int] = 10
-#: The termios constant of each baud rate.
-BAUD_RATES: Final[Mapping[int, int]] = {
-    int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r'B\d+', name)}
 #: A TCP connection is made within this time, s, or tried again.
 CONNECT_TIMEOUT: Final[float] = 0.2
+#: Errors of an address that a network interface may have later.
+COMES_LATER: Final[tuple[int, ...]] = (errno.EADDRNOTAVAIL, errno.ENETDOWN, errno.ENODEV)
 #: Errors of a serial port that another process uses: it is exclusive, or locked.
 IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
@@ -67,6 +63,7 @@ class _Line:
     peer: Any = 'line'
     capacity = 0.0
     delivers_late = False
+    _device = ''  # of a serial port
     _backlog = 0.0  # bytes that may wait in the kernel
 
     def __init__(self, url: str) -> None:
@@ -91,7 +88,7 @@ class _Line:
         except (BlockingIOError, InterruptedError):
             return None
         except OSError as error:
-            self._lose(reason_of(error))
+            self._lose(explain_error(error, self._device))
             return None
 
     def _lose(self, fault: str) -> None:
@@ -106,7 +103,7 @@ class _Line:
         try:
             self._fd, self.fault = self._open(), ''
         except (OSError, termios.error) as error:
-            self.fault = reason_of(error)
+            self.fault = explain_error(error, self._device)
 
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the bytes that have arrived."""
@@ -190,7 +187,8 @@ class SerialTransport(_Line):
             if fd >= 0:
                 os.close(fd)
             if isinstance(error, OSError) and error.errno in IN_USE:
-                raise OSError(error.errno, f'another process uses {self._device}') from None
+                raise OSError(errno.EBUSY, f'another process uses {self._device}: end it, or have '
+                              'a router share the port (docs/deploy.md)') from None
             raise
         return fd
 
@@ -229,18 +227,9 @@ class TcpTransport(_Line):
             return connection.detach()
 
 
-def reason_of(error: BaseException) -> str:
-    """Return the reason of an OSError or termios.error in words."""
-    return str(getattr(error, 'strerror', None) or error.args[-1])
-
-
-DEFAULT_BAUD: Final[int] = 115200
-_URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'
-
-
 class UdpTransport(_Line):
     """
-    A UDP socket, which is never lost.
+    A UDP socket, which is never lost once it is open.
 
     A listening one sends only to the ``peer`` that its owner sets, not to each sender: a setpoint
     must not reach a second vehicle by accident.
@@ -252,15 +241,23 @@ class UdpTransport(_Line):
                  peer: tuple[str, int] | None = None) -> None:
         super().__init__(url)
         self.peer = peer
+        self._bind = bind
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._fd = self._open()
+        except OSError as error:
+            self.fault = explain_error(error)
+            if error.errno not in COMES_LATER:
+                raise OSError(error.errno, f'connection = {url!r}: cannot listen there: '
+                              f'{self.fault}') from None
+
+    def _open(self) -> int:
+        self._socket.close()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._fd = self._socket.fileno()
-        try:
-            if bind is not None:
-                self._socket.bind(bind)
-        except OSError as error:
-            self.close()
-            raise OSError(f'connection = {url!r}: cannot listen there: {error.strerror}') from None
+        if self._bind is not None:
+            self._socket.bind(self._bind)
+        return self._socket.fileno()
 
     @property
     def address(self) -> tuple[str, int]:
@@ -270,6 +267,8 @@ class UdpTransport(_Line):
 
     def read(self) -> Iterator[tuple[bytes, Any]]:
         """Yield the datagrams that have arrived, with their senders."""
+        if self._fd < 0:
+            return
         # Bounded, so that a flood cannot keep the caller from its other work.
         for _ in range(256):
             try:
@@ -279,13 +278,16 @@ class UdpTransport(_Line):
 
     def write(self, data: bytes) -> bool:
         """Send one datagram to the peer; return whether it went out."""
-        if self.peer is None:
+        if self.peer is None or self._fd < 0:
             return False
         try:
             self._socket.sendto(data, self.peer)
-        except OSError:
-            # Unreachable now: the link reports the silence, without an exception.
+        except (BlockingIOError, InterruptedError):
             return False
+        except OSError as error:  # unreachable now
+            self.fault = explain_error(error, sending=True)
+            return False
+        self.fault = ''
         return True
 
     def close(self) -> None:
@@ -306,30 +308,21 @@ def open_transport(url: str) -> Transport:
     """
     Open a connection URL.
 
-    A missing serial device, or a TCP port without a listener, is opened as soon as it appears.
+    A missing serial device, an address that no network interface has yet, or a TCP port without a
+    listener is opened as soon as it appears.
 
     :raises ValueError: if the URL is not one of the known forms.
     :raises OSError: if a UDP port cannot be opened; the message names the URL.
     """
-    network = re.fullmatch(r'(udpin|udpout|tcp):([^:\s]+):(\d{1,5})', url)
-    if network:
-        kind, host, port = network[1], network[2], int(network[3])
-        lowest = 0 if kind == 'udpin' else 1
-        Range(lowest, 65535, whole=True).check(f'connection = {url!r}: port', port)
-        try:
-            address = (socket.gethostbyname(host), port)
-        except OSError:
-            raise ValueError(f'connection = {url!r}: unknown host {host}') from None
-        if kind == 'udpin':
-            return UdpTransport(url, bind=address)
-        if kind == 'tcp':
-            return TcpTransport(url, address)
-        return UdpTransport(url, peer=address)
-    serial = re.fullmatch(r'(/dev/[^,\s]+)(?:,(\d+))?', url)
-    if serial:
-        baud = int(serial[2] or DEFAULT_BAUD)
-        if baud not in BAUD_RATES or baud == 0:
-            rates = ', '.join(str(b) for b in sorted(BAUD_RATES) if b >= 9600)
-            raise ValueError(f'connection = {url!r}: baud rate must be one of {rates}')
-        return SerialTransport(url, serial[1], baud)
-    raise ValueError(f'connection = {url!r}: must be {_URL_FORMS}')
+    parsed = parse_connection(url)
+    if parsed.device:
+        return SerialTransport(url, parsed.device, parsed.baud)
+    try:
+        address = (socket.gethostbyname(parsed.host), parsed.port)
+    except OSError:
+        raise ValueError(f'connection = {url!r}: unknown host {parsed.host}') from None
+    if parsed.kind == 'udpin':
+        return UdpTransport(url, bind=address)
+    if parsed.kind == 'tcp':
+        return TcpTransport(url, address)
+    return UdpTransport(url, peer=address)

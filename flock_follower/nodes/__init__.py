@@ -17,11 +17,10 @@
 from collections.abc import Callable, Iterator
 import contextlib
 import os
-from pathlib import Path
 import signal
-import sys
 import threading
-from types import TracebackType
+
+from flock_follower.signals import AS_A_PROGRAM, ending, hang_up_as_terminate
 
 #: A signalled process has ended after this, s; the bridge has braked and ended its stream before.
 SHUTDOWN_TIMEOUT = 1.8
@@ -43,7 +42,7 @@ def set_deadline() -> None:
     Once in some thousand times Fast DDS spins for ever while it destroys a node, and holds the
     GIL: no thread and no handler of Python can end that.
     """
-    if _AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
+    if AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
 
 
@@ -60,9 +59,9 @@ def unhurried() -> Iterator[None]:
 
 def ignore_signals() -> None:
     """Ignore further signals: one during the interpreter's exit must not change the exit code."""
-    if _AS_A_PROGRAM:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if AS_A_PROGRAM:
+        for number in ending():
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _handle(number: int, _: object) -> None:
@@ -80,23 +79,7 @@ def _shut_down_context() -> None:
         _shut_down()
 
 
-def _runs_as_a_program() -> bool:
-    path = Path(sys.argv[0] if sys.argv else '')
-    return (path.name == '-m' or path.parent.name in ('flock_follower', 'flock_desk')
-            or Path(__file__).with_name(f'{path.name}.py').exists())
-
-
-def _report_missing_package(kind: type[BaseException], error: BaseException,
-                            trace: TracebackType | None) -> None:
-    if isinstance(error, ModuleNotFoundError):
-        print(f'error: {error}: source ROS 2 (/opt/ros/.../setup.bash) and install every '
-              'package in package.xml', file=sys.stderr)
-    else:
-        sys.__excepthook__(kind, error, trace)
-
-
-_AS_A_PROGRAM = _runs_as_a_program()
-if _AS_A_PROGRAM:
+if AS_A_PROGRAM:
     signal.signal(signal.SIGINT, _handle)
     signal.signal(signal.SIGTERM, _handle)
-    sys.excepthook = _report_missing_package
+    hang_up_as_terminate()

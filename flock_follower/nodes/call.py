@@ -25,6 +25,8 @@ have taken over.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
+import difflib
 import sys
 import time
 
@@ -47,6 +49,9 @@ POLL_PERIOD = 0.1  # s between looks for the service
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
 LONGEST = STREAM_TIMEOUT + CONFIRM_TIMEOUT + REASON_WAIT
+#: The services of our nodes, in no namespace.
+OURS = ('/planner/engage', *(f'/mavlink_bridge/{name}' for name in (
+    'arm', 'offboard', 'takeoff', 'land')), '/replay/pause')
 _HEIGHT = next(spec.range.high for spec in MAVLINK_BRIDGE if spec.name == 'takeoff_height')
 
 
@@ -58,6 +63,15 @@ def patience(service: str) -> float:
     """
     climb = TAKEOFF_DELAY + _HEIGHT / SLOWEST_CLIMB if service.endswith('takeoff') else 0.0
     return LONGEST + climb + MARGIN
+
+
+def proposal(service: str, there: Iterable[str]) -> str:
+    """Return which service is meant, as a question; ``there`` are full names. '' if none is."""
+    last = service.rpartition('/')[2]
+    known = {*there, *OURS}
+    meant = sorted(name for name in known if name.rpartition('/')[2] == last and name != service)
+    meant = meant or difflib.get_close_matches(service, known - {service}, n=1)
+    return f'; did you mean {" or ".join(name.lstrip("/") for name in meant)}?' if meant else ''
 
 
 class Caller(Node):
@@ -85,8 +99,10 @@ class Caller(Node):
         deadline = time.monotonic() + self._timeout
         while not self._client.service_is_ready():
             if time.monotonic() >= deadline:
+                there = [name for name, kinds in self.get_service_names_and_types()
+                         if f'std_srvs/srv/{self._kind.__name__}' in kinds]
                 return False, (f'no such service of type {self._kind.__name__} within '
-                               f'{self._timeout:g} s')
+                               f'{self._timeout:g} s{proposal(self._service, there)}')
             rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
         future = self._client.call_async(self._request)
         deadline = time.monotonic() + patience(self._service)

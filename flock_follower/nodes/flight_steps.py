@@ -26,9 +26,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 import math
-import re
 from typing import Final
 
+from flock_follower.mavlink.connection import parse_connection
 from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT, READY
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
@@ -51,11 +51,10 @@ SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = {
 
 def loopback(connection: str) -> bool:
     """Return whether the bridge's ``connection`` is an address of this machine alone."""
-    network = re.fullmatch(r'(?:udpin|udpout|tcp):([^:\s]+):\d+', connection)
     try:
-        return network is not None and (
-            network[1] == 'localhost' or ip_address(network[1]).is_loopback)
-    except ValueError:  # another name: it may be resolved to any address
+        host = parse_connection(connection).host
+        return host == 'localhost' or ip_address(host).is_loopback
+    except ValueError:  # a serial port, or another name: it may be resolved to any address
         return False
 
 

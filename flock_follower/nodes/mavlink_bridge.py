@@ -290,6 +290,8 @@ class MavlinkBridge(FlockNode):
 
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._bridge.gate.limits = self._settings.current
+        if (signing := self._bridge.link.signing) is not None:
+            signing.set_clock(time.time(), now)
         self._report.on_cycle(cycle, now)
 
 

@@ -56,6 +56,7 @@ from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import never_block_output, run
+from flock_follower.signals import ending
 
 POLL_PERIOD = 0.05  # s between looks at keys and answers
 
@@ -104,7 +105,7 @@ class Pilot(Node):
 
     def spin(self) -> int:
         """Fly, and return the exit code."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in ending():
             # No more than that: the interrupted code may hold a lock that a call needs.
             signal.signal(number, lambda number, _: self._signals.append(number))
         executor = SingleThreadedExecutor()

@@ -195,7 +195,8 @@ class Planner(FlockNode):
                                  stamp_to_nanoseconds(message.stamp)):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
-            self._silence.timer_period_ns = max(timeout - late, 1)
+            # Within the timeout, if the clock was set meanwhile.
+            self._silence.timer_period_ns = max(timeout - max(late, 0), 1)
             self._silence.reset()
 
     def _on_silence(self) -> None:

@@ -33,6 +33,8 @@ from typing import Any, Final
 
 import yaml
 
+from flock_follower.files import read_text
+from flock_follower.mavlink.connection import parse_connection
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import (
     check_values,
@@ -43,6 +45,7 @@ from flock_follower.parameters.spec import (
     specs_of,
 )
 from flock_follower.parameters.tables import MAVLINK_BRIDGE, PLANNER, RELATIVE_POSE
+from flock_follower.perception.markers import load
 
 Table = Mapping[str, Sequence[Spec]]
 #: The parameters of the nodes that a flight needs.
@@ -90,6 +93,25 @@ def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | Non
         if own.get('neighbors_file'):
             own['neighbors_file'] = str(path.parent / own['neighbors_file'])
     return values
+
+
+def refuse_start(files: Sequence[str | Path], given: Mapping[str, Mapping[str, Any]],
+                 neighbors: str | Path) -> None:
+    """
+    Refuse what would end a node at each start: a launch would start it again for ever.
+
+    :param files: parameter files. :param given: values of parameters beside them, by node.
+    :param neighbors: the neighbours' file.
+    :raises ValueError, OSError: naming the file or the parameter.
+    """
+    for path in files:
+        read_parameters(path, TABLE)
+    load(neighbors)
+    for node, values in given.items():
+        for spec in TABLE.get(node, ()):
+            if spec.name in values:
+                spec.check(values[spec.name])
+    parse_connection(given['mavlink_bridge']['connection'])
 
 
 def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
@@ -193,7 +215,7 @@ def _naming(place: str | Path) -> Iterator[None]:
 
 def _read(path: str | Path) -> Any:
     try:
-        return yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        return yaml.safe_load(read_text(path))
     except (yaml.YAMLError, ValueError) as error:
         raise ValueError(f'not valid YAML: {" ".join(str(error).split())}') from None
 

@@ -343,8 +343,14 @@ def recommendations(forwarding: bool, takeoff_height: float) -> dict[str, list[R
 
 
 def recordings_folder(values: Mapping[str, Any], ros_home: str, namespace: str) -> Path:
-    """Return the folder of the recordings; ``ros_home`` is $ROS_HOME, or ''."""
-    if values['record_folder']:
-        return Path(values['record_folder']).expanduser()
-    home = Path(ros_home or '~/.ros').expanduser()
-    return home / 'flock_follower' / 'black_box' / namespace.strip('/')
+    """
+    Return the folder of the recordings; ``ros_home`` is $ROS_HOME, or ''.
+
+    A user without a home folder (a container's) has / instead, as with an empty $HOME.
+    """
+    folder = Path(values['record_folder']) if values['record_folder'] else (
+        Path(ros_home or '~/.ros') / 'flock_follower' / 'black_box' / namespace.strip('/'))
+    try:
+        return folder.expanduser()
+    except RuntimeError:
+        return Path('/', *folder.parts[1:])

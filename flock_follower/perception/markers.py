@@ -63,6 +63,7 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
+from flock_follower.files import read_text
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
 from flock_follower.perception.images import GrayImage
 from flock_follower.ranges import Range, suggestion
@@ -265,7 +266,7 @@ def load(path: str | Path) -> NeighborConfig:
     :raises ValueError: naming the file, the key, its value and the valid range.
     :raises OSError: if the file cannot be read.
     """
-    text = Path(path).read_text(encoding='utf-8')
+    text = read_text(path)
     try:
         return parse(yaml.safe_load(text))
     except yaml.YAMLError as error:

@@ -277,6 +277,11 @@ FAULTS: list[Fault] = [
           bridge('not ready to arm', 'press the safety button')),
     Fault('no autopilot', LIVE, ERROR, 'autopilot', 'not received (never received)', 'check cable',
           bridge('link', 'never received')),
+    Fault('a port without permission', LIVE, ERROR, 'autopilot', 'not received', 'group dialout',
+          together(bridge('link', 'never received'),
+                   bridge('link fault', 'Permission denied (EACCES): the group dialout'))),
+    Fault('a link without a route', LIVE, WARNING, 'autopilot', 'PX4', '(ENETUNREACH)',
+          bridge('link fault', 'Network is unreachable (ENETUNREACH)')),
     Fault('an error of a node', LIVE, ERROR, 'relative_pose status', 'no image processed for 4 s',
           'see images',
           lambda seen: seen.statuses.update(relative_pose=NodeStatus(

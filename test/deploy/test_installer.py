@@ -39,6 +39,7 @@ def files(root: Path) -> dict[str, str]:
 SETTINGS = 'etc/flock_follower/follower.env'
 INSTALLED = {'etc/systemd/system/flock_follower@.service', SETTINGS,
              'etc/sysctl.d/05-flock_follower.conf',
+             'etc/systemd/logind.conf.d/05-flock_follower.conf',
              'etc/udev/rules.d/61-flight-controller.rules',
              'usr/local/lib/flock_follower/start',
              'usr/local/lib/flock_follower/prefer_realtime',
@@ -55,6 +56,8 @@ def test_it_prints_and_writes_its_files_and_undoes_them(tmp_path: Path) -> None:
     unit = there['etc/systemd/system/flock_follower@.service']
     assert '\nUser=pilot\n' in unit
     assert '\nExecStart=/bin/bash /usr/local/lib/flock_follower/start ' in unit
+    # Else the shared memory of a running service goes when its user logs out.
+    assert '\n[Login]\nRemoveIPC=no\n' in there['etc/systemd/logind.conf.d/05-flock_follower.conf']
     assert (tmp_path / 'usr/local/lib/flock_follower/start').stat().st_mode & 0o111
     assert '\nWORKSPACE=/home/pilot/ws\n' in there[SETTINGS]
     install(tmp_path, '--name', 'drone2')

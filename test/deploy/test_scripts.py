@@ -67,6 +67,17 @@ def test_without_peers_ros_keeps_to_the_loopback(workspace: Path) -> None:
         assert start(workspace, **variables).stdout.splitlines()[-2:] == profiles
 
 
+def test_without_a_place_for_logs_it_starts_with_a_warning(workspace: Path) -> None:
+    (workspace / 'ros2').write_text(f'#!/bin/sh\necho {workspace} "$ROS_LOG_DIR"\n')
+    logs = workspace / 'logs'
+    assert start(workspace, ROS_LOG_DIR=str(logs)).stdout.split() == [str(workspace), str(logs)]
+    for folder in ('/proc/none', '/dev/full/none', str(workspace / 'ros2')):
+        ended = start(workspace, ROS_LOG_DIR=folder)
+        assert Path(ended.stdout.split()[1]).parent == Path('/dev/shm'), ended
+        Path(ended.stdout.split()[1]).rmdir()
+        assert f'ROS_LOG_DIR = {folder}' in ended.stderr
+
+
 def test_a_workspace_that_is_not_built_is_named_with_the_file_that_says_so(tmp_path: Path) -> None:
     ended = start(tmp_path)
     assert ended.returncode == 1

@@ -153,6 +153,25 @@ def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
         assert bool(bench.beats('vehicle', now=now)) == received
 
 
+def test_a_signed_link_follows_a_clock_that_is_set_after_the_start():
+    started = 1_000.0  # s since 1970: a computer without a battery for its clock
+    bench = Bench(signing=Signing(KEY, started))
+    assert not bench.beats('vehicle', now=100.0, signing=Signing(KEY, UNIX))
+    bench.link.signing.set_clock(started + 1.0, 101.0)  # not set yet
+    assert not bench.beats('vehicle', now=101.0)
+    bench.link.signing.set_clock(UNIX + 2.0, 102.0)
+    sent = bench.link._sender.signing.timestamp
+    assert sent == Signing(KEY, UNIX + 2.0).state.timestamp
+    assert bench.beats('vehicle', now=102.0)
+    # Set back: MAVLink's timestamps never decrease, and the autopilot's do not either.
+    bench.link.signing.set_clock(UNIX - 3600.0, 103.0)
+    assert bench.link._sender.signing.timestamp >= sent
+    bench.codecs['vehicle'].signing.timestamp = Signing(KEY, UNIX + 3.0).state.timestamp
+    assert bench.beats('vehicle', now=103.0)
+    bench.codecs['vehicle'].signing.timestamp = Signing(KEY, UNIX + 86400.0).state.timestamp
+    assert not bench.beats('vehicle', now=103.0)
+
+
 @pytest.mark.parametrize(('content', 'mode', 'reported'), [
     (KEY, 0o400, ''), *((content, 0o600, 'must hold 32 bytes') for content in (b'', b'z' * 64)),
     *((KEY, mode, f'mode {mode:03o} gives others access: chmod 600') for mode in (0o640, 0o601)),

@@ -28,6 +28,9 @@ from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
     jumped,
     OdometryForwarder,
+    OLDEST,
+    quality,
+    UNKNOWN_QUALITY,
 )
 from flock_follower.messages import OdometryState
 
@@ -137,3 +140,16 @@ def test_the_rate_is_limited_evenly_and_never_halved(source, rate, expected):
         times += [m.time_usec * 1e-6 for m in forwarder.messages(PX4, time)]
     assert len(times) == pytest.approx(10 * expected, rel=0.02)
     assert np.diff(times).max() < 1.6 / expected
+
+
+def test_the_quality_falls_with_covariance_and_age_and_is_never_unknown():
+    def of(std, age=0.0):
+        return quality(sample(twist=np.eye(6) * std ** 2)[0], age)
+    assert [of(std) for std in (0.01, 0.1, 0.2, 1.0, 100.0)] == [100, 100, 50, 10, 1]
+    assert [of(0.1, age) for age in (-0.1, 0.0, 0.5 * OLDEST, OLDEST, 9.0)] == [100, 100, 50, 1, 1]
+    assert of(0.0) == of(math.nan) == UNKNOWN_QUALITY
+    for dialect in (PX4, ARDUPILOT):
+        forwarder = OdometryForwarder()
+        forwarder.take(*sample(), 10.1)
+        (message,) = forwarder.messages(dialect, 10.1)
+        assert 1 <= message.quality == quality(sample()[0], 0.1) < 100

@@ -42,8 +42,8 @@ ALLOWED = {
 #: What the shipped files recommend where odometry is forwarded.
 FORWARDING = {
     'px4': {'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0, 'EKF2_GPS_CTRL': 0, 'EKF2_MAG_TYPE': 5,
-            'COM_OBL_RC_ACT': 4, 'COM_RCL_EXCEPT': 0},
-    'ardupilot': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSZ': 1, **{
+            'COM_OBL_RC_ACT': 4, 'COM_RCL_EXCEPT': 0, 'EKF2_EV_QMIN': 0},
+    'ardupilot': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSZ': 1, 'VISO_QUAL_MIN': 0, **{
         f'EK3_SRC1_{name}': 6 for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 #: Of the whole numbers from -1 to 12 those that are good for a failsafe, by newest version known:
 #: PX4's 1 of GF_ACTION and 0 of COM_LOW_BAT_ACT only warn, 5 and 6 of NAV_RCL_ACT stop the motors,

@@ -60,6 +60,13 @@ def test_texts_are_joined_from_their_chunks_and_reported_once(chunks, whole):
     assert texts.new(9.0) == [] and texts.since(1.0) == whole and texts.since(1.1) == []
 
 
+def test_control_characters_reach_no_terminal():
+    texts = StatusTexts()
+    texts.add(statustext('bad \x1b[2J\x07\nend\r.'), 1.0)
+    (text,) = texts.new(1.0)
+    assert text.text == 'bad ?[2J??end?.'
+
+
 def test_a_refusal_is_explained_by_more_than_information():
     texts = StatusTexts()
     texts.add(statustext('merely information', INFO), 1.0)

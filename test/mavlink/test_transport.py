@@ -14,20 +14,28 @@
 
 """Lines that are lost and come back: a serial device, a TCP connection; and slow ones."""
 
+import errno
 import fcntl
+import grp
 import os
 import select
 import socket
 import struct
 import termios
+from types import SimpleNamespace
 
 import pytest
 
+from flock_follower.mavlink.connection import explain_error, parse_connection
 from flock_follower.mavlink.transport import (
     open_transport,
     RETRY_PERIOD,
 )
 
+MISSING = ('No such file or directory (ENOENT): is it plugged in? `ls /dev/serial/by-id` lists '
+           'what is there')
+IN_USE = ('another process uses /dev/ttyTEST: end it, or have a router share the port '
+          '(docs/deploy.md) (EBUSY)')
 TIOCGEXCL = 0x80045440  # of Linux; the termios module names it from Python 3.13 on
 
 
@@ -68,7 +76,7 @@ def test_a_serial_device_that_is_away_is_reported_and_opened_when_it_comes(termi
     plug, make, unlink = terminal
     transport = make()
     for lost_at in (1.0, 10.0):
-        assert (transport.fileno(), transport.fault) == (-1, 'No such file or directory')
+        assert (transport.fileno(), transport.fault) == (-1, MISSING)
         assert not transport.write(b'lost') and list(transport.read()) == []
         assert not transport.congested()
         transport.reopen(lost_at)
@@ -119,7 +127,7 @@ def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
     main, replica = plug()
     first, second = make(), make()
     assert first.capacity == 5760.0  # a tenth of its baud rate
-    assert (first.fault, second.fault) == ('', 'another process uses /dev/ttyTEST')
+    assert (first.fault, second.fault) == ('', IN_USE)
     # Nor does another program open it.
     assert struct.unpack('i', fcntl.ioctl(replica, TIOCGEXCL, b'\0' * 4))[0] == 1
     carries(first, main)
@@ -135,7 +143,8 @@ def test_tcp_connects_when_somebody_listens_again_after_a_close_and_holds_odomet
     transport = open_transport(f'tcp:127.0.0.1:{server.getsockname()[1]}')
     assert transport.fault == 'not connected yet' and transport.fileno() == -1
     transport.reopen(0.0)
-    assert transport.fault == 'Connection refused' and not transport.write(b'x')
+    assert 'Connection refused (ECONNREFUSED): ' in transport.fault
+    assert not transport.write(b'x')
     server.listen()
     for now in (1.0, 2.0):
         transport.reopen(now)
@@ -159,15 +168,79 @@ def test_tcp_connects_when_somebody_listens_again_after_a_close_and_holds_odomet
     ('udpin:127.0.0.1:70000', r'port = \d+: must be an integer in \[0, 65535\]'),
     ('udpout:127.0.0.1:0', r'port = \d+: must be an integer in \[1, 65535\]'),
     ('udpin:no.such.host.invalid:14540', 'unknown host no.such.host.invalid'),
-    ('/dev/ttyACM0,12345', 'baud rate must be one of 9600')])
+    ('udp://:14540@192.168.1.5:14550', r'did you mean udpout:192.168.1.5:14550\?'),
+    ('udp://0.0.0.0:14540@', r'did you mean udpin:0.0.0.0:14540\?'),
+    ('udp://:14540', r'did you mean udpin:127.0.0.1:14540\?'),
+    ('udpin:14540', r'did you mean udpin:127.0.0.1:14540\?'),
+    ('/dev/ttyACM0,12345', 'baud rate must be one of 9600'),
+    ('/dev/ttyACM0:12345', 'baud rate must be one of 9600')])
 def test_a_bad_url_is_refused_with_the_valid_forms(url, reason):
     with pytest.raises(ValueError, match=f'connection = .*{reason}'):
         open_transport(url)
 
 
+@pytest.mark.parametrize(('url', 'expected'), [
+    ('/dev/ttyACM0:57600', ('serial', '', 0, '/dev/ttyACM0', 57600)),
+    ('/dev/ttyACM0', ('serial', '', 0, '/dev/ttyACM0', 115200)),
+    ('serial:///dev/ttyS4:921600', ('serial', '', 0, '/dev/ttyS4', 921600)),
+    ('/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0,57600',
+     ('serial', '', 0, '/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0', 57600)),
+    ('udp:127.0.0.1:14540', ('udpin', '127.0.0.1', 14540, '', 115200)),
+    ('udpin://0.0.0.0:14540', ('udpin', '0.0.0.0', 14540, '', 115200)),
+    ('udpout://10.0.0.2:14550', ('udpout', '10.0.0.2', 14550, '', 115200)),
+    ('tcp://localhost:5760', ('tcp', 'localhost', 5760, '', 115200))])
+def test_the_forms_of_other_programs_are_taken(url, expected):
+    assert parse_connection(url) == expected
+
+
 def test_a_port_in_use_is_named():
     first = open_transport('udpin:127.0.0.1:0')
     url = f'udpin:127.0.0.1:{first.address[1]}'
-    with pytest.raises(OSError, match=f'connection = .{url}.: cannot listen there: Address'):
+    with pytest.raises(OSError, match=f'connection = .{url}.: cannot listen there: .*EADDRINUSE'):
         open_transport(url)
     first.close()
+
+
+def test_an_address_that_no_interface_has_yet_is_reported_and_listened_on_later(monkeypatch):
+    bind, taken = socket.socket.bind, []
+
+    class Late(socket.socket):
+        def bind(self, address):
+            if not taken:
+                raise OSError(errno.EADDRNOTAVAIL, os.strerror(errno.EADDRNOTAVAIL))
+            bind(self, address)
+    monkeypatch.setattr(socket, 'socket', Late)
+    transport = open_transport('udpin:127.0.0.1:0')
+    assert 'EADDRNOTAVAIL' in transport.fault and transport.fileno() == -1
+    assert not transport.write(b'x') and list(transport.read()) == []
+    taken.append(True)
+    transport.reopen(1.0)
+    assert transport.fault == '' and transport.fileno() >= 0
+    transport.close()
+
+
+def test_a_datagram_that_cannot_be_sent_is_reported_with_its_remedy_until_one_is(monkeypatch):
+    transport = open_transport('udpout:255.255.255.255:14550')  # without the right to broadcast
+    assert not transport.write(b'x')
+    assert '(EACCES): a broadcast address' in transport.fault
+    transport.peer = ('127.0.0.1', 9)
+    assert transport.write(b'x') and transport.fault == ''
+    transport.close()
+
+
+@pytest.mark.parametrize(('number', 'word'), [
+    (errno.ENETUNREACH, 'interface'), (errno.EHOSTUNREACH, 'address'), (errno.EPERM, 'firewall'),
+    (errno.EADDRINUSE, 'end it'), (errno.EACCES, 'below 1024'), (errno.EIO, '')])
+def test_an_error_has_its_name_and_a_remedy(number, word):
+    text = explain_error(OSError(number, os.strerror(number)))
+    assert f'({errno.errorcode[number]})' in text and word in text
+
+
+@pytest.mark.parametrize(('mode', 'group', 'said'), [
+    (0o660, 20, 'usermod -aG {name} '), (0o600, 20, '61-flight-controller.rules'),
+    (0o660, 0, '61-flight-controller.rules')])
+def test_a_serial_port_without_permission_names_its_group(monkeypatch, mode, group, said):
+    name = grp.getgrgid(group).gr_name
+    monkeypatch.setattr(os, 'stat', lambda _: SimpleNamespace(st_gid=group, st_mode=mode))
+    text = explain_error(PermissionError(errno.EACCES, 'Permission denied'), '/dev/ttyACM0')
+    assert text.startswith('Permission denied (EACCES): ') and said.format(name=name) in text

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 import math
+from pathlib import Path
 import socket
 import threading
 import time
@@ -390,3 +391,24 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
     assert bench.values['missing parameter COM_RC'] == 'does not exist in PX4 1.20.0'
     assert bench.values['unproven firmware'] == results[-1].unproven
     assert bench.values['firmware'] == '1.20.0'
+
+
+def test_the_timestamps_of_signatures_follow_a_clock_that_is_set_after_the_start(
+        make_bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'key').write_bytes(bytes(32))
+    (tmp_path / 'key').chmod(0o600)
+    with monkeypatch.context() as patch:
+        patch.setattr(time, 'time', lambda: 1000.0)  # no battery for the clock
+        bench = make_bench(signing_key_file=str(tmp_path / 'key'))
+        assert bench.bridge.link.signing.state.timestamp < 1e6
+    bench.wait(lambda: bench.bridge.link.signing.state.timestamp > 3e13)  # 10 years of 10 us
+
+
+def test_a_line_that_cannot_send_is_named_while_the_autopilot_is_received(make_bench):
+    bench = make_bench()
+    bench.beat()
+    bench.wait(lambda: bench.bridge.alive(time.monotonic()))
+    bench.bridge.link.transport.write = lambda _: False
+    bench.bridge.link.transport.fault = 'Network is unreachable (ENETUNREACH)'
+    assert bench.values['link fault'] == 'Network is unreachable (ENETUNREACH)'
+    assert 'cannot send on udpin:127.0.0.1:0: Network is unreachable' in bench.problems()

@@ -47,7 +47,8 @@ class Client:
 
 @pytest.mark.parametrize(('looks', 'success', 'code', 'said', 'asked'), [
     (1, True, 0, '/offboard: because', 1), (0, False, 1, 'error: /offboard: because', 1),
-    (10**9, True, 1, 'error: /offboard: no such service of type SetBool within 0.2 s', 0),
+    (10**9, True, 1, 'error: /offboard: no such service of type SetBool within 0.2 s; '
+     'did you mean mavlink_bridge/offboard?', 0),
     (0, None, 1, 'error: /offboard: no answer: the result is unknown', 1)])
 def test_a_request_is_made_once_and_its_answer_shown(
         monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], looks: int,
@@ -57,6 +58,16 @@ def test_a_request_is_made_once_and_its_answer_shown(
     assert call.main(['offboard', 'true', '--timeout', '0.2']) == code
     assert ''.join(capsys.readouterr()).strip() == said
     assert client.asked == [True] * asked
+
+
+@pytest.mark.parametrize(('service', 'there', 'meant'), [
+    ('/engage', [], 'planner/engage'), ('/land', [], 'mavlink_bridge/land'),
+    ('/planner/engage', ['/drone1/planner/engage'], 'drone1/planner/engage'),
+    ('/planer/engag', [], 'planner/engage'), ('/planner/engage', [], ''),
+    ('/something/else', [], '')])
+def test_a_service_named_without_its_node_gets_a_proposal(
+        service: str, there: list[str], meant: str) -> None:
+    assert call.proposal(service, there) == (f'; did you mean {meant}?' if meant else '')
 
 
 def test_it_waits_longer_than_any_service_takes() -> None:

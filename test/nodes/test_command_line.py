@@ -122,6 +122,22 @@ def test_a_start_that_fails_is_one_line_and_exit_code_1(
     assert not (tmp_path / 'bag').exists()
 
 
+@pytest.mark.parametrize('fault', ['missing', 'unreadable', 'a folder'])
+@pytest.mark.parametrize(('node', 'option'), [
+    ('relative_pose', '-p neighbors_file:='), ('planner', '-p neighbors_file:='),
+    ('mavlink_bridge', f'-p {BRIDGE} -p signing_key_file:='), ('planner', '--params-file '),
+    ('simulator', '-p scenario:=')])
+def test_a_file_that_cannot_be_read_is_refused_by_name(
+        node: str, option: str, fault: str, tmp_path: Path,
+        capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'mine.yaml'
+    if fault == 'unreadable':
+        path.symlink_to('/proc/self/mem')
+    elif fault == 'a folder':
+        path.mkdir()
+    assert str(path) in refused(capfd, node, '--ros-args', *f'{option}{path}'.split())
+
+
 def test_a_wrong_scenario_file_is_refused_with_file_key_and_the_valid_values(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'mine.yaml'

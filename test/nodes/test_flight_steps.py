@@ -113,7 +113,7 @@ def test_without_keys_each_step_is_requested_once_and_a_refusal_ends_the_flight(
     ('udpin:127.0.0.1:14540', True), ('udpout:localhost:14540', True), ('tcp:127.0.0.2:1', True),
     ('udpin:0.0.0.0:14540', False), ('/dev/ttyACM0:57600', False), ('udpin:drone:14540', False),
     ('tcp:localhost.example.com:5760', False), ('udpin:127.0.0.1', False), ('', False),
-    ('udpin:192.168.1.2:14540', False)])
+    ('udpin:192.168.1.2:14540', False), ('udp://127.0.0.1:14540', True)])
 def test_only_an_address_of_this_machine_is_loopback(connection: str, own: bool) -> None:
     assert loopback(connection) is own
 

@@ -92,3 +92,13 @@ def test_constants_of_the_gate_are_no_parameters() -> None:
     missing = {field.name for field in fields(GateLimits)} - {
         spec.name for spec in MAVLINK_BRIDGE}
     assert missing == {'brake_time', 'speed_horizon', 'blind_timeout'}
+
+
+def test_a_user_without_a_home_folder_has_a_folder_of_recordings(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless(_: Path) -> Path:
+        raise RuntimeError('Could not determine home directory.')
+    monkeypatch.setattr(Path, 'expanduser', homeless)
+    usual = recordings_folder({'record_folder': ''}, '', '')
+    assert usual == Path('/.ros/flock_follower/black_box')
+    assert recordings_folder({'record_folder': '~/x'}, '', '') == Path('/x')

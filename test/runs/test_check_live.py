@@ -29,6 +29,7 @@ import pytest
 
 from flock_desk.program import PROGRAMS
 from flock_desk.runs.processes import claim_domain, free_udp_port, private_environment, Processes
+from flock_follower.fast_dds import PROFILE_VARIABLES
 
 pytestmark = pytest.mark.ros
 #: What a busy machine makes late is no false alarm.
@@ -47,7 +48,9 @@ def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, 
     ended = subprocess.run(
         [sys.executable, '-m', 'flock_follower.check', '--json', *arguments],
         env=environment, capture_output=True, text=True, timeout=DEADLINE)
-    assert ended.stderr == ''
+    # Fast DDS 3 deprecates the variable that Fast DDS 2 needs.
+    lines = [line for line in ended.stderr.splitlines() if PROFILE_VARIABLES[1] not in line]
+    assert lines == []
     reported = json.loads(ended.stdout)
     found: dict[str, list[Any]] = {}
     for finding in reported['findings']:

@@ -317,9 +317,9 @@ def test_the_bridge_ends_a_flight_with_its_first_state_after_active(states, ende
 
 
 @pytest.mark.parametrize(('autopilot', 'truth', 'expected'), [
-    ('udp:127.0.0.1:14988', '', ('udpin:127.0.0.1:14988', 'udpin:127.0.0.1:19410')),
+    ('udp:127.0.0.1:14988', '', ('udp:127.0.0.1:14988', 'udpin:127.0.0.1:19410')),
     ('udpin:127.0.0.1:14988', 'udp:127.0.0.1:14989',
-     ('udpin:127.0.0.1:14988', 'udpin:127.0.0.1:14989')),
+     ('udpin:127.0.0.1:14988', 'udp:127.0.0.1:14989')),
     ('tcp:127.0.0.1:5760', '', ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5762')),
     ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5763', ('tcp:127.0.0.1:5760', 'tcp:127.0.0.1:5763'))])
 def test_the_truth_comes_on_the_usual_link_of_each_simulator(autopilot, truth, expected):

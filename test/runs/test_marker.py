@@ -212,3 +212,14 @@ def test_bad_options_end_in_one_line_and_exit_code_2(
     assert output.err.startswith('error: ') and output.err.count('\n') == 1 and not output.out
     assert re.search(message, output.err)
     assert not list(tmp_path.iterdir())
+
+
+def test_without_options_it_is_the_marker_of_the_page(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(ISSUE) == 0
+    expected = capsys.readouterr().out, (tmp_path / 'marker.pdf').read_bytes()
+    for arguments in ([], ['--output', 'marker.pdf']):
+        assert main(arguments) == 0
+        assert (capsys.readouterr().out, (tmp_path / 'marker.pdf').read_bytes()) == expected

@@ -24,8 +24,8 @@ from typing import Any
 
 import pytest
 
-from flock_desk.runs.console import guarded, progress
-from flock_desk.runs.figure_table import bounds, FIGURES, words
+from flock_desk.runs.console import guarded, logs_in, progress
+from flock_desk.runs.figure_table import bounds, FIGURES, parts_of, words
 from flock_desk.runs.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
 from flock_desk.runs.processes import TooBusyError
 from flock_desk.runs.report import announce, report, table, text, WIDTH, write_report
@@ -165,7 +165,7 @@ def test_a_command_ends_in_one_line_and_its_exit_code(
         error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     def command() -> int:
         raise error
-    assert guarded(command, refused=2, hint='; see logs') == code
+    assert guarded(command, refused=2, hint=lambda: '; see logs') == code
     assert capsys.readouterr().err.strip() == line
 
 
@@ -186,3 +186,20 @@ def test_figures_have_as_many_digits_as_people_read(value: Any, shown: str) -> N
 
 def test_a_figure_that_is_not_in_the_table_is_named_by_its_key() -> None:
     assert words('some_group.new_thing') == 'new thing' and words('latency_ms.p50') == 'median'
+
+
+def test_a_dot_of_a_number_divides_no_key(tmp_path: Path) -> None:
+    assert parts_of('holds.at_1.0_s') == ['holds', 'at_1.0_s']
+    assert parts_of('stages.nees_x') == ['stages', 'nees_x'] and parts_of('recall') == ['recall']
+    write_report(tmp_path / 'r.html', 'one', '', {
+        'holds': {'at_1.0_s': '0.5 s: none'}, 'check': {'errors': [], 'warnings': []}}, [])
+    page = (tmp_path / 'r.html').read_text()
+    assert '<td>at 1.0 s</td><td>0.5 s: none</td>' in page
+    assert all(f'<td>{name}</td><td>none</td>' in page for name in ('errors', 'warnings'))
+    assert '@media (max-width: 700px)' in page
+
+
+def test_logs_are_named_only_if_there_are_some(tmp_path: Path) -> None:
+    assert logs_in(tmp_path) == logs_in(tmp_path / 'none') == ''
+    (tmp_path / 'bridge.log').touch()
+    assert str(tmp_path) in logs_in(tmp_path)

@@ -35,7 +35,14 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from flock_follower.checks.system import MISSING, NOT_READY, PARAMETER, REFUSED, UNPROVEN
+from flock_follower.checks.system import (
+    LINK_FAULT,
+    MISSING,
+    NOT_READY,
+    PARAMETER,
+    REFUSED,
+    UNPROVEN,
+)
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
@@ -245,7 +252,7 @@ class BridgeReport:
             'firmware': str(bridge.housekeeping.parameters.version or ''),
             'mode': status.mode if status else '', 'armed': status.armed if status else '',
             'flying': '' if flying is None else flying, 'state': bridge.state(now),
-            'handed_over': bridge.end.why,
+            'handed_over': bridge.end.why, LINK_FAULT: bridge.link.transport.fault,
             REFUSED: bridge.refusal(now) if bridge.alive(now) else ''}
         if unready is not None:
             values[NOT_READY] = unready
@@ -298,12 +305,14 @@ class BridgeReport:
     # Problems; '' or None without one.
 
     def _link_fault(self, now: float) -> str:
-        telemetry = self._bridge.telemetry
+        telemetry, transport = self._bridge.telemetry, self._bridge.link.transport
         if self._bridge.alive(now):
+            if transport.fault:
+                return f'cannot send on {transport.url}: {transport.fault}'
             age = telemetry.mode_age(now)
             return self._bridge.housekeeping.unreceived(now) or ('' if age <= MODE_TIMEOUT else (
                 f'{MODE_UNKNOWN}: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s'))
-        transport, received = self._bridge.link.transport, telemetry.message_time
+        received = telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
         if math.isfinite(received):
@@ -367,8 +376,9 @@ class BridgeReport:
             return None
         bridge, setpoint = self._bridge, self._last.setpoint
         if now - self._stuck_since > STUCK:
+            transport = bridge.link.transport
             return ERROR, (f'no setpoint was sent for {now - self._stuck_since:.1f} s: '
-                           f'{bridge.link.transport.url} is blocked')
+                           f'{transport.url}: {transport.fault or "is blocked"}')
         permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not self._takes_off(now)
         silent = permission.reason.startswith(FELL_SILENT)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
+import os
 import time
 import traceback
 from typing import Any, Final
@@ -32,6 +33,8 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
+
+from flock_follower.checks.shared_memory import open_files, undelivered
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -140,7 +143,10 @@ class Input:
             verdict, why = qos_check_compatible(publisher.qos_profile, self._qos)
             if verdict == QoSCompatibility.ERROR:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
-        return '' if self._sporadic else f'{len(publishers)} publisher(s), none sending'
+        if self._sporadic:
+            return ''
+        fault = undelivered(open_files(), os.getuid())
+        return f'{len(publishers)} publisher(s), ' + (fault or 'none sending')
 
 
 class Diagnostics:

@@ -23,8 +23,10 @@ import gc
 import inspect
 import itertools
 import os
+from pathlib import Path
 import stat
 import sys
+import tempfile
 import time
 from typing import Any, ClassVar, TypeVar
 
@@ -35,6 +37,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -44,6 +47,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from flock_follower.files import read_text
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
@@ -59,6 +63,7 @@ READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 #: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
 READING_TIME = 1e-3  # s within which two clocks are read
+LOGGER = 'flock_follower'  # of lines before a node has its name
 LONGEST_WAIT = 1_000_000_000  # ns: every node polls more often
 
 
@@ -319,7 +324,7 @@ def spin(node: Node) -> None:
 def run(factory: Callable[[], Node], args: list[str] | None = None,
         spin: Callable[[Any], int | None] = spin) -> int:
     """
-    Run one node until Ctrl-C, SIGTERM or its own end, and return the process's exit code.
+    Run one node until Ctrl-C, SIGTERM, SIGHUP or its own end; return the process's exit code.
 
     ``factory`` creates the node; a ValueError or OSError it raises (a bad parameter, a missing
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
@@ -336,11 +341,20 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
               file=sys.stderr)
         return 1
+    try:  # rclpy names neither the cause nor, for a folder, the file
+        for path in files_in(arguments):
+            read_text(path)
+    except (OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
     node: Node | None = None
     code: int | None = 0
+    # A node without a log flies better than none.
+    reason = unwritable_logs(os.environ)
+    silent = ['--ros-args', '--disable-external-lib-logs', '--'] if reason else []
     try:
         try:
-            rclpy.init(args=args)
+            rclpy.init(args=[*silent, *(sys.argv if args is None else args)])
         except RuntimeError as error:  # malformed --ros-args
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
@@ -349,6 +363,8 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         # the same thread may hold their locks, and nodes whose constructor raised. `run` does it.
         context.track_node = lambda node: None
         on_signal(context.try_shutdown)
+        if reason:
+            get_logger(LOGGER).warning(f'logs go to the terminal alone: {reason}')
         FlockNode.parameter_files = files_in(arguments)
         try:
             node = factory()
@@ -373,6 +389,22 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         rclpy.try_shutdown()
         ignore_signals()
     return code or 0
+
+
+def unwritable_logs(environment: Mapping[str, str]) -> str:
+    """Return why ROS, started with an environment, cannot write a log file; '' if it can."""
+    get, home = environment.get, environment.get('HOME', '')
+    name = get('ROS_LOG_DIR') or f'{get("ROS_HOME") or "~/.ros"}/log'
+    if name.startswith('~') and not home:
+        return f'{name}: HOME is not set'
+    folder = Path(home + name[1:] if name.startswith('~') else name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b'.')
+    except OSError as error:
+        return f'{folder}: {error.strerror}'
+    return ''
 
 
 def never_block_output() -> None:
