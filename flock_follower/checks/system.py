@@ -50,6 +50,10 @@ PARAMETER: Final = 'parameter '
 MISSING: Final = 'missing parameter '
 UNPROVEN: Final = 'unproven firmware'
 NOT_READY: Final = 'not ready to arm'
+UNREAD: Final = 'parameters unread'
+#: That the autopilot answers nothing, or ''; the questions that have no answer.
+NO_ANSWERS: Final = 'no answers'
+UNKNOWN: Final = 'unanswered questions'
 REFUSED: Final = 'offboard would be refused'
 #: The action for a status of a node, by a part of its text.
 ADVICE: Final[Mapping[str, str]] = {
@@ -136,15 +140,20 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
-    link = values.get('link', 'not reported')
-    alive = link == 'alive'
-    yield judged(
-        not alive, False, 'autopilot', ', '.join(
-            values.get(key) or f'no {key}' for key in ('autopilot', 'mode')) if alive else
-        f'not received ({link})', 'received', 'check cable, connection and baud rate; is the '
-        'autopilot on, is its MAVLink port set up?')
-    if not alive:
+    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS, '')
+    vehicle = ', '.join(values.get(key) or f'no {key}' for key in ('autopilot', 'mode'))
+    yield first(
+        'autopilot', 'received, and answers',
+        (silent, ERROR, f'{vehicle}: {silent}', 'check the transmit wire and its level, '
+         'connection and target_system; set the port of the autopilot to MAVLink both ways'),
+        (link != 'alive', ERROR, f'not received ({link})', 'check cable, connection and baud '
+         'rate; is the autopilot on, is its MAVLink port set up?'),
+        (True, OK, vehicle, ''))
+    if silent or link != 'alive':
         return
+    unknown = values.get(UNKNOWN, 'not reported')
+    yield first('answers', 'every question is answered',
+                (unknown, UNMEASURED, f'none about {unknown}', ''), (True, OK, 'all', ''))
     for key in values:
         if key.startswith(PARAMETER):
             yield Finding(WARNING, 'autopilot parameter',
@@ -158,9 +167,11 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     if UNPROVEN in values:
         yield Finding(WARNING, 'autopilot firmware', values[UNPROVEN], 'known',
                       'compare its parameters with the recommended values by hand')
-    if 'parameters' not in values:
-        yield Finding(UNMEASURED, 'autopilot parameters', 'not compared yet: check again in '
-                      'some seconds', 'as config/ recommends')
+    unread = values.get(UNREAD, '')
+    if unread or 'parameters' not in values:
+        yield Finding(UNMEASURED, 'autopilot parameters', f'no answer about {unread}' if unread
+                      else 'not compared yet: check again in some seconds',
+                      'as config/ recommends')
     wanted = 'no obstacle'
     for what, key, advice in (
             ('ready to arm', NOT_READY, 'fix the reported causes, then check again'),
@@ -169,5 +180,5 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         if key in values:
             yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
                          wanted, wanted, advice)
-        elif key == NOT_READY and values.get('armed') != 'True':
-            yield Finding(UNMEASURED, what, 'the autopilot has not reported it yet', wanted)
+        elif key == REFUSED or values.get('armed') != 'True':
+            yield Finding(UNMEASURED, what, 'not reported yet', wanted)

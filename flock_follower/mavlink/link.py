@@ -40,6 +40,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import AUTO, describe, dialect_of
+from flock_follower.mavlink.link_questions import LinkQuestions
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
@@ -218,6 +219,7 @@ class Link:
         self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
                           else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
+        self.questions = LinkQuestions((source_system, source_component))
         #: Number of messages that were received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
@@ -227,6 +229,7 @@ class Link:
         self.signing = signing
         #: Whether the autopilot's newest message was signed.
         self.autopilot_signs = False
+        self._now = -math.inf  # of the last call of receive, s
         self._framers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
@@ -239,6 +242,7 @@ class Link:
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
         messages = []
+        self._now = now
         self.transport.reopen(now)
         # Pieces of the vehicle, and of all other senders together.
         budgets = {True: MOST_PIECES, False: MOST_PIECES}
@@ -258,6 +262,7 @@ class Link:
                     continue
                 self.autopilot_signs = bool(message.get_header().incompat_flags & _SIGNED)
                 self.telemetry.update(message, now)
+                self.questions.take(message, now)
                 messages.append(message)
         return messages
 
@@ -300,6 +305,7 @@ class Link:
             return False
         data = message.pack(self._sender)
         self._sender.seq = (self._sender.seq + 1) % 256
+        self.questions.sent(message, self._now)
         sent = self.transport.write(bytes(data))
         self.bytes_sent += len(data) * sent
         return sent

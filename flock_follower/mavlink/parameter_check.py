@@ -159,6 +159,8 @@ class CheckResult(NamedTuple):
     """For people: each difference, and its reason."""
     missing: tuple[str, ...] = ()
     """For people: each parameter that does not exist."""
+    unread: tuple[str, ...] = ()
+    """The names of what was not answered: unknown, and so neither good nor bad."""
     unproven: str = ''
     """For people: the firmware, if no recommendation is known for it."""
 
@@ -256,16 +258,13 @@ class ParameterCheck:
                  for name, entry in recommended.items()
                  if name in values and entry.differs(values[name])]
         differing = len(lines)
-        if unanswered:
-            lines.append(f'no answer about {", ".join(unanswered)}: '
-                         'compare them with the recommended values by hand')
         known = version is None or dialect.versions[0] <= version[:2] <= dialect.versions[1]
         return CheckResult(
             len(values), differing, len(unanswered), tuple(lines),
             tuple(f'{name} does not exist in {self.firmware}' + (
                 f', recommended {recommended[name].value:g}: {recommended[name].why}'
                 if name in recommended else '') for name in names if name in missing),
-            '' if known else
+            tuple(unanswered), '' if known else
             f'{self.firmware}: the recommended values are known for {dialect.known_versions}')
 
 
@@ -276,6 +275,8 @@ def _name_of(message: Any) -> str:
 
 
 _ANYWAY: Final[str] = 'require_failsafe:=false'
+#: The action if a parameter is not answered, whose cause is not known.
+ASK: Final[str] = 'does the autopilot receive our messages? read them in the ground station'
 
 
 def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
@@ -296,4 +297,4 @@ def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> 
                 f'{parameters.firmware}: {doubt}; its rules are known for '
                 f'{dialect.known_versions}')
     unread = ', '.join(rule.name for rule in applicable if rule.name not in values)
-    return unread and f'{unread} could not be read: {doubt} ({_ANYWAY} flies all the same)'
+    return unread and f'{unread} could not be read: {doubt}; {ASK}'

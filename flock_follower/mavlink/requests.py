@@ -113,9 +113,7 @@ class Requests:
 
     def acknowledge(self, ack: Any, now: float) -> None:
         """Take a COMMAND_ACK."""
-        # To us, not to a ground station. MAVLink 1 has no target.
-        ours = (ack.target_system in (0, self._link.source_system)
-                and ack.target_component in (0, self._link.source_component))
+        ours = self._link.questions.addressed(ack)  # not to a ground station
         if ours and self.newest is not None and self.newest.acknowledge(
                 ack.command, ack.result, now):
             self._housekeeping.request_reasons()
@@ -202,7 +200,8 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
-        reasons = [gate.permission.taken_over(now), gate.contradiction(now)]
+        reasons = [self._housekeeping.unreceived(now), gate.permission.taken_over(now),
+                   gate.contradiction(now)]
         if gate.speed(now) is None:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:

@@ -35,11 +35,21 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from flock_follower.checks.system import MISSING, NOT_READY, PARAMETER, REFUSED, UNPROVEN
+from flock_follower.checks.system import (
+    MISSING,
+    NO_ANSWERS,
+    NOT_READY,
+    PARAMETER,
+    REFUSED,
+    UNKNOWN,
+    UNPROVEN,
+    UNREAD,
+)
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
+from flock_follower.mavlink.parameter_check import ASK
 from flock_follower.mavlink.permission import (
     FELL_SILENT,
     MODE_TIMEOUT,
@@ -223,7 +233,8 @@ class BridgeReport:
         # While some are unanswered, more lines may follow.
         lines = () if result is None else (
             *(f'parameter {line}' for line in (*result.lines, *result.missing)),
-            *filter(None, (result.unproven,)))
+            *filter(None, (result.unproven, result.unread and (
+                f'no answer about {", ".join(result.unread)}: {ASK}'))))
         good = result is not None and not (lines or result.unanswered)
         if result is not None and good:
             lines = (f'{result.answered} parameters of the autopilot are as recommended',)
@@ -237,10 +248,13 @@ class BridgeReport:
         """Return the state of autopilot and flight, and reasons against offboard and arming."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
         status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
-        result = bridge.housekeeping.parameters.result()
+        result, unreceived = (
+            bridge.housekeeping.parameters.result(), bridge.housekeeping.unreceived(now))
         values: dict[str, object] = {
-            'link': 'alive' if bridge.alive(now) else (
+            'link': ('one way' if unreceived else 'alive') if bridge.alive(now) else (
                 'lost' if telemetry.status else 'never received'),
+            NO_ANSWERS: unreceived,
+            UNKNOWN: ', '.join(bridge.link.questions.unknown(now)),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
             'firmware': str(bridge.housekeeping.parameters.version or ''),
             'mode': status.mode if status else '', 'armed': status.armed if status else '',
@@ -255,6 +269,8 @@ class BridgeReport:
             for key, texts in ((PARAMETER, result.lines), (MISSING, result.missing)):
                 values |= {key + name: rest for name, _, rest in (
                     text.partition(' ') for text in texts)}
+            if result.unread:
+                values[UNREAD] = ', '.join(result.unread)
             if result.unproven:
                 values[UNPROVEN] = result.unproven
         return values
