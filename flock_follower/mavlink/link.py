@@ -40,6 +40,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import AUTO, describe, dialect_of
+from flock_follower.mavlink.identity import device, Identity
 from flock_follower.mavlink.link_questions import LinkQuestions
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
@@ -202,24 +203,26 @@ class Link:
     """
     A link over a transport to the autopilot of ``target_system``.
 
-    :param source_system: our own system id; the vehicle's own is usual for its companion.
+    :param source_system: our own system id; 0: that of the vehicle, as MAVLink wants it of its
+        companion.
     :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
     :param signing: if given, every message is signed and unsigned ones are dropped.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     """
 
-    def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
+    def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 0,
                  source_component: int = COMPONENT, autopilot: str = AUTO,
                  signing: Signing | None = None, announce_as_gcs: bool = False) -> None:
         self.transport = transport
         self.target_system = target_system
-        self.source_system = source_system
+        self.source_system = source_system or target_system
         self.source_component = source_component
         self.autopilot = autopilot
         self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
                           else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
-        self.questions = LinkQuestions((source_system, source_component))
+        self.questions = LinkQuestions((self.source_system, source_component))
+        self.identity = Identity()
         #: Number of messages that were received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
@@ -280,12 +283,18 @@ class Link:
         """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
         kind, system = message.get_type(), message.get_srcSystem()
         component = message.get_srcComponent()
+        other = device(message)
+        if other and (system, component) != (self.target_system, AUTOPILOT_COMPONENT):
+            return f'of {other} (system id {system}, component {component})'
         if system != self.target_system:
             return f'of system id {system}, not target_system {self.target_system}'
         if component != AUTOPILOT_COMPONENT:
             return f'of component {component}, not of an autopilot'
+        if other:
+            return f'of {other} that sends as an autopilot (component {component})'
         if kind == 'HEARTBEAT' and dialect_of(message, self.autopilot) is None:
             return f'of {describe(message)}, which autopilot = {self.autopilot!r} does not send'
+        self.identity.take(message, peer, peer == self.transport.peer, now)
         if peer == self.transport.peer:
             return ''
         # Answer one vehicle only: a second one with the same id must be silent first.
@@ -293,7 +302,8 @@ class Link:
             return 'second sender'
         if kind != 'HEARTBEAT':
             return 'before HEARTBEAT'
-        if math.isfinite(self.telemetry.message_time):
+        if math.isfinite(self.telemetry.message_time) and (
+                not self.identity.same(self.transport.peer, peer)):
             self.peer_changes += 1
             self.telemetry.forget()
         self.transport.peer = peer

@@ -34,6 +34,7 @@ from flock_follower.mavlink.estimator_health import explained, misplaced
 from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
+from flock_follower.mavlink.identity import not_hovering
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -200,8 +201,9 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
-        reasons = [self._housekeeping.unreceived(now), gate.permission.taken_over(now),
-                   gate.contradiction(now)]
+        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived(now), gate.permission.taken_over(now),
+                   gate.contradiction(now),
+                   not_hovering(telemetry.vehicle_type, telemetry.vtol_state(now))]
         if gate.speed(now) is None:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:
