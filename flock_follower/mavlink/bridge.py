@@ -245,6 +245,8 @@ class Bridge:
             self._last_sent = now
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
+        for change in self.housekeeping.changes():
+            self.ground_station.take_warning(change)
         self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
         # On a line too slow for all, setpoints go first.

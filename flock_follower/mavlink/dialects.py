@@ -148,6 +148,9 @@ class Dialect:
     """The parameters that forbid offboard."""
     versions: tuple[tuple[int, int], tuple[int, int]]
     """The oldest and the newest firmware, major and minor, for which both are known."""
+    watched: tuple[str, ...]
+    """Parameters of failsafe, frame and height that, besides those of ``rules``, may not change in
+    flight."""
     hover_thrust: str
     """Parameter of the hover thrust."""
     mode_message: int
@@ -249,6 +252,8 @@ PX4: Final[Dialect] = Dialect(
             math.isfinite(value) and int(value) & _FUSED_BITS == _FUSED_BITS),
              f'{_NOT_FUSED}set bits 0 (horizontal position) and 2 (velocity), as 13 does',
              forwarding=True)),
+    watched=('NAV_RCL_ACT', 'COM_LOW_BAT_ACT', 'COM_RCL_EXCEPT', 'GF_ACTION', 'EKF2_GPS_CTRL',
+             'EKF2_HGT_REF', 'EKF2_MAG_TYPE'),
     hover_thrust='MPC_THR_HOVER',
     # Two changes further apart than 20 ms arrive as two messages. The cost is that of 2 Hz:
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
@@ -284,6 +289,8 @@ ARDUPILOT: Final[Dialect] = Dialect(
         *(Rule(f'EK3_SRC1_{source}', lambda value: value != _EXTERNAL_NAVIGATION,
                f'{_NOT_FUSED}set it to {_EXTERNAL_NAVIGATION} (ExternalNav)', forwarding=True)
           for source in ('POSXY', 'VELXY'))),
+    watched=('FS_THR_ENABLE', 'BATT_FS_LOW_ACT', 'BATT_FS_CRT_ACT', 'FENCE_ACTION',
+             'EK3_SRC1_POSZ', 'EK3_SRC1_VELZ', 'EK3_SRC1_YAW'),
     hover_thrust='MOT_THST_HOVER',
     # HEARTBEAT is sent at once when the mode changes; 5 Hz covers lost ones.
     mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0,

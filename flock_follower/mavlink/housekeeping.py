@@ -42,6 +42,7 @@ from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.link_questions import NO_ANSWER, REASONS
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
+from flock_follower.mavlink.parameter_watch import ParameterWatch
 from flock_follower.mavlink.sticks import take_over_slowly
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 from flock_follower.messages import to_nanoseconds
@@ -170,6 +171,7 @@ class Housekeeping:
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
         self.parameters = ParameterCheck()
+        self.watch = ParameterWatch()
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
@@ -207,7 +209,7 @@ class Housekeeping:
             self._link.questions.begin_again()
             self._why_asked = self._reasons_since = -math.inf
             self.timesync = TimeSync()  # its clock has restarted
-            self.parameters = self._new_check()
+            self.parameters, self.watch = self._new_check(), ParameterWatch()
             self.origin.begin_again()
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
@@ -221,6 +223,12 @@ class Housekeeping:
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
         self._request_reasons_in_time(now)
+
+    def changes(self) -> list[str]:
+        """Return the parameters that a rule depends on and that have just changed in flight."""
+        status = self._link.telemetry.status
+        return self.watch.step(self.parameters.values, self.parameters.watched(),
+                               status is not None and status.armed)
 
     def _request_reasons_in_time(self, now: float) -> None:
         status, answered = self._link.telemetry.status, self._link.questions.answered(REASONS)

@@ -123,8 +123,12 @@ class TwoSources(Generic[T]):
             self._turns += 1
             if self._turns >= TURNS:
                 self.found = now
+        # Two that one value fits are one, as two counters are that pass each other.
+        apart = [each for each in known if each is not near
+                 and self._distance(each.value, value) > self._most(now - each.time)]
+        self._turns = self._turns if apart else 0
         near.value, near.time = value, now
-        self._sources = [*(each for each in known if each is not near), near]
+        self._sources = [*apart, near]
 
 
 def _steps_apart(one: int, other: int) -> float:

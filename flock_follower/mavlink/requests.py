@@ -201,7 +201,8 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
-        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived(now), gate.permission.taken_over(now),
+        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived(now),
+                   gate.permission.taken_over(now),
                    gate.contradiction(now),
                    not_hovering(telemetry.vehicle_type, telemetry.vtol_state(now))]
         if gate.speed(now) is None:
@@ -209,7 +210,8 @@ class Requests:
         if in_air:
             reasons += [IN_AIR[telemetry.flying(now)],
                         envelope.outside(gate.limits, gate.heights.height(now))]
-        reasons += [self._end.battery_low(now), self._housekeeping.origin.obstacle,
+        reasons += [self._housekeeping.watch.obstacle(), self._end.battery_low(now),
+                    self._housekeeping.origin.obstacle,
                     misplaced(telemetry.local_place(now), telemetry.home(),
                               gate.odometry_position)]
         if self._require_failsafe:

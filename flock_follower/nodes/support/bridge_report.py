@@ -114,8 +114,10 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, bridge.link.identity.conflict), (ERROR, self._ended), (ERROR, self._forwarding_fault),
+                (ERROR, self._link_fault), (ERROR, bridge.link.identity.conflict),
+                (ERROR, self._ended), (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
+                (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
                 (WARN, self._planner_differs), (WARN, self._heights_differ),
                 (WARN, self._battery_unknown)))]
