@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import contextlib
 import fcntl
-import math
 from pathlib import Path
 import time
 from typing import Final
@@ -89,17 +88,19 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
 
 def _shared_memory(machine: Machine, image: int) -> Finding:
     """Check the shared memory; ``image`` is the size of the largest image, bytes."""
-    free = math.inf if machine.shared_memory_free is None else machine.shared_memory_free
+    free = machine.shared_memory_free
     return first(
         'shared memory', f'{ROOM:.0f} MB, images that fit into {machine.segment // 1024} kB',
-        (free < ROOM, ERROR, f'{free:.0f} MB free in /dev/shm', 'delete /dev/shm/fastrtps_* of '
-         'processes that are gone; in a container, --shm-size'),
+        (free is not None and free < ROOM, ERROR, f'{free or 0.0:.0f} MB free in /dev/shm',
+         'delete /dev/shm/fastrtps_* of processes that are gone; in a container, --shm-size'),
         (machine.dead_segments >= DEAD_SEGMENTS, WARNING,
          f'{machine.dead_segments} segments of processes that were killed slow every node',
          'fastdds shm clean'),
         (image > machine.segment, WARNING,
          f'images of {image / 1024:.0f} kB, of which some may be lost',
          'export FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml for every node'),
+        (free is None, UNMEASURED, 'the space in /dev/shm is unknown', ''),
+        (not image, UNMEASURED, 'no image was seen', ''),
         (True, OK, f'images of {image / 1024:.0f} kB', ''))
 
 

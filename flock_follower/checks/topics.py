@@ -100,7 +100,9 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
                  if 'use_sim_time' in own}
     clock = '/clock' in seen.topics
     wrong = ', '.join(node for node, value in simulated.items() if value != clock)
-    if simulated:
+    unread = ', '.join(node for node in OURS if node not in simulated
+                       and full_name(node, seen.namespace) in seen.nodes)
+    if simulated or unread:
         yield first(
             'clock', 'use_sim_time if there is a /clock, and only then',
             (wrong and clock, ERROR,
@@ -108,6 +110,7 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
              'start with -p use_sim_time:=true; or end the publisher of /clock'),
             (wrong, ERROR, f'use_sim_time is true in {wrong}, but no node publishes /clock',
              'start without use_sim_time; or replay with /clock'),
+            (unread, UNMEASURED, f'no parameters received of {unread}', ''),
             (True, OK, 'the same for all our nodes', ''))
 
 
