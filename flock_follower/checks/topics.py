@@ -81,7 +81,8 @@ def check_nodes(seen: Observations) -> Finding:
     """Check that each of our nodes runs once."""
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = ', '.join(name for name, number in count.items() if number == 0)
-    twice = ', '.join(name for name, number in count.items() if number > 1)
+    twice = ', '.join(f'{name}{_files(seen, name)}' for name, number in count.items()
+                      if number > 1)
     other = ', '.join(full for full in seen.nodes if count.get(full.rsplit('/', 1)[-1]) == 0)
     return first(
         'nodes', 'each of our three, once',
@@ -92,6 +93,13 @@ def check_nodes(seen: Observations) -> Finding:
          'check --namespace NAME; or start all in one namespace'),
         (missing, ERROR, f'not running: {missing}', f'start: {START}'),
         (True, OK, 'all three are running', ''))
+
+
+def _files(seen: Observations, node: str) -> str:
+    """Return the different parameter files of nodes with one name as text; '' if they agree."""
+    files = seen.files.get(full_name(node, seen.namespace).lstrip('/'), [])
+    return f' (with {" and with ".join(each or "no file" for each in files)})' if (
+        len(files) > 1) else ''
 
 
 def _clocks(seen: Observations) -> Iterator[Finding]:

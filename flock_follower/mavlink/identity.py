@@ -51,7 +51,11 @@ FLOWN: Final[float] = 5.0
 #: Messages of one sender that may be lost, or arrive in another order, in a row.
 MISSING_MOST: Final[int] = 16
 _MOST_PEERS: Final[int] = 16
+#: HEARTBEATs of ours that may be echoed, and those of another that show it.
+_ECHOES: Final[int] = 5
+_RIVAL_BEATS: Final[int] = 3
 TWO_VEHICLES: Final[str] = 'two vehicles send with one system id'
+SECOND_BRIDGE: Final[str] = 'another program sends with the ids of this bridge'
 _REMEDY: Final[str] = 'give each its own (MAV_SYS_ID, MAV_SYSID), and set target_system'
 FORWARD_FLIGHT: Final[str] = 'a VTOL that does not hover (EXTENDED_SYS_STATE.vtol_state)'
 
@@ -158,6 +162,17 @@ class Identity:
         self._addresses: TwoSources[Any] = TwoSources(
             lambda one, other: float(one != other), lambda _: 0.0)
         self._peers: dict[Any, _Peer] = {}
+        self._beats: deque[int] = deque(maxlen=_ECHOES)  # sequence numbers of our HEARTBEATs
+        self._rivals: deque[float] = deque(maxlen=_RIVAL_BEATS)  # when another's arrived, s
+
+    def sent_heartbeat(self, number: int) -> None:
+        """Take the sequence number of a HEARTBEAT of ours, which a line may echo."""
+        self._beats.append(number)
+
+    def take_own(self, message: Any, now: float) -> None:
+        """Take a message with our own ids."""
+        if message.get_type() == 'HEARTBEAT' and message.get_seq() not in self._beats:
+            self._rivals.append(now)
 
     def take(self, message: Any, peer: Any, answered: bool, now: float) -> None:
         """Take a message of the autopilot; ``answered``: whether ours are sent to its sender."""
@@ -184,7 +199,10 @@ class Identity:
                 self._places.take(place, now)
 
     def conflict(self, now: float) -> str:
-        """Return that two vehicles send, and by which evidence, or ''."""
+        """Return that two vehicles send, and by which evidence, or two bridges, or ''."""
+        if len(self._rivals) == _RIVAL_BEATS and now - self._rivals[0] <= FINDING:
+            return (f'{SECOND_BRIDGE}: end one, a second mavlink_bridge or MAVROS; or set '
+                    'source_system')
         evidence = [name for name, sources in (
             ('times of boot', self._boots), ('positions', self._places),
             ('sequence numbers', self._numbers), ('addresses', self._addresses))

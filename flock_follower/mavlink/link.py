@@ -283,6 +283,8 @@ class Link:
         """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
         kind, system = message.get_type(), message.get_srcSystem()
         component = message.get_srcComponent()
+        if (system, component) == (self.source_system, self.source_component):
+            self.identity.take_own(message, now)
         other = device(message)
         if other and (system, component) != (self.target_system, AUTOPILOT_COMPONENT):
             return f'of {other} (system id {system}, component {component})'
@@ -322,6 +324,7 @@ class Link:
 
     def send_heartbeat(self) -> bool:
         """Send the HEARTBEAT of an onboard computer, or of a ground station."""
+        self.identity.sent_heartbeat(self._sender.seq)
         return self.send(mavlink.MAVLink_heartbeat_message(
             self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
 

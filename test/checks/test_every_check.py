@@ -390,6 +390,10 @@ FAULTS: list[Fault] = [
           'no parameters received of planner', '', lambda seen: seen.parameters.pop('planner')),
     Fault('an unknown space in shared memory', LIVE, UNMEASURED, 'shared memory',
           'is unknown', '', machine(shared_memory_free=None)),
+    Fault('two planners with different files', LIVE, ERROR, 'nodes',
+          'twice: planner (with a.yaml and with no file)', 'end one of each',
+          lambda seen: vars(seen).update(
+              nodes=[*seen.nodes, '/planner'], files={'planner': ['a.yaml', '']})),
     Fault('questions without an answer', LIVE, UNMEASURED, 'answers', 'none about TIMESYNC', '',
           bridge('unanswered questions', 'TIMESYNC, HOME_POSITION')),
     Fault('a parameter that could not be read', LIVE, UNMEASURED, 'autopilot parameters',

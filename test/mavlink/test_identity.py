@@ -28,6 +28,7 @@ from flock_follower.mavlink.identity import (
     FORWARD_FLIGHT,
     Identity,
     not_hovering,
+    SECOND_BRIDGE,
     TWO_VEHICLES,
 )
 
@@ -141,6 +142,21 @@ def test_two_vehicles_at_two_addresses_are_named():
         assert bench.link.transport.peer == 'first'
         assert ('times of boot' if stamped else 'addresses') in bench.link.identity.conflict(now)
         assert bench.link.identity.conflict(now + 6.0) == ''  # the second one was switched off
+
+
+@pytest.mark.parametrize('echo', [False, True])
+def test_a_second_bridge_on_the_vehicle_is_named_and_an_echo_of_ours_is_not(echo):
+    bench, other = Bench(), mavlink.MAVLink(None, 1, 191)
+    ours = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3)
+    for second in range(1, 6):
+        bench.beats('vehicle', now=float(second))
+        assert bench.link.send_heartbeat()
+        other.seq = 100 + second
+        data = bench.link.transport.written[-1] if echo else bytes(ours.pack(other))
+        bench.link.transport.arrived.append((data, 'vehicle'))
+        bench.link.receive(second + 0.5)
+    assert bench.link.identity.conflict(6.0).startswith(SECOND_BRIDGE) != echo
+    assert bench.link.identity.conflict(12.0) == ''  # the other one has ended
 
 
 def test_one_vehicle_by_two_addresses_is_no_second_one():

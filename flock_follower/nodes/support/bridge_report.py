@@ -72,6 +72,7 @@ from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.parameters.differences import differences
 from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
@@ -93,7 +94,9 @@ class BridgeReport:
         self._start = time.monotonic()
         self.place: tuple[OdometryState, float] | None = None
         """The newest odometry, and its time of arrival on the monotonic clock, s."""
-        self.planner = RemoteParameters(node, 'planner')
+        self._planner_before: dict[str, Any] | None = None
+        self._planner_difference = ''
+        self.planner = RemoteParameters(node, 'planner', self._take_planner)
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._last: Cycle | None = None
         self._stuck_since = math.inf
@@ -119,8 +122,8 @@ class BridgeReport:
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
                 (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
-                (WARN, self._planner_differs), (WARN, self._heights_differ),
-                (WARN, self._battery_unknown)))]
+                (WARN, self._planner_differs), (WARN, self._planner_changed),
+                (WARN, self._heights_differ), (WARN, self._battery_unknown)))]
 
     # From any thread.
 
@@ -365,6 +368,20 @@ class BridgeReport:
         status = self._bridge.status(now)
         return 'the autopilot reports no battery charge: battery_low cannot act' if (
             status and status.armed and self._bridge.end.battery_unknown(now)) else ''
+
+    def _take_planner(self, values: dict[str, Any]) -> None:
+        """Take the planner's parameters, which have changed, or are those of a new planner."""
+        before, self._planner_before = self._planner_before, values
+        status = self._bridge.telemetry.status
+        if before is not None and status is not None and status.armed:
+            self._planner_difference = differences(before, values)
+
+    def _planner_changed(self, now: float) -> str:
+        status = self._bridge.telemetry.status
+        if status is None or not status.armed:
+            self._planner_difference = ''
+        return self._planner_difference and (
+            f'parameters of the planner changed in flight: {self._planner_difference}')
 
     def _planner_differs(self, now: float) -> str:
         """Return the limits that differ from those of the planner as text, or ''."""
