@@ -160,10 +160,10 @@ class CheckResult(NamedTuple):
     """For people: each difference, and its reason."""
     missing: tuple[str, ...] = ()
     """For people: each parameter that does not exist."""
-    unread: tuple[str, ...] = ()
-    """The names of what was not answered: unknown, and so neither good nor bad."""
     unproven: str = ''
     """For people: the firmware, if no recommendation is known for it."""
+    unread: tuple[str, ...] = ()
+    """The names of what was not answered: unknown, and so neither good nor bad."""
 
 
 class ParameterCheck:
@@ -281,8 +281,9 @@ class ParameterCheck:
             tuple(f'{name} does not exist in {self.firmware}' + (
                 f', recommended {recommended[name].value:g}: {recommended[name].why}'
                 if name in recommended else '') for name in names if name in missing),
-            tuple(unanswered), '' if known else
-            f'{self.firmware}: the recommended values are known for {dialect.known_versions}')
+            '' if known else
+            f'{self.firmware}: the recommended values are known for {dialect.known_versions}',
+            tuple(unanswered))
 
 
 def _name_of(message: Any) -> str:

@@ -238,8 +238,8 @@ class BridgeReport:
         # While some are unanswered, more lines may follow.
         lines = () if result is None else (
             *(f'parameter {line}' for line in (*result.lines, *result.missing)),
-            *filter(None, (result.unproven, result.unread and (
-                f'no answer about {", ".join(result.unread)}: {ASK}'))))
+            *filter(None, (result.unproven, f'no answer about {", ".join(result.unread)}: {ASK}'
+                           if result.unread else '')))
         good = result is not None and not (lines or result.unanswered)
         if result is not None and good:
             lines = (f'{result.answered} parameters of the autopilot are as recommended',)
