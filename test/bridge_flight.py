@@ -25,6 +25,7 @@ from flock_desk.vehicles.embedded import STEP
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.messages import Command, OdometryState
 
 PERIOD = 5  # steps of a cycle: 20 Hz
@@ -34,6 +35,12 @@ NO_GPS = {
     'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0},
     'arducopter': {'GPS1_TYPE': 0, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6,
                    'EK3_SRC1_VELZ': 6, 'EK3_SRC1_YAW': 6}}
+
+
+def without_gps(personality, **bridge):
+    """Return the options of a flight on the odometry that is forwarded to the autopilot."""
+    return {'parameters': NO_GPS[personality],
+            'bridge': {'forwarder': OdometryForwarder(30.0), **bridge}}
 
 
 class Modes(NamedTuple):

@@ -175,6 +175,8 @@ class BridgeUnderFire:
         self.traffic = Traffic(seed, personality, theirs and theirs.state)
         self.transport = FuzzedLine()
         self.link = Link(self.transport, signing=ours)
+        # Forged messages look like those of a second vehicle, which would refuse offboard.
+        self.link.identity.conflict = lambda now: ''
         # The random velocities are to contradict those of the autopilot now and then only.
         self.gate = Gate(GateLimits(velocity_disagreement=0.7))
         wanted = [Recommendation(name, 1.0, '') for name in ('COM_OBL_RC_ACT', 'GUID_TIMEOUT')]

@@ -22,6 +22,8 @@ class MemoryLine:
 
     def __init__(self):
         self.arrived, self.written = [], []
+        self.source = 'vehicle'
+        """The address from which it comes."""
 
     def fileno(self):
         return -1
@@ -35,7 +37,7 @@ class MemoryLine:
     def read(self):
         arrived, self.arrived = self.arrived, []
         for data in arrived:
-            yield data, 'vehicle'
+            yield data, self.source
 
     def write(self, data):
         self.written.append(bytes(data))

@@ -219,4 +219,4 @@ def healthy(live: bool = True) -> Observed:
 
 BRIDGE = {'link': 'alive', 'autopilot': 'PX4', 'mode': 'POSCTL', 'armed': 'False',
           'parameters': '0 of 9 differ, 0 unanswered', 'not ready to arm': '',
-          'offboard would be refused': ''}
+          'offboard would be refused': '', 'no answers': '', 'unanswered questions': ''}

@@ -23,6 +23,7 @@ import numpy as np
 
 from flock_follower.checks.image_motion import shift, small
 from flock_follower.checks.observations import (
+    FILES,
     NodeStatus,
     Observations,
     OwnMotion,
@@ -99,6 +100,10 @@ class Collector:
             self.observations.statuses[status.name] = NodeStatus(
                 level[0] if isinstance(level, bytes) else int(level), status.message,
                 {item.key: item.value for item in status.values})
+            files = self.observations.statuses[status.name].values.get(FILES)
+            known = self.observations.files.setdefault(status.name, [])
+            if files is not None and files not in known:
+                known.append(files)
 
     def _image(self, message: Any, arrival: float, stamp: float) -> GrayImage | None:
         """Take an Image or CompressedImage; return its pixels: only some are decoded."""

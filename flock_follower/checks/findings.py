@@ -28,7 +28,7 @@ SURE: Final = 3.0
 #: The system is not ready while one of these is unmeasured. All others may be measured later.
 ESSENTIAL: Final = frozenset({
     'images rate', 'odom rate', 'relative_pose status', 'planner status', 'mavlink_bridge status',
-    'ready to arm'})
+    'ready to arm', 'ready for offboard'})
 _CAMERA: Final = ('images', 'camera_info', 'calibration')
 _AXES: Final = (*_CAMERA, 'odom', 'odom positions', 'odom up', 'odom ahead')
 #: The causes of each property: its row is left out if one of them is an error.

@@ -19,18 +19,25 @@ from __future__ import annotations
 from collections.abc import Iterator
 import math
 
-from flock_follower.checks.findings import ERROR, Finding, OK, WARNING
+from flock_follower.checks.findings import ERROR, Finding, OK, UNMEASURED, WARNING
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.pictures import camera_model
 from flock_follower.settings import Camera, judge
 
 #: Messages after which a rate counts as measured.
 MEASURED_MESSAGES = 10
+#: The nodes whose parameters are judged.
+JUDGED = ('planner', 'mavlink_bridge')
 
 
 def check_settings(seen: Observations) -> Iterator[Finding]:
     """Check that the parameters of a live system can fly; a bag is judged with ours."""
-    values = {**seen.parameters.get('planner', {}), **seen.parameters.get('mavlink_bridge', {})}
+    wanted = 'parameters that can fly'
+    missing = ', '.join(node for node in JUDGED if not seen.parameters.get(node))
+    if missing and seen.live:
+        yield Finding(UNMEASURED, 'settings', f'no parameters received of {missing}', wanted)
+    values = {name: value for node in JUDGED
+              for name, value in seen.parameters.get(node, {}).items()}
     if not values:
         return
     found = judge(values, _camera(seen))
@@ -38,8 +45,8 @@ def check_settings(seen: Observations) -> Iterator[Finding]:
         yield Finding(ERROR if each.dangerous else WARNING, 'settings',
                       f'{each.parameter} = {each.value:g}: {each.why}', each.valid,
                       f'set {each.parameter}')
-    if not found:
-        yield Finding(OK, 'settings', 'judged together', 'parameters that can fly')
+    if not found and not missing:
+        yield Finding(OK, 'settings', 'judged together', wanted)
 
 
 def _camera(seen: Observations) -> Camera:

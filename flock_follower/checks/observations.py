@@ -31,6 +31,8 @@ from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 
+#: Key of a node's diagnostics: its parameter files.
+FILES: Final = 'parameter_files'
 #: The nodes of a follower.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
 
@@ -173,6 +175,8 @@ class Observations:
     sightings: list[list[float]] = field(default_factory=list)
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
     """Newest status by the full name of the node, without its first slash."""
+    files: dict[str, list[str]] = field(default_factory=dict)
+    """The parameter files by the name of the node, as for ``statuses``; two of two nodes."""
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import contextlib
 import fcntl
-import math
 from pathlib import Path
 import time
 from typing import Final
@@ -52,6 +51,10 @@ PARAMETER: Final = 'parameter '
 MISSING: Final = 'missing parameter '
 UNPROVEN: Final = 'unproven firmware'
 NOT_READY: Final = 'not ready to arm'
+UNREAD: Final = 'parameters unread'
+#: That the autopilot answers nothing, or ''; the questions that have no answer.
+NO_ANSWERS: Final = 'no answers'
+UNKNOWN: Final = 'unanswered questions'
 REFUSED: Final = 'offboard would be refused'
 LINK_FAULT: Final = 'link fault'
 #: The action for a status of a node, by a part of its text.
@@ -91,11 +94,12 @@ def check_machine(seen: Observations) -> Iterator[Finding]:
 
 def _shared_memory(machine: Machine, image: int) -> Finding:
     """Check the shared memory; ``image`` is the size of the largest image, bytes."""
-    free = math.inf if machine.shared_memory_free is None else machine.shared_memory_free
+    free = machine.shared_memory_free
     return first(
         'shared memory', f'{ROOM:.0f} MB, images that fit into {machine.segment // 1024} kB',
-        (free < ROOM, ERROR, f'{free:.0f} MB free in /dev/shm', 'delete /dev/shm/fastrtps_* and '
-         'fastdds_* of processes that are gone; in a container, --shm-size'),
+        (free is not None and free < ROOM, ERROR, f'{free or 0.0:.0f} MB free in /dev/shm',
+         'delete /dev/shm/fastrtps_* and fastdds_* of processes that are gone; in a container, '
+         '--shm-size'),
         (machine.dead_segments >= DEAD_SEGMENTS, WARNING,
          f'{machine.dead_segments} segments of processes that were killed slow every node',
          'fastdds shm clean'),
@@ -103,6 +107,8 @@ def _shared_memory(machine: Machine, image: int) -> Finding:
          f'images of {image / 1024:.0f} kB, of which some may be lost',
          ' and '.join(f'{name}=.../config/fastdds.xml' for name in PROFILE_VARIABLES)
          + ' for every node'),
+        (free is None, UNMEASURED, 'the space in /dev/shm is unknown', ''),
+        (not image, UNMEASURED, 'no image was seen', ''),
         (True, OK, f'images of {image / 1024:.0f} kB', ''))
 
 
@@ -143,15 +149,21 @@ def check_diagnostics(seen: Observations) -> Iterator[Finding]:
 
 def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     """Report the state of the autopilot, by the values of the bridge's diagnostics."""
-    link = values.get('link', 'not reported')
-    alive, fault = link == 'alive', values.get(LINK_FAULT, '')
-    yield judged(
-        not alive, bool(fault), 'autopilot', ', '.join(
-            values.get(key) or f'no {key}' for key in ('autopilot', 'mode')) if alive else
-        f'not received ({link})', 'received', fault or 'check cable, connection and baud rate; is '
-        'the autopilot on, is its MAVLink port set up?')
-    if not alive:
+    link, silent = values.get('link', 'not reported'), values.get(NO_ANSWERS, '')
+    fault = values.get(LINK_FAULT, '')
+    vehicle = ', '.join(values.get(key) or f'no {key}' for key in ('autopilot', 'mode'))
+    yield first(
+        'autopilot', 'received, and answers',
+        (silent, ERROR, f'{vehicle}: {silent}', fault or 'check the transmit wire and its level, '
+         'connection and target_system; set the port of the autopilot to MAVLink both ways'),
+        (link != 'alive', ERROR, f'not received ({link})', fault or 'check cable, connection and '
+         'baud rate; is the autopilot on, is its MAVLink port set up?'),
+        (fault, WARNING, vehicle, fault), (True, OK, vehicle, ''))
+    if silent or link != 'alive':
         return
+    unknown = values.get(UNKNOWN, 'not reported')
+    yield first('answers', 'every question is answered',
+                (unknown, UNMEASURED, f'none about {unknown}', ''), (True, OK, 'all', ''))
     for key in values:
         if key.startswith(PARAMETER):
             yield Finding(WARNING, 'autopilot parameter',
@@ -165,9 +177,11 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
     if UNPROVEN in values:
         yield Finding(WARNING, 'autopilot firmware', values[UNPROVEN], 'known',
                       'compare its parameters with the recommended values by hand')
-    if 'parameters' not in values:
-        yield Finding(UNMEASURED, 'autopilot parameters', 'not compared yet: check again in '
-                      'some seconds', 'as config/ recommends')
+    unread = values.get(UNREAD, '')
+    if unread or 'parameters' not in values:
+        yield Finding(UNMEASURED, 'autopilot parameters', f'no answer about {unread}' if unread
+                      else 'not compared yet: check again in some seconds',
+                      'as config/ recommends')
     wanted = 'no obstacle'
     for what, key, advice in (
             ('ready to arm', NOT_READY, 'fix the reported causes, then check again'),
@@ -176,5 +190,5 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         if key in values:
             yield judged(bool(values[key]), False, what, f'no: {values[key]}' if values[key] else
                          wanted, wanted, advice)
-        elif key == NOT_READY and values.get('armed') != 'True':
-            yield Finding(UNMEASURED, what, 'the autopilot has not reported it yet', wanted)
+        elif key == REFUSED or values.get('armed') != 'True':
+            yield Finding(UNMEASURED, what, 'not reported yet', wanted)

@@ -81,7 +81,8 @@ def check_nodes(seen: Observations) -> Finding:
     """Check that each of our nodes runs once."""
     count = {name: seen.nodes.count(full_name(name, seen.namespace)) for name in OURS}
     missing = ', '.join(name for name, number in count.items() if number == 0)
-    twice = ', '.join(name for name, number in count.items() if number > 1)
+    twice = ', '.join(f'{name}{_files(seen, name)}' for name, number in count.items()
+                      if number > 1)
     other = ', '.join(full for full in seen.nodes if count.get(full.rsplit('/', 1)[-1]) == 0)
     return first(
         'nodes', 'each of our three, once',
@@ -94,13 +95,22 @@ def check_nodes(seen: Observations) -> Finding:
         (True, OK, 'all three are running', ''))
 
 
+def _files(seen: Observations, node: str) -> str:
+    """Return the different parameter files of nodes with one name as text; '' if they agree."""
+    files = seen.files.get(full_name(node, seen.namespace).lstrip('/'), [])
+    return f' (with {" and with ".join(each or "no file" for each in files)})' if (
+        len(files) > 1) else ''
+
+
 def _clocks(seen: Observations) -> Iterator[Finding]:
     """Check that every node runs on simulated time if there is a /clock, and only then."""
     simulated = {node: bool(own['use_sim_time']) for node, own in seen.parameters.items()
                  if 'use_sim_time' in own}
     clock = '/clock' in seen.topics
     wrong = ', '.join(node for node, value in simulated.items() if value != clock)
-    if simulated:
+    unread = ', '.join(node for node in OURS if node not in simulated
+                       and full_name(node, seen.namespace) in seen.nodes)
+    if simulated or unread:
         yield first(
             'clock', 'use_sim_time if there is a /clock, and only then',
             (wrong and clock, ERROR,
@@ -108,6 +118,7 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
              'start with -p use_sim_time:=true; or end the publisher of /clock'),
             (wrong, ERROR, f'use_sim_time is true in {wrong}, but no node publishes /clock',
              'start without use_sim_time; or replay with /clock'),
+            (unread, UNMEASURED, f'no parameters received of {unread}', ''),
             (True, OK, 'the same for all our nodes', ''))
 
 

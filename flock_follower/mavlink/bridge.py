@@ -139,7 +139,10 @@ class Bridge:
 
     def state(self, now: float) -> str:
         """Return the text of ``mavlink_bridge/state`` at ``now``, s: the state and its reason."""
-        announced = self.gate.permission.announced()
+        permission = self.gate.permission
+        announced, idle = permission.announced(), permission.phase is Phase.INACTIVE
+        if idle and (unreceived := self.housekeeping.unreceived(now)):
+            announced = f'{permission.phase.value}: {unreceived}'
         return first_reason(
             (self.telemetry.dialect is None, f'{NO_AUTOPILOT}: no HEARTBEAT yet'),
             (not self.alive(now), f'{NO_AUTOPILOT}: lost, {announced} before'), (True, announced))
@@ -242,6 +245,8 @@ class Bridge:
             self._last_sent = now
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
+        for change in self.housekeeping.changes():
+            self.ground_station.take_warning(change)
         self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
         # On a line too slow for all, setpoints go first.

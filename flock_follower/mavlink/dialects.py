@@ -37,6 +37,13 @@ _NOT_FUSED: Final[str] = ': it does not fuse the odometry that is forwarded to i
 #: Bits of PX4's EKF2_EV_CTRL: horizontal position, and velocity.
 _FUSED_BITS: Final[int] = 1 | 4
 _EXTERNAL_NAVIGATION: Final[int] = 6
+#: MAV_TYPE of the vehicles that setpoints of acceleration are for; VTOLs while they hover.
+MULTICOPTERS: Final[frozenset[int]] = frozenset({
+    mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER,
+    mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER,
+    mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR})
+VTOLS: Final[frozenset[int]] = frozenset(range(
+    mavlink.MAV_TYPE_VTOL_TILTROTOR - 2, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1))
 
 
 def enum_name(enum: str, value: int | None) -> str:
@@ -93,8 +100,8 @@ class Dialect:
     """Name for people."""
     firmware: int
     """MAV_AUTOPILOT."""
-    vehicle_types: frozenset[int] | None = None
-    """The values of MAV_TYPE that it is for; None: all."""
+    vehicle_types: frozenset[int]
+    """The values of MAV_TYPE that it is for."""
     modes: Mapping[str, int]
     """custom_mode by the name of the mode."""
     sub_modes: bool
@@ -141,6 +148,9 @@ class Dialect:
     """The parameters that forbid offboard."""
     versions: tuple[tuple[int, int], tuple[int, int]]
     """The oldest and the newest firmware, major and minor, for which both are known."""
+    watched: tuple[str, ...]
+    """Parameters of failsafe, frame and height that, besides those of ``rules``, may not change in
+    flight."""
     hover_thrust: str
     """Parameter of the hover thrust."""
     mode_message: int
@@ -213,6 +223,7 @@ class Dialect:
 #: PX4 1.14 and later.
 PX4: Final[Dialect] = Dialect(
     name='px4', title='PX4', firmware=mavlink.MAV_AUTOPILOT_PX4,
+    vehicle_types=MULTICOPTERS | VTOLS,
     modes=MappingProxyType({name: main << 16 | sub << 24 for name, main, sub in (
         ('MANUAL', 1, 0), ('ALTCTL', 2, 0), ('POSCTL', 3, 0), ('ACRO', 5, 0), ('OFFBOARD', 6, 0),
         ('STABILIZED', 7, 0), ('RATTITUDE', 8, 0), ('AUTO.READY', 4, 1), ('AUTO.TAKEOFF', 4, 2),
@@ -241,6 +252,8 @@ PX4: Final[Dialect] = Dialect(
             math.isfinite(value) and int(value) & _FUSED_BITS == _FUSED_BITS),
              f'{_NOT_FUSED}set bits 0 (horizontal position) and 2 (velocity), as 13 does',
              forwarding=True)),
+    watched=('NAV_RCL_ACT', 'COM_LOW_BAT_ACT', 'COM_RCL_EXCEPT', 'GF_ACTION', 'EKF2_GPS_CTRL',
+             'EKF2_HGT_REF', 'EKF2_MAG_TYPE'),
     hover_thrust='MPC_THR_HOVER',
     # Two changes further apart than 20 ms arrive as two messages. The cost is that of 2 Hz:
     # without a change no more are sent. A rate for HEARTBEAT would be refused.
@@ -251,10 +264,7 @@ PX4: Final[Dialect] = Dialect(
 ARDUPILOT: Final[Dialect] = Dialect(
     name='ardupilot', title='ArduPilot', firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     # Its mode numbers depend on the vehicle type.
-    vehicle_types=frozenset({
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER,
-        mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER,
-        mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR}),
+    vehicle_types=MULTICOPTERS,
     modes=MappingProxyType({
         'STABILIZE': 0, 'ACRO': 1, 'ALT_HOLD': 2, 'AUTO': 3, 'GUIDED': 4, 'LOITER': 5, 'RTL': 6,
         'CIRCLE': 7, 'LAND': 9, 'DRIFT': 11, 'SPORT': 13, 'FLIP': 14, 'AUTOTUNE': 15,
@@ -279,6 +289,8 @@ ARDUPILOT: Final[Dialect] = Dialect(
         *(Rule(f'EK3_SRC1_{source}', lambda value: value != _EXTERNAL_NAVIGATION,
                f'{_NOT_FUSED}set it to {_EXTERNAL_NAVIGATION} (ExternalNav)', forwarding=True)
           for source in ('POSXY', 'VELXY'))),
+    watched=('FS_THR_ENABLE', 'BATT_FS_LOW_ACT', 'BATT_FS_CRT_ACT', 'FENCE_ACTION',
+             'EK3_SRC1_POSZ', 'EK3_SRC1_VELZ', 'EK3_SRC1_YAW'),
     hover_thrust='MOT_THST_HOVER',
     # HEARTBEAT is sent at once when the mode changes; 5 Hz covers lost ones.
     mode_message=mavlink.MAVLINK_MSG_ID_HEARTBEAT, mode_rate=5.0, least_mode_rate=5.0,
@@ -297,9 +309,8 @@ def dialect_of(heartbeat: Any, autopilot: str = AUTO) -> Dialect | None:
         that HEARTBEAT does not name.
     """
     sender = next((d for d in DIALECTS.values() if d.firmware == heartbeat.autopilot), None)
-    types = None if sender is None else sender.vehicle_types
     if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_INVALID or (  # a gimbal, a ground station
-            types is not None and heartbeat.type not in types):
+            sender is not None and heartbeat.type not in sender.vehicle_types):
         return None
     if autopilot == AUTO:
         return sender

@@ -40,7 +40,9 @@ from flock_follower.mavlink.dialects import Dialect
 from flock_follower.mavlink.estimator_health import RECENT
 from flock_follower.mavlink.global_origin import GlobalOrigin
 from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.link_questions import NO_ANSWER, REASONS
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
+from flock_follower.mavlink.parameter_watch import ParameterWatch
 from flock_follower.mavlink.sticks import take_over_slowly
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
 from flock_follower.messages import to_nanoseconds
@@ -49,8 +51,6 @@ from flock_follower.messages import to_nanoseconds
 PERIOD: Final[float] = 1.0
 #: The answer with the shortest delay among this many gives the offset.
 WINDOW: Final[int] = 10
-#: An autopilot that does not answer for this long, s, does not receive our messages.
-UNANSWERED_MAX: Final[float] = 5.0
 #: Answers older than this, ns, are not used: clocks drift by up to 0.1 ms/s.
 MEMORY: Final[int] = 30_000_000_000
 #: In that time the samples of two clocks of the same speed may differ by this, ns.
@@ -89,13 +89,6 @@ class TimeSync:
         if message.ts1 in self._asked:  # else another system has sent the request
             self._samples.append(Sample(message.tc1 - message.ts1, message.tc1 - now, now))
         return None
-
-    def unanswered(self, now: int) -> float:
-        """Return the age, s, of the oldest request without an answer since; 0 if none waits."""
-        # Copies: diagnostics read them from another thread.
-        answered = max((sample.time for sample in self._samples.copy()), default=0)
-        waiting = (now - time for time in self._asked.copy() if time > answered)
-        return max(waiting, default=0) * 1e-9
 
     def age(self, time_boot_ms: int, now: int) -> float:
         """
@@ -143,9 +136,11 @@ STICK_RATES: Final[Mapping[int, float]] = MappingProxyType({
 FEW: Final[float] = 0.5
 PAUSE: Final[float] = 0.3
 #: Period of requests for the reasons that prevent arming, s, while disarmed; and the time in which
-#: the autopilot answers, s.
+#: the autopilot reports them, s, after which an unanswered request is repeated.
 WHY_PERIOD: Final[float] = 30.0
 WHY_WAIT: Final[float] = 3.0
+UNSIGNED: Final[str] = (
+    'the autopilot signs its messages and answers none of ours: set signing_key_file')
 
 
 def wanted_rates(dialect: Dialect, estimate_rate: float, sticks: bool = False
@@ -176,6 +171,7 @@ class Housekeeping:
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
         self.parameters = ParameterCheck()
+        self.watch = ParameterWatch()
         self._link = link
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
@@ -183,6 +179,7 @@ class Housekeeping:
         self.without_gps = without_gps
         self._heartbeat_sent = -math.inf
         self._timesync_sent = self._why_asked = -math.inf
+        self._reasons_since = -math.inf  # time of their first answer, s
         self._vehicle = -1, 0  # reboots, and changes of the vehicle; none was connected
         self._alive_since = math.inf  # s; infinite: it is not connected
         self._requested: dict[int, float] = {}  # when each message was requested last, s
@@ -198,6 +195,7 @@ class Housekeeping:
             self._heartbeat_sent = now
         if not alive:
             self._alive_since = math.inf
+            self._link.questions.pause()
             status = self._link.telemetry.status
             if status is not None and not status.armed:
                 self.origin.begin_again()  # it may reboot: odometry waits for its new origin
@@ -208,8 +206,10 @@ class Housekeeping:
             self._requested, self._alive_since = {}, now
         if vehicle != self._vehicle:
             self._vehicle = vehicle
+            self._link.questions.begin_again()
+            self._why_asked = self._reasons_since = -math.inf
             self.timesync = TimeSync()  # its clock has restarted
-            self.parameters = self._new_check()
+            self.parameters, self.watch = self._new_check(), ParameterWatch()
             self.origin.begin_again()
         self._request_streams(now)
         if now - self._timesync_sent >= PERIOD:
@@ -222,8 +222,20 @@ class Housekeeping:
                                     (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,))
         if name := self.parameters.step(now):
             self._link.request_parameter(name)
+        self._request_reasons_in_time(now)
+
+    def changes(self) -> list[str]:
+        """Return the parameters that a rule depends on and that have just changed in flight."""
         status = self._link.telemetry.status
-        if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
+        return self.watch.step(self.parameters.values, self.parameters.watched(),
+                               status is not None and status.armed)
+
+    def _request_reasons_in_time(self, now: float) -> None:
+        status, answered = self._link.telemetry.status, self._link.questions.answered(REASONS)
+        if math.isinf(self._reasons_since) and math.isfinite(answered):
+            self._reasons_since = answered
+        period = WHY_PERIOD if answered >= self._why_asked else WHY_WAIT
+        if status is not None and not status.armed and now - self._why_asked >= period:
             self._why_asked = now
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
@@ -238,8 +250,9 @@ class Housekeeping:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
     def has_reasons(self, now: float) -> bool:
-        """Return whether the arming reasons were requested and the answer time is over."""
-        return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
+        """Return whether the autopilot has answered which reasons prevent arming."""
+        return WHY_WAIT <= now - self._reasons_since < math.inf and (
+            now - self._link.questions.answered(REASONS) <= 2.0 * WHY_PERIOD)
 
     def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
@@ -253,11 +266,9 @@ class Housekeeping:
 
     def unreceived(self, now: float) -> str:
         """Return why the autopilot does not receive our messages, or ''."""
-        if self._link.signing or not self._link.autopilot_signs or (  # USB needs no signature
-                self.timesync.unanswered(to_nanoseconds(now)) < UNANSWERED_MAX):
-            return ''
-        return ('the autopilot signs its messages and answers none of ours: '
-                'set signing_key_file')
+        if not self._link.questions.unanswered(now):
+            return ''  # also of one that signs: USB needs no signature
+        return NO_ANSWER if self._link.signing or not self._link.autopilot_signs else UNSIGNED
 
     def rates(self, now: float) -> dict[str, float]:
         """Return the rates of the estimate, Hz, by the message's name."""

@@ -40,6 +40,8 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import AUTO, describe, dialect_of
+from flock_follower.mavlink.identity import device, Identity
+from flock_follower.mavlink.link_questions import LinkQuestions
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
@@ -217,23 +219,26 @@ class Link:
     """
     A link over a transport to the autopilot of ``target_system``.
 
-    :param source_system: our own system id; the vehicle's own is usual for its companion.
+    :param source_system: our own system id; 0: that of the vehicle, as MAVLink wants it of its
+        companion.
     :param autopilot: firmware of the autopilot, see ``dialects.dialect_of``.
     :param signing: if given, every message is signed and unsigned ones are dropped.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     """
 
-    def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
+    def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 0,
                  source_component: int = COMPONENT, autopilot: str = AUTO,
                  signing: Signing | None = None, announce_as_gcs: bool = False) -> None:
         self.transport = transport
         self.target_system = target_system
-        self.source_system = source_system
+        self.source_system = source_system or target_system
         self.source_component = source_component
         self.autopilot = autopilot
         self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
                           else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
+        self.questions = LinkQuestions((self.source_system, source_component))
+        self.identity = Identity()
         #: Number of messages that were received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
@@ -243,6 +248,7 @@ class Link:
         self.signing = signing
         #: Whether the autopilot's newest message was signed.
         self.autopilot_signs = False
+        self._now = -math.inf  # of the last call of receive, s
         self._framers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
@@ -255,6 +261,7 @@ class Link:
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
         messages = []
+        self._now = now
         self.transport.reopen(now)
         # Pieces of the vehicle, and of all other senders together.
         budgets = {True: MOST_PIECES, False: MOST_PIECES}
@@ -274,6 +281,7 @@ class Link:
                     continue
                 self.autopilot_signs = bool(message.get_header().incompat_flags & _SIGNED)
                 self.telemetry.update(message, now)
+                self.questions.take(message, now)
                 messages.append(message)
         return messages
 
@@ -291,12 +299,20 @@ class Link:
         """Return why a message is not used, or '' if it is the autopilot's; then answer it."""
         kind, system = message.get_type(), message.get_srcSystem()
         component = message.get_srcComponent()
+        if (system, component) == (self.source_system, self.source_component):
+            self.identity.take_own(message, now)
+        other = device(message)
+        if other and (system, component) != (self.target_system, AUTOPILOT_COMPONENT):
+            return f'of {other} (system id {system}, component {component})'
         if system != self.target_system:
             return f'of system id {system}, not target_system {self.target_system}'
         if component != AUTOPILOT_COMPONENT:
             return f'of component {component}, not of an autopilot'
+        if other:
+            return f'of {other} that sends as an autopilot (component {component})'
         if kind == 'HEARTBEAT' and dialect_of(message, self.autopilot) is None:
             return f'of {describe(message)}, which autopilot = {self.autopilot!r} does not send'
+        self.identity.take(message, peer, peer == self.transport.peer, now)
         if peer == self.transport.peer:
             return ''
         # Answer one vehicle only: a second one with the same id must be silent first.
@@ -304,7 +320,8 @@ class Link:
             return 'second sender'
         if kind != 'HEARTBEAT':
             return 'before HEARTBEAT'
-        if math.isfinite(self.telemetry.message_time):
+        if math.isfinite(self.telemetry.message_time) and (
+                not self.identity.same(self.transport.peer, peer)):
             self.peer_changes += 1
             self.telemetry.forget()
         self.transport.peer = peer
@@ -316,12 +333,14 @@ class Link:
             return False
         data = message.pack(self._sender)
         self._sender.seq = (self._sender.seq + 1) % 256
+        self.questions.sent(message, self._now)
         sent = self.transport.write(bytes(data))
         self.bytes_sent += len(data) * sent
         return sent
 
     def send_heartbeat(self) -> bool:
         """Send the HEARTBEAT of an onboard computer, or of a ground station."""
+        self.identity.sent_heartbeat(self._sender.seq)
         return self.send(mavlink.MAVLink_heartbeat_message(
             self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
 

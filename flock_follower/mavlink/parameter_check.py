@@ -35,6 +35,7 @@ from typing import Any, Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import Dialect, firmware_version, Rule, Version
+from flock_follower.mavlink.parameter_watch import UNKNOWN_AFTER, WATCH_PERIOD
 
 #: An unanswered request is repeated after this, s.
 RETRY_PERIOD: Final[float] = 2.0
@@ -161,6 +162,8 @@ class CheckResult(NamedTuple):
     """For people: each parameter that does not exist."""
     unproven: str = ''
     """For people: the firmware, if no recommendation is known for it."""
+    unread: tuple[str, ...] = ()
+    """The names of what was not answered: unknown, and so neither good nor bad."""
 
 
 class ParameterCheck:
@@ -185,6 +188,7 @@ class ParameterCheck:
         self._needed = tuple(needed)
         self._wanted = {*needed, *(entry.name for entry in recommended)}
         self._asked: dict[str, float] = {}  # when last, s
+        self._tries: dict[str, int] = {}  # since the last answer
         self._version_asked = -math.inf  # s
         self._begun = math.inf
         self._patient = True
@@ -209,9 +213,23 @@ class ParameterCheck:
         self._patient = now - self._begun < PATIENCE
         due = [name for name in self._names(self.version) if self._open(name)
                and now - self._asked.get(name, -math.inf) >= RETRY_PERIOD]
+        due += [name for name in self.watched()
+                if now - self._asked.get(name, -math.inf) >= WATCH_PERIOD]
         for name in due[:1]:
             self._asked[name] = now
+            self._tries[name] = self._tries.get(name, 0) + 1
         return ''.join(due[:1])
+
+    def watched(self) -> list[str]:
+        """Return the names that were answered and that a rule depends on: to read repeatedly."""
+        if self._dialect is None:
+            return []
+        kept = {*self._dialect.watched, *(rule.name for rule in self._dialect.rules)}
+        return [name for name in self.values if name in kept]
+
+    def known(self, name: str) -> bool:
+        """Return whether a value was answered, and no longer ago than some requests."""
+        return name in self.values and self._tries.get(name, 0) <= UNKNOWN_AFTER
 
     def _names(self, version: Version | None) -> list[str]:
         """Return the names to read, those that are needed by rules first."""
@@ -227,6 +245,7 @@ class ParameterCheck:
         if name in self._wanted and self._dialect is not None:
             self.values[name] = parameter_value(
                 message, bytewise=self._dialect.bytewise_parameters)
+            self._tries[name] = 0
             self.missing.discard(name)
 
     def take_error(self, message: Any) -> None:
@@ -256,9 +275,6 @@ class ParameterCheck:
                  for name, entry in recommended.items()
                  if name in values and entry.differs(values[name])]
         differing = len(lines)
-        if unanswered:
-            lines.append(f'no answer about {", ".join(unanswered)}: '
-                         'compare them with the recommended values by hand')
         known = version is None or dialect.versions[0] <= version[:2] <= dialect.versions[1]
         return CheckResult(
             len(values), differing, len(unanswered), tuple(lines),
@@ -266,7 +282,8 @@ class ParameterCheck:
                 f', recommended {recommended[name].value:g}: {recommended[name].why}'
                 if name in recommended else '') for name in names if name in missing),
             '' if known else
-            f'{self.firmware}: the recommended values are known for {dialect.known_versions}')
+            f'{self.firmware}: the recommended values are known for {dialect.known_versions}',
+            tuple(unanswered))
 
 
 def _name_of(message: Any) -> str:
@@ -276,6 +293,8 @@ def _name_of(message: Any) -> str:
 
 
 _ANYWAY: Final[str] = 'require_failsafe:=false'
+#: The action if a parameter is not answered, whose cause is not known.
+ASK: Final[str] = 'does the autopilot receive our messages? read them in the ground station'
 
 
 def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
@@ -295,5 +314,5 @@ def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> 
         return (f'{", ".join(missing)} {"does" if len(missing) == 1 else "do"} not exist in '
                 f'{parameters.firmware}: {doubt}; its rules are known for '
                 f'{dialect.known_versions}')
-    unread = ', '.join(rule.name for rule in applicable if rule.name not in values)
-    return unread and f'{unread} could not be read: {doubt} ({_ANYWAY} flies all the same)'
+    unread = ', '.join(rule.name for rule in applicable if not parameters.known(rule.name))
+    return unread and f'{unread} could not be read: {doubt}; {ASK}'

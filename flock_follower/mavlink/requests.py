@@ -34,6 +34,7 @@ from flock_follower.mavlink.estimator_health import explained, misplaced
 from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
+from flock_follower.mavlink.identity import not_hovering
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -113,9 +114,7 @@ class Requests:
 
     def acknowledge(self, ack: Any, now: float) -> None:
         """Take a COMMAND_ACK."""
-        # To us, not to a ground station. MAVLink 1 has no target.
-        ours = (ack.target_system in (0, self._link.source_system)
-                and ack.target_component in (0, self._link.source_component))
+        ours = self._link.questions.addressed(ack)  # not to a ground station
         if ours and self.newest is not None and self.newest.acknowledge(
                 ack.command, ack.result, now):
             self._housekeeping.request_reasons()
@@ -202,13 +201,17 @@ class Requests:
         dialect = telemetry.dialect
         if dialect is None or self.status(now) is None:
             return NOT_RECEIVED
-        reasons = [gate.permission.taken_over(now), gate.contradiction(now)]
+        reasons = [self._link.identity.conflict(now), self._housekeeping.unreceived(now),
+                   gate.permission.taken_over(now),
+                   gate.contradiction(now),
+                   not_hovering(telemetry.vehicle_type, telemetry.vtol_state(now))]
         if gate.speed(now) is None:
             reasons.append('no velocity known: neither odom nor LOCAL_POSITION_NED')
         if in_air:
             reasons += [IN_AIR[telemetry.flying(now)],
                         envelope.outside(gate.limits, gate.heights.height(now))]
-        reasons += [self._end.battery_low(now), self._housekeeping.origin.obstacle,
+        reasons += [self._housekeeping.watch.obstacle(), self._end.battery_low(now),
+                    self._housekeeping.origin.obstacle,
                     misplaced(telemetry.local_place(now), telemetry.home(),
                               gate.odometry_position)]
         if self._require_failsafe:

@@ -274,6 +274,7 @@ class GroundStationReport:
         self._state, self._state_time = '', -math.inf
         self._reported = ''
         self._handed_over: str | None = None
+        self._warnings: deque[str] = deque(maxlen=10)
         self._neighbor, self._distance, self._distance_time = '', math.nan, -math.inf
         self._last_text = self._last_distance = -math.inf
 
@@ -290,6 +291,10 @@ class GroundStationReport:
         """Take the reason for which the bridge ends the flight; it is the next text."""
         self._handed_over = reason
 
+    def take_warning(self, text: str) -> None:
+        """Take a warning, such as a parameter that has changed; it is one of the next texts."""
+        self._warnings.append(text)
+
     def due(self, time_boot_ms: int, now: float) -> list[Any]:
         """Return the STATUSTEXT and NAMED_VALUE_FLOAT to send at ``now``; at most one of each."""
         messages = []
@@ -303,6 +308,8 @@ class GroundStationReport:
         if self._handed_over is not None:
             severity, text = mavlink.MAV_SEVERITY_CRITICAL, f'hands over: {self._handed_over}'
             self._handed_over = None
+        elif self._warnings:
+            severity, text = mavlink.MAV_SEVERITY_WARNING, self._warnings.popleft()
         elif self._state != self._reported and now - self._state_time >= HELD:
             severity = SEVERITIES.get(self._state, mavlink.MAV_SEVERITY_INFO)
             text = self._reported = self._state

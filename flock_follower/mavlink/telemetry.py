@@ -219,6 +219,17 @@ class Telemetry:
         message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
         return None if message is None else _FLYING.get(message.landed_state)
 
+    @property
+    def vehicle_type(self) -> int | None:
+        """Return the MAV_TYPE in the newest HEARTBEAT, None before the first."""
+        message = self.recent('HEARTBEAT', math.inf, 0.0)
+        return None if message is None else message.type
+
+    def vtol_state(self, now: float) -> int | None:
+        """Return the MAV_VTOL_STATE; None without a report."""
+        message = self.recent('EXTENDED_SYS_STATE', LANDED_OLDEST, now)
+        return None if message is None else message.vtol_state
+
     def transmitter_lost(self, now: float) -> bool:
         """Return whether the autopilot reports that the pilot's transmitter is lost."""
         message = self.recent('SYS_STATUS', LANDED_OLDEST, now)

@@ -22,6 +22,7 @@ below ``camera.NAME``; planner, relative_pose and black_box take the same ones.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
 import math
@@ -132,7 +133,9 @@ MAVLINK_BRIDGE = [
     Spec('autopilot', 'auto', 'firmware of the autopilot; auto: by its HEARTBEAT', AUTOPILOTS),
     Spec('target_system', 1,
          'MAVLink system id of the autopilot; others are ignored', IDS),
-    Spec('source_system', 1, 'own MAVLink system id', IDS),
+    Spec('source_system', 0,
+         'own MAVLink system id; 0: that of target_system, as MAVLink requires of the companion '
+         'computer of a vehicle', replace(IDS, low=0)),
     Spec('announce_as_gcs', False,
          'send the HEARTBEAT of a ground station, so that PX4 sends its STATUSTEXTs on this '
          'link, too. While the bridge runs, PX4 then counts a ground station as connected: the '

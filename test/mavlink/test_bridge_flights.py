@@ -15,7 +15,7 @@
 """Whole flights by the bridge's requests, with and without GPS, over good lines and bad ones."""
 
 
-from bridge_flight import BOTH, EAST, Flight, NO_GPS
+from bridge_flight import BOTH, EAST, Flight, without_gps
 from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -25,12 +25,6 @@ from flock_follower.mavlink.global_origin import NO_HEIGHT
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 
 pytestmark = pytest.mark.slow
-
-
-def without_gps(personality, **bridge):
-    """Return the options of a flight on the odometry that is forwarded to the autopilot."""
-    return {'parameters': NO_GPS[personality],
-            'bridge': {'forwarder': OdometryForwarder(30.0), **bridge}}
 
 
 def forwarding(flight):

@@ -182,12 +182,3 @@ def test_only_answers_to_us_are_believed(system, component, estimated):
     flight.fly(1.0)
     assert (request.outcome is not None and 'denied' in request.outcome.message) == estimated
 
-
-@pytest.mark.parametrize(('options', 'reported'), [
-    (never('TIMESYNC'), 'the autopilot signs its messages and answers none of ours'), ({}, '')])
-def test_an_autopilot_that_signs_and_answers_nothing_is_reported(options, reported):
-    flight = Flight('arducopter', **options)
-    for seconds, expected in ((4.0, ''), (3.0, reported)):
-        flight.fly(seconds)
-        flight.bridge.link.autopilot_signs = True  # as its newest message showed
-        assert flight.bridge.housekeeping.unreceived(flight.now).partition(':')[0] == expected

@@ -50,7 +50,14 @@ def heartbeat(autopilot=PX4.firmware, kind=QUADROTOR, base=1, custom=0):
     # A firmware that does not say which it is, is what the parameter says.
     ('px4', GENERIC, QUADROTOR, PX4), ('ardupilot', GENERIC, QUADROTOR, ARDUPILOT),
     ('auto', GENERIC, QUADROTOR, None), ('px4', ARDUPILOT.firmware, QUADROTOR, None),
-    ('ardupilot', ARDUPILOT.firmware, ROVER, None),
+    *((name, firmware, kind, None) for name, firmware in (
+        ('ardupilot', ARDUPILOT.firmware), ('auto', ARDUPILOT.firmware), ('px4', PX4.firmware),
+        ('auto', PX4.firmware)) for kind in (
+            ROVER, mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_TYPE_SUBMARINE,
+            mavlink.MAV_TYPE_SURFACE_BOAT, mavlink.MAV_TYPE_CAMERA, mavlink.MAV_TYPE_GENERIC)),
+    # QuadPlanes are planes to ArduPilot; those of PX4 may hover.
+    ('auto', ARDUPILOT.firmware, mavlink.MAV_TYPE_VTOL_TILTROTOR, None),
+    ('auto', PX4.firmware, mavlink.MAV_TYPE_VTOL_TILTROTOR, PX4),
     ('px4', mavlink.MAV_AUTOPILOT_INVALID, mavlink.MAV_TYPE_GCS, None)])
 def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, kind, dialect):
     assert dialect_of(heartbeat(firmware, kind), autopilot) is dialect

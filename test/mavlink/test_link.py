@@ -83,7 +83,9 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered():
 
 @pytest.mark.parametrize(('who', 'autopilot', 'silence'), [
     ({'system': 7}, PX4, '1 of system id 7, not target_system 1'),
-    ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4, '1 of component 154, not of an autopilot'),
+    ({'component': mavlink.MAV_COMP_ID_GIMBAL}, PX4,
+     '1 of a gimbal (system id 1, component 154)'),
+    ({'component': 42}, PX4, '1 of component 42, not of an autopilot'),
     ({}, mavlink.MAV_AUTOPILOT_GENERIC,
      "1 of GENERIC QUADROTOR, which autopilot = 'auto' does not send")])
 def test_another_vehicle_a_gimbal_and_an_unknown_firmware_are_named_and_never_answered(

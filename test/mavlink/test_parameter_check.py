@@ -204,7 +204,7 @@ def test_the_version_is_asked_for_until_it_is_answered_and_decides_what_is_asked
     check.take(answer('A', 1.0))
     assert check.result() is None
     check.step(5.1)
-    assert check.result()[:3] == (1, 0, 1) and 'AUTOPILOT_VERSION' in check.result().lines[0]
+    assert check.result()[:3] == (1, 0, 1) and check.result().unread == ('AUTOPILOT_VERSION',)
     check.take_version(version(0, 0))  # a build without a version
     assert check.version is None
     check.take_version(version(4, 7, 2))

@@ -38,15 +38,19 @@ from std_msgs.msg import String
 from flock_follower.checks.system import (
     LINK_FAULT,
     MISSING,
+    NO_ANSWERS,
     NOT_READY,
     PARAMETER,
     REFUSED,
+    UNKNOWN,
     UNPROVEN,
+    UNREAD,
 )
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
+from flock_follower.mavlink.parameter_check import ASK
 from flock_follower.mavlink.permission import (
     FELL_SILENT,
     MODE_TIMEOUT,
@@ -69,6 +73,7 @@ from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.parameters.differences import differences
 from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
@@ -90,7 +95,9 @@ class BridgeReport:
         self._start = time.monotonic()
         self.place: tuple[OdometryState, float] | None = None
         """The newest odometry, and its time of arrival on the monotonic clock, s."""
-        self.planner = RemoteParameters(node, 'planner')
+        self._planner_before: dict[str, Any] | None = None
+        self._planner_difference = ''
+        self.planner = RemoteParameters(node, 'planner', self._take_planner)
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._last: Cycle | None = None
         self._stuck_since = math.inf
@@ -111,11 +118,13 @@ class BridgeReport:
         self._diagnostics.checks += [
             self._collect, self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
-                (ERROR, self._link_fault), (ERROR, self._ended), (ERROR, self._forwarding_fault),
+                (ERROR, self._link_fault), (ERROR, bridge.link.identity.conflict),
+                (ERROR, self._ended), (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
+                (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
-                (WARN, self._planner_differs), (WARN, self._heights_differ),
-                (WARN, self._battery_unknown)))]
+                (WARN, self._planner_differs), (WARN, self._planner_changed),
+                (WARN, self._heights_differ), (WARN, self._battery_unknown)))]
 
     # From any thread.
 
@@ -230,7 +239,8 @@ class BridgeReport:
         # While some are unanswered, more lines may follow.
         lines = () if result is None else (
             *(f'parameter {line}' for line in (*result.lines, *result.missing)),
-            *filter(None, (result.unproven,)))
+            *filter(None, (result.unproven, f'no answer about {", ".join(result.unread)}: {ASK}'
+                           if result.unread else '')))
         good = result is not None and not (lines or result.unanswered)
         if result is not None and good:
             lines = (f'{result.answered} parameters of the autopilot are as recommended',)
@@ -244,10 +254,13 @@ class BridgeReport:
         """Return the state of autopilot and flight, and reasons against offboard and arming."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
         status, flying, unready = bridge.status(now), telemetry.flying(now), bridge.unready(now)
-        result = bridge.housekeeping.parameters.result()
+        result, unreceived = (
+            bridge.housekeeping.parameters.result(), bridge.housekeeping.unreceived(now))
         values: dict[str, object] = {
-            'link': 'alive' if bridge.alive(now) else (
+            'link': ('one way' if unreceived else 'alive') if bridge.alive(now) else (
                 'lost' if telemetry.status else 'never received'),
+            NO_ANSWERS: unreceived,
+            UNKNOWN: ', '.join(bridge.link.questions.unknown(now)),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
             'firmware': str(bridge.housekeeping.parameters.version or ''),
             'mode': status.mode if status else '', 'armed': status.armed if status else '',
@@ -262,6 +275,8 @@ class BridgeReport:
             for key, texts in ((PARAMETER, result.lines), (MISSING, result.missing)):
                 values |= {key + name: rest for name, _, rest in (
                     text.partition(' ') for text in texts)}
+            if result.unread:
+                values[UNREAD] = ', '.join(result.unread)
             if result.unproven:
                 values[UNPROVEN] = result.unproven
         return values
@@ -356,6 +371,20 @@ class BridgeReport:
         status = self._bridge.status(now)
         return 'the autopilot reports no battery charge: battery_low cannot act' if (
             status and status.armed and self._bridge.end.battery_unknown(now)) else ''
+
+    def _take_planner(self, values: dict[str, Any]) -> None:
+        """Take the planner's parameters, which have changed, or are those of a new planner."""
+        before, self._planner_before = self._planner_before, values
+        status = self._bridge.telemetry.status
+        if before is not None and status is not None and status.armed:
+            self._planner_difference = differences(before, values)
+
+    def _planner_changed(self, now: float) -> str:
+        status = self._bridge.telemetry.status
+        if status is None or not status.armed:
+            self._planner_difference = ''
+        return self._planner_difference and (
+            f'parameters of the planner changed in flight: {self._planner_difference}')
 
     def _planner_differs(self, now: float) -> str:
         """Return the limits that differ from those of the planner as text, or ''."""
