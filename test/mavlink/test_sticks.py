@@ -203,11 +203,11 @@ def test_it_acts_where_slow_sticks_do_not_take_over(autopilot, reported, known, 
 def sticks_in_flight(minor, accepts):
     """Return a flight by setpoints in which a stick has been moved slowly."""
     flight = Flight()
-    codec = mavlink.MAVLink(None, 1, 1)
     flight.controller._sticks = accepts
 
     def arrives(message):
-        flight.wire.arrived.append(bytes(message.pack(codec)))
+        # Numbered with the others of the autopilot.
+        flight.wire.arrived += flight.autopilot._packed([message])
     flight.fly(0.5)
     arrives(version(1, minor))
     arrives(manual_control(REST))
