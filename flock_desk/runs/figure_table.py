@@ -123,6 +123,8 @@ FIGURES: Final[dict[str, Figure]] = {
     'setpoints': Figure('setpoints', True),
     'setpoints.sent': Figure('sent', demo=(1, None), load=LATE),
     'setpoints.rate_hz': Figure('rate, Hz', demo=(19.5, 30.5), load=LATE),
+    'setpoints.opposed_share': Figure('share against their command, or along the velocity without',
+                                      demo=(None, 0.5), fly=(None, 0.5), external=(None, None)),
     'setpoints.acceleration_max_m_s2': Figure('greatest acceleration, m/s²', True,
                                               demo=(None, 'a_max'), fly=(None, 'a_max')),
     'setpoints.reasons': Figure('reasons given'),

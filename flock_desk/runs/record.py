@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_desk.runs.directions import along_law, opposed
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_desk.runs.processes import LateError
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import (
     from_odometry,
@@ -50,7 +50,6 @@ from flock_follower.planner.params import PlannerParams
 
 LEADER_NAME = 'leader'  # as config/neighbors.yaml names it
 REPLAYED = 'vehicle that flew the commands'
-SAME_TIME_NS = 50_000_000  # between an estimate and the odometry that places it
 _RECORD = 'record'
 _FILES = (_RECORD, 'autopilot.npz', 'flight.npz', 'report.html', 'summary.json')
 
@@ -69,7 +68,8 @@ class Flight:
 
     Of a flight through the nodes: ``distance`` holds true distances, m, as often as they are
     known; ``diagnostics`` the arrays published, each with its time; ``command_times`` are those
-    for which the planner commanded, s on the bag's clock; ``along_law``: see :func:`along_law`.
+    for which the planner commanded, s on the bag's clock; ``along_law`` and ``opposed``: see
+    ``directions``.
     """
 
     name: str = LEADER_NAME
@@ -87,6 +87,7 @@ class Flight:
     diagnostics: Sequence[tuple[float, Any]] = ()
     command_times: Array = field(default_factory=lambda: np.empty(0))
     along_law: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
+    opposed: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def values(self, node: str, key: str) -> list[tuple[float, str]]:
         """Return the values of a key in a node's diagnostics, with their times."""
@@ -177,38 +178,14 @@ def read_replayed(bag: Path, out: Path, params: PlannerParams) -> Flight:
         states=[(t - origin, m.data) for t, m in record.get('/planner/state', [])],
         diagnostics=[(t - origin, m) for t, m in record.get('/diagnostics', [])],
         command_times=ticks,
-        along_law=along_law([m for _, m in commands], _received(record), own, params.law))
+        along_law=along_law([m for _, m in commands], _received(record), own, params.law),
+        opposed=opposed(log, commands))
 
 
 def tick_time(message: Any) -> float:
     """Return the time for which a command holds, s: its stamp plus its point's time from start."""
     command = from_trajectory(message, message.header.frame_id)
     return (command.stamp + command.ahead) / NANOSECONDS
-
-
-def along_law(commands: Iterable[Any], neighbors: Sequence[OdometryState],
-              own: Sequence[OdometryState], law: FlockingParams) -> NDArray[np.bool_]:
-    """
-    Return whether each command points along the law, horizontally.
-
-    The guard and the limits change the law's length and direction, but seldom turn it round.
-    Commands that rest on no estimate, or on one without odometry at its stamp, are left out.
-
-    :param neighbors: as published. :param own: the odometry.
-    """
-    known = {state.stamp: state for state in neighbors if state.frame != RELATIVE}
-    stamps, along = np.array([state.stamp for state in own]), []
-    for message in commands:
-        command = from_trajectory(message, message.header.frame_id)
-        leader = known.get(command.stamp)
-        if leader is None or not len(stamps):
-            continue
-        ego = own[int(np.argmin(np.abs(stamps - command.stamp)))]
-        if abs(ego.stamp - command.stamp) <= SAME_TIME_NS:
-            demanded = acceleration([leader.position - ego.position],
-                                    [leader.velocity - ego.velocity], law)
-            along.append(bool(demanded[:2] @ np.asarray(command.acceleration)[:2] > 0.0))
-    return np.array(along, dtype=bool)
 
 
 def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight:
@@ -232,6 +209,10 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
     shown = flown(log['image_stamp'], epoch, epoch + round((ended - began) * 1e9))
     if not shown.any():
         raise LateError('not one image was rendered in time')
+    record = read_record(out / _RECORD)
+    commands = record.get('/command/trajectory', [])
+    external = bool(str(log['pose_source']))
+    against = np.empty(0, dtype=bool) if external else opposed(log, commands)
     state_flown = flown(log['state_time'])
     log['clock'] = log['clock'][flown(log['clock'][:, 0])]
     for name in log:
@@ -239,9 +220,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
             log[name] = log[name][shown]
         elif name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
             log[name] = log[name][state_flown]
-    record = read_record(out / _RECORD)
-    commands = record.get('/command/trajectory', [])
-    if str(log['pose_source']):
+    if external:
         log['setpoint_time'] = np.array([time for time, _ in commands])
         log['setpoint_acceleration'] = np.reshape(
             [from_trajectory(message, 'odom').acceleration for _, message in commands],
@@ -267,6 +246,7 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         setpoints=log['setpoint_acceleration'][sent],
         along_law=along_law([m for t, m in commands if began <= t <= ended], neighbors, own,
                             scenario.flight.planner(True).law),
+        opposed=against,
         states=[(float(t) - began, str(s))
                 for t, s in zip(log['planner_time'], log['planner_state'])],
         diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],

@@ -178,7 +178,8 @@ def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None],
     bridge counts it. ``holds`` are those of the planner, each with its reason.
     ``failed_processes`` counts those that did not end with 0 in time, but for ``late_processes``,
     which waited for a processor until they were cut off. ``along_law_share`` is that of the
-    commands, None of fewer than ``COMMANDS``. ``machine``: the other programs on it during the
+    commands, None of fewer than ``COMMANDS``; ``opposed_share`` is that of at least so many
+    setpoints. ``machine``: the other programs on it during the
     worst 2 s, None if unknown.
 
     :param load: of the flight, None if unknown.
@@ -199,6 +200,7 @@ def flight_figures(flight: Flight, exit_codes: Mapping[str, int | None],
         'setpoints': {
             'sent': len(flight.setpoints),
             'rate_hz': rate(flight.setpoint_times),
+            'opposed_share': float(np.sum(flight.opposed)) / max(len(flight.opposed), COMMANDS),
             'acceleration_max_m_s2': most(norms(flight.setpoints))},
         'speed_max_m_s': most(next(iter(flight.speeds.values()))[1]),
         'latency_ms': {

@@ -67,7 +67,7 @@ def flight(evaluated: tuple[Path, dict[str, Any]],
     times = end / NANOSECONDS + LATER - np.arange(240)[::-1] / 20
     along = np.tile([1.0, 0.0, 0.0], (240, 1))
     np.savez(out / 'autopilot.npz', state_time=times, position=0 * along, velocity=0.5 * along,
-             setpoint_time=times, setpoint_acceleration=0.3 * along)
+             setpoint_time=times, setpoint_acceleration=np.tile([0.0, 0.0, 0.3], (240, 1)))
     return read_replayed(BAG, out, PARAMS)
 
 
@@ -92,7 +92,8 @@ def test_its_figures_are_those_of_evaluate(
         assert mine[key] == pytest.approx(theirs[key], rel=1e-6, abs=1e-9), key
     assert mine['planner']['rate_hz'] == pytest.approx(10.0)
     assert mine['setpoints'] == pytest.approx(
-        {'sent': len(flight.setpoints), 'rate_hz': 20.0, 'acceleration_max_m_s2': 0.3})
+        {'sent': len(flight.setpoints), 'rate_hz': 20.0, 'opposed_share': 0.0,
+         'acceleration_max_m_s2': 0.3})
 
 
 def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: Flight) -> None:
