@@ -45,7 +45,7 @@ ROOMS = {
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
-    'bags': ('', 'mcap numpy rosbags'),
+    'bags': ('', 'mcap numpy rosbags yaml'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),

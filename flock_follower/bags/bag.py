@@ -25,21 +25,24 @@ chunks compressed with bz2.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2.storage_mcap import McapReader
 
-from flock_follower.bags.mcap_file import incomplete, mcap_files, METADATA
+from flock_follower.bags.bag_files import BagFiles, find_files
 from flock_follower.bags.message_types import migration_obstacle, typestore
-from flock_follower.bags.unfinished import has_end, UnfinishedReader
+from flock_follower.bags.sequential import SequentialReader
 
 _UNREADABLE = 'corrupt, truncated or unsupported'
+_UNTYPED = '__schemaless__'  # rosbags' type of a channel whose schema the summary does not repeat
+Reader: TypeAlias = Rosbag1Reader | Rosbag2Reader | SequentialReader
 
 
 class BagError(ValueError):
@@ -91,25 +94,31 @@ class Bag(AbstractContextManager['Bag']):
     ``incomplete`` is the reason if the bag was never finished, else ''.
     """
 
-    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader,
-                 reason: str = '') -> None:
+    def __init__(self, path: Path, reader: Reader, reason: str = '', remedy: str = '') -> None:
         self.path = path
         self.incomplete = reason
         self.topics: dict[str, Topic] = {}
         self.skipped: dict[str, str] = {}
-        self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
         self._reader = reader
-        groups: dict[str, list[Connection]] = {}
-        for connection in reader.connections:
-            groups.setdefault(absolute(connection.topic), []).append(connection)
-        for name, connections in sorted(groups.items()):
+        self._unreadable = f'{_UNREADABLE} (to save what is whole: {remedy})'
+        # The files of a folder are the authority: its metadata.yaml may describe them otherwise.
+        files = _storages(reader)
+        self.start_ns = min(file.metadata.start_time for file in files) if files else (
+            reader.start_time)
+        self.end_ns = (max(file.metadata.end_time for file in files) if files else (
+            reader.end_time)) - 1
+        described = _by_topic(reader.connections)
+        self._connections = {**described, **_by_topic(
+            connection for file in files for connection in file.connections)}
+        for name, connections in sorted(self._connections.items()):
+            announced = described.get(name, [])
             if why := _unreadable(connections):
                 self.skipped[name] = why
             else:
                 self.topics[name] = Topic(
-                    name, connections[0].msgtype, sum(c.msgcount for c in connections),
-                    any(map(_latched, connections)))
-        self._connections = groups
+                    name, connections[0].msgtype, max(
+                        sum(c.msgcount for c in each) for each in (connections, announced)),
+                    any(map(_latched, (*connections, *announced))))
 
     @property
     def duration_ns(self) -> int:
@@ -147,7 +156,7 @@ class Bag(AbstractContextManager['Bag']):
         """
         names = self.select(topics)
         yielded = 0
-        with failures(self.path, _UNREADABLE):
+        with failures(self.path, self._unreadable):
             for connection, stamp_ns, raw in self._reader.messages(
                     connections=[c for name in names for c in self._connections[name]],
                     start=start_ns, stop=stop_ns):
@@ -157,9 +166,10 @@ class Bag(AbstractContextManager['Bag']):
                     raw = bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
                 yield BagMessage(topic.name, topic.msgtype, stamp_ns, raw)
         announced = sum(self.topics[name].count for name in names)
-        if start_ns is None and stop_ns is None and yielded != announced:
+        if start_ns is None and stop_ns is None and yielded < announced:
             raise BagError(
-                f'{self.path}: {_UNREADABLE}: {yielded} of {announced} announced messages found')
+                f'{self.path}: {self._unreadable}: {yielded} of {announced} announced messages '
+                f'found; if only metadata.yaml is wrong: ros2 bag reindex {self.path}')
 
     def close(self) -> None:
         """Close the files."""
@@ -174,7 +184,8 @@ def open_bag(path: str | Path) -> Bag:
     """
     Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
 
-    One in MCAP that was never finished is read as far as it goes, see ``Bag.incomplete``.
+    A file that rosbags refuses, or cannot read to the last message, is read from start to end;
+    one in MCAP that was never finished is read as far as it goes, see ``Bag.incomplete``.
 
     :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
     """
@@ -183,48 +194,75 @@ def open_bag(path: str | Path) -> Bag:
         raise BagError(f'{path}: no such bag')
     if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
-    with failures(path, _UNREADABLE):
-        _refuse_unclosed(path)
-        files = mcap_files(path) if path.is_dir() else [path] if path.suffix == '.mcap' else []
-        reason = incomplete(path) or _missing_end(path, files)
-        reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader
-        if files and reason:
-            reader = UnfinishedReader(files)
-        elif path.suffix == '.bag' and path.is_file():
-            reader = Rosbag1Reader(path)
-        else:
-            reader = Rosbag2Reader(path)
-    with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
-        reader.open()
-        bag = Bag(path, reader, reason)
-        if bag.message_count == 0:
-            bag.close()
-            reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
-            raise BagError(f'{path}: holds no message that can be read{reasons}')
+    if path.suffix == '.bag' and path.is_file():
+        reason, remedy = '', f'rosbag reindex {path}'
+        with failures(path, f'{_UNREADABLE} (to save what is whole: {remedy})'):
+            reader: Reader = Rosbag1Reader(path)
+            reader.open()
+            bag = Bag(path, reader, reason, remedy)
+    else:
+        try:
+            files = find_files(path)
+        except (OSError, ValueError) as error:
+            raise BagError(f'{path}: {getattr(error, "strerror", "") or error}') from error
+        reason, remedy = files.fault, files.remedy
+        what = f'{_UNREADABLE} (to save what is whole: {remedy})'
+        with failures(path, f'incomplete ({reason}), and {what}' if reason else what):
+            bag = Bag(path, _ros2_reader(path, files), reason, remedy)
+    if bag.message_count == 0:
+        bag.close()
+        reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
+        raise BagError(f'{path}: holds no message that can be read{reasons}')
     return bag
 
 
-def _refuse_unclosed(path: Path) -> None:
+def _ros2_reader(path: Path, files: BagFiles) -> Rosbag2Reader | SequentialReader:
     """
-    Refuse a folder that no recorder finished, and an SQLite file that none closed.
+    Return an open reader: rosbags' if it reads every message, else the sequential one.
 
-    SQLite's readers ignore rows in a write-ahead log, as if nothing were missing.
+    :raises Exception: whatever the libraries raise for damage.
     """
-    if path.is_dir() and not mcap_files(path) and not (path / METADATA).is_file():
-        raise BagError(f'{path}: no {METADATA} in it, so not a finished ROS 2 bag')
-    for log in path.glob('*.db3-wal') if path.is_dir() else [Path(f'{path}-wal')]:
-        if log.exists() and log.stat().st_size:
-            raise BagError(f'{path}: recording was not closed: {log.name} holds part of it')
+    refusal: Exception | None = None
+    if files.compressed or not files.fault:
+        try:
+            reader = Rosbag2Reader(path)
+            reader.open()
+            if files.compressed or all(map(_is_indexed, _storages(reader) or [reader.storage])):
+                return reader
+            reader.close()
+        except Exception as error:  # as many as it has reasons to refuse a file
+            if files.compressed:
+                raise
+            refusal = error
+    sequential = SequentialReader(files.paths)
+    try:
+        sequential.open()
+    except ValueError as error:
+        raise error from refusal
+    return sequential
 
 
-def _missing_end(path: Path, files: Sequence[Path]) -> str:
-    """Return the part of a finished bag that MCAP files lack, or ''."""
-    for file in files:
-        if not has_end(file):
-            return f'{file.name} was cut short'
-    if files and path.is_dir() and not (path / METADATA).is_file():
-        return 'no metadata.yaml in it'
-    return ''
+def _storages(reader: Reader) -> list[Any]:
+    """Return rosbags' readers of the files of a folder; none for other readers."""
+    return getattr(getattr(reader, 'storage', None), 'storages', [])
+
+
+def _is_indexed(storage: Any) -> bool:
+    """Return whether a file's index leads to every message, each with its type."""
+    if not isinstance(storage, McapReader):
+        return True
+    indexed = sum(sum(chunk.channel_count.values()) for chunk in storage.chunks)
+    listed = sum(connection.msgcount for connection in storage.connections)
+    return indexed == listed == storage.metadata.message_count and all(
+        connection.msgtype != _UNTYPED for connection in storage.connections)
+
+
+def _by_topic(connections: Iterable[Connection]) -> dict[str, list[Connection]]:
+    """Return connections by the absolute names of their topics."""
+    groups: dict[str, list[Connection]] = {}
+    for connection in connections:
+        groups.setdefault(absolute(connection.topic), []).append(connection)
+    return groups
 
 
 @contextmanager

@@ -18,7 +18,7 @@ An MCAP file with an index and checksums: the one writer of bags and of recordin
 On request every write is flushed to the disk: a recording has to survive a kill or
 a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
 at the end (https://mcap.dev/spec, which names the records). A file without its end is good up to
-its last whole chunk, see ``bags.unfinished``.
+its last whole chunk, see ``bags.sequential``.
 
 Beside the files of a bag lies its ``metadata.yaml``. A bag's folder holds a file MARK from when it
 is made until it is finished. If writing ended otherwise (a full disk, an exception, a kill), the

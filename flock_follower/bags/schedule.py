@@ -25,6 +25,7 @@ import math
 from typing import NamedTuple
 
 NANOSECONDS = 1_000_000_000
+MAX_GAP = 5.0  # s between two messages; if it is more, the clock was set or nothing was recorded
 
 
 class Section(NamedTuple):
@@ -46,6 +47,24 @@ def section(bag_start_ns: int, bag_end_ns: int, start: float, duration: float) -
     start_ns = bag_start_ns + round(start * NANOSECONDS)
     last_ns = start_ns + round(duration * NANOSECONDS)
     return Section(start_ns, min(bag_end_ns + 1, last_ns) if duration else bag_end_ns + 1)
+
+
+class Gaps:
+    """Finds the steps of more than MAX_GAP in the times of successive messages, ahead and back."""
+
+    def __init__(self, start_ns: int | None = None) -> None:
+        self.skipped_ns = 0
+        """The sum of all steps."""
+        self._last_ns = start_ns
+
+    def take(self, stamp_ns: int) -> float:
+        """Return the step before a message, s, negative if the clock went back; 0: no gap."""
+        step_ns = 0 if self._last_ns is None else stamp_ns - self._last_ns
+        self._last_ns = stamp_ns
+        if abs(step_ns) <= MAX_GAP * NANOSECONDS:
+            return 0.0
+        self.skipped_ns += step_ns
+        return step_ns / NANOSECONDS
 
 
 class Timeline:

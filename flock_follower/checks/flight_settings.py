@@ -52,7 +52,7 @@ def check_settings(seen: Observations) -> Iterator[Finding]:
 def _camera(seen: Observations) -> Camera:
     """Return the camera and the smallest marker, as far as both are known."""
     images = seen.topic(seen.image_name)
-    rate = images.rate if len(images.arrivals) >= MEASURED_MESSAGES else None
+    rate = seen.rate(images) if len(images.arrivals) >= MEASURED_MESSAGES else None
     if seen.calibration is None:
         return Camera(rate)
     try:

@@ -24,6 +24,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
+from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
@@ -51,12 +54,6 @@ class TopicSeen:
     publishers: list[TopicEnd] = field(default_factory=list)
     arrivals: list[float] = field(default_factory=list)
     stamps: list[float] = field(default_factory=list)
-
-    @property
-    def rate(self) -> float:
-        """Return the rate of the messages, Hz; 0 before the second."""
-        span = self.arrivals[-1] - self.arrivals[0] if self.arrivals else 0.0
-        return (len(self.arrivals) - 1) / span if span > 0.0 else 0.0
 
     @property
     def types(self) -> list[str]:
@@ -180,6 +177,9 @@ class Observations:
     machine: Machine = field(default_factory=Machine)
     incomplete: str = ''
     """Why a bag was never finished."""
+    gaps: list[tuple[float, float, bool]] = field(default_factory=list)
+    """Steps in the times of a bag: s after its start, s of the step, whether it interrupts images
+    or odometry."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
 
@@ -204,6 +204,14 @@ class Observations:
                          else (RAW_IMAGES, COMPRESSED_IMAGES))
         return other if self.topic(other).publishers and (
             not self.topic(wanted).publishers) else wanted
+
+    def rate(self, topic: TopicSeen) -> float:
+        """Return the rate of messages, Hz, 0 before the second; without the gaps of a bag."""
+        periods = np.diff(topic.arrivals)
+        if self.gaps:
+            periods = periods[np.abs(periods) <= MAX_GAP]
+        span = float(periods.sum())
+        return len(periods) / span if span > 0.0 else 0.0
 
     def value(self, node: str, parameter: str, default: Any = None) -> Any:
         """Return the value of a parameter of one of our nodes."""

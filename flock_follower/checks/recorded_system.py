@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
+from flock_follower.bags.schedule import Gaps
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.flight_settings import check_settings
@@ -99,14 +100,18 @@ class RecordedSystem:
                 for name, topic in bag.topics.items() if topic.count})
         self._neighbors = load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
         self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
-        self.stop_ns = bag.start_ns + round(LONGEST * NANOSECONDS)
-        """What comes later is not checked."""
+        self._gaps = Gaps()
+        self._start_ns = bag.start_ns
         names[DIAGNOSTICS] = DIAGNOSTICS
         self.topics = {names[name]: name for name, msgtype in READ.items()
                        if names[name] in self.seen.topics
                        and bag.topics[names[name]].msgtype == msgtype
                        and (name not in _IMAGES or name == self.seen.image_name)}
         """Our names of the topics to take, by their full names."""
+
+    def is_long_enough(self, time_ns: int) -> bool:
+        """Return whether what comes at a time, ns, is not checked any more."""
+        return time_ns - self._start_ns - self._gaps.skipped_ns >= LONGEST * NANOSECONDS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
              ) -> tuple[Any, GrayImage | None]:
@@ -117,7 +122,11 @@ class RecordedSystem:
         are no message of the type, the bag is reported as incomplete.
         """
         name = self.topics.get(topic)
-        if name is None or time_ns >= self.stop_ns:
+        if step := self._gaps.take(time_ns):
+            self.seen.gaps.append((
+                (time_ns - self._start_ns) / NANOSECONDS - step, step,
+                any(self.seen.topic(each).arrivals for each in (self.seen.image_name, 'odom'))))
+        if name is None or self.is_long_enough(time_ns):
             return None, None
         try:
             message = read_odometry(data) if msgtype == ODOMETRY else deserialize(data, msgtype)
@@ -144,11 +153,12 @@ def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = ''
     """
     with open_bag(path) as bag:
         system = RecordedSystem(bag, values, camera, namespace, remaps)
-        # Without an end the bag counts its messages: fewer than announced are reported.
-        stop_ns = system.stop_ns if bag.end_ns >= system.stop_ns else None
+        # To its end the bag counts its messages: fewer than announced are reported.
         try:
-            for message in bag.messages(list(system.topics), stop_ns=stop_ns):
+            for message in bag.messages(list(system.topics)):
                 system.take(*message)
+                if system.is_long_enough(message.stamp_ns):
+                    break
         except BagError as problem:
             system.seen.incomplete = system.seen.incomplete or str(problem)
     return system.seen, system.findings()

@@ -21,6 +21,7 @@ from typing import Final
 
 import numpy as np
 
+from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -61,6 +62,8 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     elif seen.incomplete:
         yield Finding(WARNING, 'bag', f'incomplete: {seen.incomplete}', 'finished',
                       'the part that exists can be used; record again for the rest')
+    if seen.gaps:
+        yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
         yield _needed(seen, name)
     late = float(seen.value('planner', 'odom_timeout', 0.3))
@@ -122,6 +125,18 @@ def _clocks(seen: Observations) -> Iterator[Finding]:
             (True, OK, 'the same for all our nodes', ''))
 
 
+def _gaps(seen: Observations) -> Finding:
+    """Report the largest step in the times of a bag."""
+    after, step, interrupts = max(seen.gaps, key=lambda gap: (gap[2], abs(gap[1])))
+    others = f' (and {len(seen.gaps) - 1} more steps)' if len(seen.gaps) > 1 else ''
+    return Finding(
+        ERROR if interrupts else WARNING, 'bag clock',
+        f'times jump by {step:+.1f} s after {after:.1f} s{others}: the clock was set, or nothing '
+        'was recorded', f'one clock, gaps below {MAX_GAP:g} s',
+        'cut the bag there (ros2 bag convert) and use each part; synchronise the clock before '
+        'recording')
+
+
 def _needed(seen: Observations, name: str) -> Finding:
     """Check that a topic is published, and that messages arrive."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
@@ -163,22 +178,32 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
     if seen.live and silence > max(STOPPED[0], STOPPED[1] * gap):
         yield Finding(ERROR, name, f'stopped: none in the last {silence:.1f} s',
                       'messages to the end', 'see the log of its driver; is it still running?')
-    wanted, rate = f'{rates[0]:g} Hz or more', f'{topic.rate:.1f} Hz'
+    frequency = seen.rate(topic)
+    wanted, rate = f'{rates[0]:g} Hz or more', f'{frequency:.1f} Hz'
     busy = 'not judged, the computer is too busy: '
     yield first(
         f'{name} rate', wanted,
         (len(topic.arrivals) <= 2, UNMEASURED, f'{len(topic.arrivals)} messages are too few', ''),
-        (seen.busy and topic.rate < rates[0], UNMEASURED, busy + rate, ''),
-        (topic.rate < rates[1], ERROR, rate, faster),
-        (topic.rate < rates[0], WARNING, rate, faster),
+        (seen.busy and frequency < rates[0], UNMEASURED, busy + rate, ''),
+        (frequency < rates[1], ERROR, rate, faster),
+        (frequency < rates[0], WARNING, rate, faster),
         (True, OK, rate, ''))
     late = np.array(topic.arrivals) - np.array(topic.stamps)
     middle, most = float(np.median(late)), float(np.percentile(late, 95))
+    stamped = np.array(topic.stamps) > 0.0
+    steps = np.diff(late[stamped])
+    jumps = np.flatnonzero(np.abs(steps) > OTHER_CLOCK)
+    jump, since = ((-steps[jumps[0]], np.array(topic.arrivals)[stamped][jumps[0]]
+                    - topic.arrivals[0]) if jumps.size else (0.0, 0.0))
     ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
     synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
     measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
     yield first(
         f'{name} latency', f'below {latencies[0]:g} s after its stamp',
+        (jumps.size, ERROR,
+         f'stamps jump by {jump:+.1f} s against the time they came, after {since:.1f} s',
+         'a clock was set meanwhile: synchronise all clocks before the flight (chrony, PTP), and '
+         'have the driver stamp by the clock of ROS'),
         (abs(middle) > OTHER_CLOCK, ERROR,
          f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '

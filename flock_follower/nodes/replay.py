@@ -15,7 +15,8 @@
 """
 Replay a bag: ``replay BAG [--ros-args -p rate:=2.0 -p loop:=true ...]``.
 
-Plays ROS 1, ROS 2 sqlite3 and MCAP bags on their recorded schedule, with ``/clock``. A bag's
+Plays ROS 1, ROS 2 sqlite3 and MCAP bags on their recorded schedule, with ``/clock``; gaps of more
+than 5 s in it are named and left out. A bag's
 absolute topics are published under relative names (``/odom`` as ``odom``), so namespaces and
 remaps apply. The service ``replay/pause`` (std_srvs/SetBool) stops and resumes, clock included.
 """
@@ -40,7 +41,7 @@ from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
 from flock_follower.bags.live_line import bar, LiveLine
-from flock_follower.bags.schedule import NANOSECONDS, section, Timeline
+from flock_follower.bags.schedule import Gaps, NANOSECONDS, section, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import percentiles
 from flock_follower.nodes.support.runtime import FlockNode, run
@@ -118,7 +119,10 @@ class Replay(FlockNode):
             self._wait_for_subscribers(executor)
             while self._settings.values['loop'] or not self._sent:
                 self._begin()
+                gaps = Gaps(self._section.start_ns)
                 for message in self._messages():
+                    if step := gaps.take(message.stamp_ns):
+                        self._play_over(step, message.stamp_ns)
                     self._wait_until_due(message.stamp_ns, executor)
                     self._send(message)
                 if not self._sent:
@@ -181,7 +185,7 @@ class Replay(FlockNode):
         """Go to the start; publish the clock before any message."""
         start_ns = self._section.start_ns
         self._timeline.jump(start_ns, time.monotonic() + LEAD_IN)
-        self._clock_ns = -1  # the one place where the clock may go back
+        self._clock_ns = -1  # the clock may go back
         self._publish_clock(start_ns)
         latched = [topic for topic in self._outputs if self.bag.topics[topic].latched]
         if latched and start_ns > self.bag.start_ns:
@@ -192,6 +196,17 @@ class Replay(FlockNode):
         if self._section == (self.bag.start_ns, self.bag.end_ns + 1):
             return self.bag.messages([*self._outputs])  # unbounded, so that losses are noticed
         return self.bag.messages([*self._outputs], *self._section)
+
+    def _play_over(self, step: float, stamp_ns: int) -> None:
+        """Go to a message after a gap in the bag's times, s, without waiting for it."""
+        before = stamp_ns / NANOSECONDS - step - self.bag.start_ns / NANOSECONDS
+        self._line.print_above(
+            f'warning: the times in the bag jump by {step:+.1f} s at {before:.1f} s: the clock '
+            'was set, or nothing was recorded; played without this gap')
+        self._timeline.jump(stamp_ns, time.monotonic() + LEAD_IN)
+        if step < 0.0:
+            self._clock_ns = -1
+        self._publish_clock(stamp_ns)
 
     def _wait_until_due(self, stamp_ns: int, executor: SingleThreadedExecutor) -> None:
         """Wait until a stamp is due; serve the clock and the services meanwhile."""

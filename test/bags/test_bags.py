@@ -276,20 +276,16 @@ def test_a_missing_bag_an_unknown_format_and_an_empty_one_are_one_line(tmp_path)
                                                      'read')
 
 
-@pytest.mark.parametrize('text', ['', 'a: [', 'a: 1', 'rosbag2_bagfile_information: 3', None])
-def test_a_folder_that_contradicts_its_files_is_one_line(tmp_path, text):
+def test_a_file_with_less_than_its_folder_announces_is_one_line(tmp_path):
     path = write_strings(tmp_path / 'bag')
-    if text is None:
-        shutil.copy(storage_file(write_strings(tmp_path / 'other' / 'bag', count=299)),
-                    storage_file(path))
-        assert '299 of 300 announced messages found' in error_of(path)
-    else:
-        (path / 'metadata.yaml').write_text(text)
-        assert 'bag: corrupt, truncated or unsupported' in error_of(path)
+    shutil.copy(storage_file(write_strings(tmp_path / 'other' / 'bag', count=299)),
+                storage_file(path))
+    assert ('299 of 300 announced messages found; if only metadata.yaml is wrong: ros2 bag '
+            f'reindex {path}') in error_of(path)
 
 
 def test_only_a_file_without_its_end_needs_the_library_mcap(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'mcap.reader', None)
+    monkeypatch.setitem(sys.modules, 'mcap.stream_reader', None)
     file = storage_file(write_strings(tmp_path / 'bag'))
     assert len(read_all(tmp_path / 'bag')) == 300
     file.write_bytes(file.read_bytes()[:-200])

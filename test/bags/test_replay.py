@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from flock_follower.bags.schedule import section, Timeline
+from flock_follower.bags.schedule import Gaps, section, Timeline
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -87,3 +87,12 @@ def test_the_part_to_play_is_within_the_bag():
     for start in (10.5, math.nan):
         with pytest.raises(ValueError, match=r'start = (10.5|nan): must be in \[0, 10\] s'):
             section(START, end, start, 0.0)
+
+
+def test_a_step_of_more_than_5_s_either_way_is_a_gap():
+    gaps, found = Gaps(START), []
+    for stamp in (0, 4_900_000_000, 9_900_000_000, 15_000_000_000, -3_600_000_000_000, 0):
+        found.append(gaps.take(START + stamp))
+    assert found == [0.0, 0.0, 0.0, 5.1, -3615.0, 3600.0]
+    assert gaps.skipped_ns == -9_900_000_000
+    assert Gaps().take(START) == 0.0

@@ -101,6 +101,16 @@ def publisher(name: str, node: str) -> Change:
     return lambda seen: seen.topic(name).publishers.append(TopicEnd(node, TYPES[name]))
 
 
+def set_clock(name: str, share: float, step: float) -> Change:
+    """Return a change of the stamps after a share of the messages, by a step, s."""
+    def make(seen: Observed) -> None:
+        topic = seen.topic(name)
+        first = round(share * len(topic.stamps))
+        topic.stamps = [stamp + step * (number >= max(first, 1))
+                        for number, stamp in enumerate(topic.stamps)]
+    return make
+
+
 def kept(name: str, which: slice) -> Change:
     """Return a change that leaves some of the messages."""
     def make(seen: Observed) -> None:
@@ -209,6 +219,16 @@ FAULTS: list[Fault] = [
     Fault('stamps that are zero', BOTH, ERROR, 'odom latency', 'no stamp, or another clock',
           'by the clock of ROS',
           change(lambda seen: seen.topic('odom'), stamps=[0.0] * 250)),
+    *(Fault(f'a clock of the {what} set in flight, {share:.0%} of the way', BOTH, ERROR,
+            f'{name} latency', f'stamps jump by {step:+.1f} s', 'a clock was set meanwhile',
+            set_clock(topic, share, step))
+      for what, name, topic in (('camera', 'images', 'image_raw'), ('VIO', 'odom', 'odom'))
+      for share, step in ((0.01, 3600.0), (0.5, -3600.0), (0.99, -11.0))),
+    Fault('a bag whose clock was set', (False,), ERROR, 'bag clock', 'jump by +3600.0 s after 2.0',
+          'ros2 bag convert', change(gaps=[(0.0, 7e9, False), (2.0, 3600.0, True)])),
+    Fault('a bag that begins with a message without a time', (False,), WARNING, 'bag clock',
+          'jump by +7000000000.0 s after 0.0 s', 'synchronise',
+          change(gaps=[(0.0, 7e9, False)])),
     Fault('a calibration of another size', BOTH, ERROR, 'calibration',
           'for 1280x720, images are 640x480', 'calibrate the camera at this size',
           change(lambda seen: seen.calibration, width=1280, height=720)),

@@ -188,3 +188,42 @@ def test_statements_and_commands_of_the_recorded_system_are_played_only_if_named
     out, err = capfd.readouterr()
     assert 'replayed 1 messages of 1 topics' in out
     assert 'not played unless named: /drone1/command/trajectory, /rosout' in err
+
+
+def write_steps(path: Path, *steps_ns: int) -> Path:
+    """Write 4 headers, each of ``steps_ns`` later than it should come, 1 file for each step."""
+    path.mkdir()
+    for number, step in enumerate(steps_ns):
+        with BagWriter(path.parent / f'{path.name}{number}') as writer:
+            for i in range(4):
+                stamp = START + step + (4 * number + i) * PERIOD
+                writer.write('stamps', 'std_msgs/msg/Header', stamp, header(stamp))
+        (path.parent / f'{path.name}{number}' / f'{path.name}{number}.mcap').rename(
+            path / f'{number}.mcap')
+    return path
+
+
+HOUR = 3_600_000_000_000  # ns
+
+
+@pytest.mark.parametrize(('steps', 'jumps'), [
+    ((0, HOUR), ['+3600.0 s at 0.1 s']), ((0, 7_000_000_000), ['+7.0 s at 0.1 s']),
+    ((0, HOUR, HOUR), ['+3600.0 s at 0.1 s']), ((-START, 0, 0), ['+1700000000.0 s at 0.1 s']),
+    ((HOUR, 0), ['+3599.9 s at 0.0 s', '-3600.0 s at 3600.0 s']),
+    ((0, HOUR, 0), ['+3600.0 s at 0.1 s', '-3600.0 s at 3600.1 s'])])
+def test_gaps_in_the_times_of_a_bag_are_named_and_not_waited_for(
+        player: Callable[..., Player], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        steps: tuple[int, ...], jumps: list[str]) -> None:
+    p = player(write_steps(tmp_path / 'bag', *steps))
+    p.thread.start()
+    p.thread.join(DEADLINE)
+    assert not p.thread.is_alive()
+    stamps = [START + step + (4 * number + i) * PERIOD
+              for number, step in enumerate(steps) for i in range(4)]
+    assert p.stamps() == stamps
+    assert set(stamps) <= set(p.clock())
+    assert sum(after < before for before, after in pairwise(p.clock())) == sum(
+        jump.startswith('-') for jump in jumps)
+    out = capsys.readouterr().out
+    assert [line.split(' jump by ')[1].split(':')[0] for line in out.splitlines()
+            if line.startswith('warning: the times in the bag jump')] == jumps

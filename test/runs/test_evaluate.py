@@ -159,6 +159,35 @@ def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
     assert summary(out)['check'] == {'errors': [], 'warnings': []}
 
 
+@pytest.mark.parametrize(('first', 'step', 'stamped', 'level', 'what'), [
+    (0.6, 3600, True, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s'),
+    (0.6, 3600, False, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s'),
+    (0.6, 6, True, 'error', 'bag clock: times jump by +6.0 s after 0.6 s'),
+    # Played in the order of their times, what was recorded later comes first.
+    (0.6, -3600, True, 'error', 'bag clock: times jump by +3598.8 s after 0.6 s')])
+def test_a_clock_set_in_flight_is_an_error(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str], first: float, step: int,
+        stamped: bool, level: str, what: str) -> None:
+    began: list[int] = []
+
+    def set_clock(message: BagMessage) -> BagMessage:
+        began.append(message.stamp_ns)
+        if message.stamp_ns - began[0] < first * 1e9:
+            return message
+        data = bytearray(message.data)
+        if stamped:
+            data[4:8] = (int.from_bytes(data[4:8], 'little') + step).to_bytes(4, 'little')
+        return message._replace(stamp_ns=message.stamp_ns + step * 10**9, data=bytes(data))
+    spoilt = excerpt(tmp_path / 'bag', 1.2, set_clock)
+    assert main([str(spoilt), '--output', str(tmp_path / 'out')]) == 1
+    assert f'{level}: {what}' in capsys.readouterr().err
+    seen, findings = check_bag(spoilt, read_parameters(resource('config/follower.yaml'), TABLE))
+    assert [each.level for each in findings if each.what == 'bag clock'] == [level]
+    assert len(seen.topic('odom').arrivals) == 240
+    assert [each.level for each in findings if each.what in ('odom rate', 'settings')] == [
+        'ok', 'ok']
+
+
 def test_bytes_that_are_no_message_are_counted_and_said(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     count = Counter[str]()

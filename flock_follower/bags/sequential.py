@@ -1,0 +1,211 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Reading ROS 2 recordings from start to end, without their indexes, changing nothing.
+
+rosbags needs a file's end and its index, and a folder's ``metadata.yaml``, and refuses a file for
+one channel that is not of ROS 2. This reader needs none of them: it takes the files one after the
+other, one in MCAP without an end up to its last good chunk. Their content is all that it goes by.
+MCAP files are read by the library mcap; on a vehicle it need not be installed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing
+import heapq
+from pathlib import Path
+import sqlite3
+from typing import NamedTuple
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Qos,
+)
+from rosbags.rosbag2.metadata import parse_qos
+
+from flock_follower.bags.bag_files import has_end, MCAP
+
+_ROS1 = 'ros1'
+_ZSTD = b'\x28\xb5\x2f\xfd'  # the first bytes of compressed data; those of CDR are 0
+
+
+class _Channel(NamedTuple):
+    """The channel of a message; ``encoding`` is that of its bytes."""
+
+    topic: str
+    msgtype: str
+    encoding: str
+    definition: str = ''
+    qos: str = ''
+
+
+_Record = tuple[_Channel, int, bytes]
+
+
+class SequentialReader:
+    """
+    Files of a recording, read one after the other, with rosbags' interface of a reader.
+
+    Messages come in the order of their stamps within each file. ``start_time`` is the stamp of
+    the first message, ``end_time`` a nanosecond more than that of the last, ns.
+    """
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self.start_time, self.end_time = 2**63, 0
+        self._files = files
+        self._connections: dict[_Channel, Connection] = {}
+        self._disorder = 0  # ns by which a message may be older than one before it in its file
+
+    @property
+    def connections(self) -> list[Connection]:
+        """Return the topics that hold messages."""
+        return list(self._connections.values())
+
+    def open(self) -> None:
+        """
+        Look through the files; those that hold nothing are left out.
+
+        :raises ValueError: all of them hold nothing, one holds less than it announces,
+            messages are compressed one by one, or the library mcap is not installed.
+        """
+        counts: Counter[_Channel] = Counter()
+        for file in self._files:
+            newest = 0
+            for channel, stamp, data in _records(file):
+                if data.startswith(_ZSTD) and channel.encoding == 'cdr':
+                    raise ValueError(f'messages of {channel.topic} are compressed, which its '
+                                     'metadata.yaml must say')
+                counts[channel] += 1
+                newest = max(newest, stamp)
+                self._disorder = max(self._disorder, newest - stamp)
+                self.start_time = min(self.start_time, stamp)
+                self.end_time = max(self.end_time, stamp + 1)
+        if not counts:
+            raise ValueError('it holds no message, or was cut short before its first: nothing is '
+                             'in it')
+        self._connections = {
+            channel: _connection(number, channel, count)
+            for number, (channel, count) in enumerate(counts.items(), 1)}
+
+    def messages(self, connections: Collection[Connection], start: int | None = None,
+                 stop: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield the messages of some connections from ``start`` to before ``stop``, ns."""
+        wanted = {one.id for one in connections}
+        stop = self.end_time if stop is None else stop
+        for file in self._files:
+            newest = 0
+            held: list[tuple[int, int, Connection, bytes]] = []
+            for number, (channel, stamp, data) in enumerate(_records(file)):
+                newest = max(newest, stamp)
+                connection = self._connections[channel]
+                if connection.id in wanted and (start or 0) <= stamp < stop:
+                    heapq.heappush(held, (stamp, number, connection, data))
+                while held and held[0][0] <= newest - self._disorder:
+                    yield _stamped(heapq.heappop(held))
+            while held:
+                yield _stamped(heapq.heappop(held))
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+
+def _stamped(held: tuple[int, int, Connection, bytes]) -> tuple[Connection, int, bytes]:
+    stamp, _, connection, data = held
+    return connection, stamp, data
+
+
+def _records(file: Path) -> Iterator[_Record]:
+    """
+    Yield the channel, the stamp, ns, and the bytes of each message of a file, as it holds them.
+
+    :raises ValueError: it holds less than it announces, or the library mcap is not installed.
+    :raises Exception: whatever the libraries raise for damage in a file that has an end.
+    """
+    return _mcap_records(file) if file.suffix == MCAP else _sqlite_records(file)
+
+
+def _mcap_records(path: Path) -> Iterator[_Record]:
+    try:
+        from mcap.records import Channel, Message, Schema, Statistics
+        from mcap.stream_reader import StreamReader
+    except ImportError:
+        raise ValueError('its end or its index is missing, or a channel is not of ROS 2; to read '
+                         'it needs the library mcap: pip install mcap') from None
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, _Channel] = {}
+    found = announced = 0
+    with path.open('rb') as file:
+        try:
+            for record in StreamReader(file, validate_crcs=True).records:
+                if isinstance(record, Message):
+                    found += 1
+                    yield channels[record.channel_id], record.log_time, record.data
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    schema = schemas.get(record.schema_id)
+                    channels[record.id] = _Channel(
+                        record.topic, _type_name(schema.name if schema else ''),
+                        record.message_encoding,
+                        schema.data.decode(errors='replace') if schema else '',
+                        record.metadata.get('offered_qos_profiles', ''))
+                elif isinstance(record, Statistics):
+                    announced = record.message_count
+        except Exception:
+            if has_end(path):
+                raise
+    if found < announced:
+        raise ValueError(f'{found} of {announced} announced messages found')
+
+
+def _sqlite_records(path: Path) -> Iterator[_Record]:
+    with closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True)) as file:
+        described = {row[1] for row in file.execute('PRAGMA table_info(topics)')}
+        qos = 'offered_qos_profiles' if 'offered_qos_profiles' in described else "''"
+        channels = {
+            number: _Channel(topic, _type_name(msgtype), encoding, '', profiles or '')
+            for number, topic, msgtype, encoding, profiles in file.execute(
+                f'SELECT id, name, type, serialization_format, {qos} FROM topics')}
+        for number, stamp, data in file.execute(
+                'SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp'):
+            yield channels[number], stamp, data
+
+
+def _type_name(name: str) -> str:
+    """Return the ROS 2 name of a type: ROS 1 has no ``msg`` in it."""
+    package, *others = name.split('/')
+    return f'{package}/msg/{others[0]}' if len(others) == 1 else name
+
+
+def _connection(number: int, channel: _Channel, count: int) -> Connection:
+    return Connection(
+        number, channel.topic, channel.msgtype,
+        MessageDefinition(MessageDefinitionFormat.MSG, channel.definition), '', count,
+        ConnectionExtRosbag1(None, None) if channel.encoding == _ROS1
+        else ConnectionExtRosbag2(channel.encoding, _profiles(channel.qos)), None)
+
+
+def _profiles(qos: str) -> list[Qos]:
+    """Return QoS profiles; none if they are written in a way that is not understood."""
+    try:
+        return parse_qos(qos)
+    except Exception:  # the recorder's text: anything can be wrong, and no message depends on it
+        return []
