@@ -68,6 +68,9 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
+#: Time between two messages of a recording, s; if it is more, the clock was set or nothing was
+#: recorded.
+MAX_GAP = 5.0
 #: Largest error of the hover thrust that the gate offsets, m/s^2.
 THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.

@@ -208,6 +208,14 @@ def keep_to_the_marker(request, monkeypatch):
     assert before or 'rclpy' not in sys.modules, 'loads rclpy: mark it with @pytest.mark.ros'
 
 
+@pytest.fixture
+def default_hangup():
+    """Let children inherit no ignored SIGHUP: the suite itself may run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture(scope='module')
 def ros():
     """Have ROS up while a module's tests run; where there is none, others run all the same."""

@@ -24,8 +24,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from flock_follower.ranges import MAX_GAP
+
 NANOSECONDS = 1_000_000_000
-MAX_GAP = 5.0  # s between two messages; if it is more, the clock was set or nothing was recorded
 
 
 class Section(NamedTuple):

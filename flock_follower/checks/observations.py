@@ -26,13 +26,13 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
+from flock_follower.ranges import MAX_GAP
 
 #: Key of a node's diagnostics: its parameter files.
 FILES: Final = 'parameter_files'

@@ -21,7 +21,6 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.bags.schedule import MAX_GAP
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -39,6 +38,7 @@ from flock_follower.checks.topic_names import (
     RAW_IMAGES,
     TYPES,
 )
+from flock_follower.ranges import MAX_GAP
 
 #: Only one node may publish these.
 ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',

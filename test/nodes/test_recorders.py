@@ -216,7 +216,7 @@ def test_in_simulated_time_the_messages_of_a_topic_keep_their_order(
 def test_no_deadline_ends_a_process_that_finishes_its_files(
         monkeypatch: pytest.MonkeyPatch) -> None:
     deadlines: list[float] = []
-    monkeypatch.setattr(nodes, '_AS_A_PROGRAM', True)
+    monkeypatch.setattr(nodes, 'AS_A_PROGRAM', True)
     monkeypatch.setattr(signal, 'setitimer', lambda _, seconds: deadlines.append(seconds))
     with nodes.unhurried():
         nodes.set_deadline()

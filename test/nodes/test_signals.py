@@ -39,6 +39,7 @@ from flock_follower import signals
 from flock_follower.files import resource
 from flock_follower.nodes.support.runtime import unwritable_logs
 
+pytestmark = pytest.mark.usefixtures('default_hangup')
 #: Instead of the library that a program imports first: sends it a signal, and waits for the end.
 STUB = """
 import os, signal, time

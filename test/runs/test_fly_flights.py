@@ -108,7 +108,7 @@ def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_
         running, tmp_path, capfd):
     port, truth = free_udp_port(), free_udp_port()
     # Setpoints begin while offboard is asked for; the scenario 1.5 s later.
-    switch = {'kind': 'pilot', 'at': 5.0, 'after': 'setpoint', 'mode': 'POSCTL'}
+    switch = {'kind': 'pilot', 'at': 8.0, 'after': 'setpoint', 'mode': 'POSCTL'}
     running('--start', 'landed', '--connect', f'127.0.0.1:{port}', '--truth',
             f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5', '--fault', json.dumps(switch))
     out, began = tmp_path / 'out', time.monotonic()

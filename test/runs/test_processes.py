@@ -56,6 +56,7 @@ def lives(pid: int) -> bool:
 
 
 @pytest.mark.ros
+@pytest.mark.usefixtures('default_hangup')
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_children_end_with_the_program_that_started_them(tmp_path: Path, number: int):
     with subprocess.Popen([sys.executable, '-c', PROGRAM, str(tmp_path)], text=True,
