@@ -380,6 +380,8 @@ class Bridge:
                 dialect is None):
             return
         cause = self.takeover.cause(dialect, permission.received)
+        if now - permission.received > AFTER and cause != PILOT:
+            cause = permission.cause  # later evidence belongs to another failsafe
         self.gate.permit(permission.attributed(cause, now))
         settled = cause not in (UNKNOWN, failsafe(UNNAMED)) or now - permission.received > AFTER
         if settled and cause != self._reported_cause:

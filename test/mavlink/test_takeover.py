@@ -168,6 +168,12 @@ def texts(flight):
     return [m.text for _, m in flight.received if m.get_type() == 'STATUSTEXT']
 
 
+def arrive(flight, message):
+    """Have an EVENT arrive at the bridge."""
+    flight.wire.arrived.append(frame(MESSAGE_ID, message.unpacker.pack(
+        message.number, 0, 0, 0, 0, 0, *message.arguments), crc_extra=message.crc_extra))
+
+
 @pytest.mark.slow
 def test_px4s_own_failsafe_is_no_pilot_and_bars_nothing():
     lost = Fault('drop', 5.0, 2.5, 'received', message=SET_POSITION)
@@ -178,13 +184,16 @@ def test_px4s_own_failsafe_is_no_pilot_and_bars_nothing():
     assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
     assert flight.bridge.state(flight.now).endswith(f'AUTO.LOITER: failsafe: {UNNAMED}')
     # The name comes a little later.
-    message = entered(3)
-    flight.wire.arrived.append(frame(MESSAGE_ID, message.unpacker.pack(
-        message.number, 0, 0, 0, 0, 0, *message.arguments), crc_extra=message.crc_extra))
+    arrive(flight, entered(3))
     flight.fly(2.5)
     assert flight.bridge.state(flight.now).endswith(f'AUTO.LOITER: failsafe: {BATTERY}')
     assert f'flock: hands over: failsafe: {BATTERY}' in texts(flight)
     assert not flight.setpoints(flight.now - 1.0)
+    # The autopilot names the cause again as it lands.
+    arrive(flight, entered(3))
+    flight.fly(3.0)
+    assert flight.bridge.state(flight.now).endswith(f'AUTO.LOITER: failsafe: {BATTERY}')
+    assert sum('hands over' in each for each in texts(flight)) == 1
     flight.fly_until(lambda: False, max(0.0, 7.6 - flight.now))
     assert flight.ask('offboard', True).success
     # A pilot after a failsafe bars offboard from then on.
