@@ -12,20 +12,117 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Names of Fast DDS that differ between version 2 (ROS 2 Jazzy) and 3 (Kilted)."""
+"""
+Fast DDS of ROS 2: its profiles, and its shared memory.
+
+Names differ between version 2 (ROS 2 Jazzy) and 3 (Kilted). Discovery goes by UDP. Messages go
+through files in /dev/shm; a process locks the file ``NAME_el`` beside each of its own and removes
+both at its end.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+import contextlib
+import fcntl
+import os
+from pathlib import Path
+import pwd
+import time
 from typing import Final
 
 from flock_follower.files import resource
 
 #: Variables that name a profile. Fast DDS 3 prefers the first; Fast DDS 2 reads the second alone.
 PROFILE_VARIABLES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-#: How its files in /dev/shm begin.
-SEGMENT_PREFIXES: Final = ('fastdds_', 'fastrtps_')
+#: Words of every reason of ``undelivered``, by which ``check`` finds its advice.
+UNDELIVERED: Final = 'the transport delivers nothing'
+#: Where the shared memory is, and how the names of its files begin.
+_FOLDER: Final = Path('/dev/shm')
+_PREFIXES: Final = ('fastdds_', 'fastrtps_')
+_LOCK_SUFFIX: Final = '_el'
+#: So the kernel marks an open file that was removed.
+_REMOVED: Final = ' (deleted)'
+#: A younger lock may be one whose process is about to lock it, s.
+_YOUNG: Final = 10.0
 
 
 def profile_variables(relative: str) -> dict[str, str]:
     """Return the variables for a profile that the package ships, such as 'config/fastdds.xml'."""
     return dict.fromkeys(PROFILE_VARIABLES, str(resource(relative)))
+
+
+def open_shared_memory() -> list[str]:
+    """Return the names of the files of shared memory that this process has open."""
+    opened = []
+    for link in Path('/proc/self/fd').glob('*'):
+        with contextlib.suppress(OSError):  # closed meanwhile by another thread
+            opened.append(os.readlink(link))
+    return [name for name in opened if _is_shared_memory(Path(name))]
+
+
+def largest_shared_memory() -> int:
+    """Return the size, bytes, of the largest file that this process has open; or 0."""
+    sizes = [0]
+    for name in open_shared_memory():
+        with contextlib.suppress(OSError):  # removed
+            sizes.append(Path(name.removesuffix(_LOCK_SUFFIX)).stat().st_size)
+    return max(sizes)
+
+
+def dead_segments(folder: Path = _FOLDER) -> list[Path]:
+    """Return the lock files of shared memory whose processes were killed."""
+    dead = []
+    for path in _locks(folder):
+        with contextlib.suppress(OSError), open(path, 'rb') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if time.time() - path.stat().st_mtime > _YOUNG:
+                dead.append(path)
+    return dead
+
+
+def undelivered(opened: Iterable[str], user: int, folder: Path = _FOLDER) -> str:
+    """
+    Return why shared memory delivers nothing to this process, or ''.
+
+    If its files are removed (a login that ends), belong to another user, or lie in another
+    /dev/shm (a container), publishers are found, and their messages never arrive.
+
+    :param opened: names of its open files. :param user: its user id.
+    """
+    own = {name for name in opened if _is_shared_memory(Path(name))}
+    if not own:
+        return ''  # it uses UDP
+    if any(name.endswith(_REMOVED) for name in own):
+        return (f'{UNDELIVERED}: the shared memory of this node was removed from {folder}, as '
+                'systemd does when a login ends: restart the node')
+    others = set()
+    for lock in _locks(folder):
+        with contextlib.suppress(OSError):  # removed meanwhile
+            if str(_FOLDER / lock.name) not in own:
+                others.add(lock.stat().st_uid)
+    if not others:
+        return (f'none sending, or {UNDELIVERED}: no other process has shared memory in this '
+                f'{folder}; containers need --ipc host')
+    if foreign := others - {user}:
+        return (f'{UNDELIVERED} from processes of {", ".join(map(_user_name, sorted(foreign)))}: '
+                f'Fast DDS shares no memory between two users, and this node is of '
+                f'{_user_name(user)}')
+    return ''
+
+
+def _is_shared_memory(file: Path) -> bool:
+    return file.parent == _FOLDER and file.name.startswith(_PREFIXES)
+
+
+def _locks(folder: Path) -> Iterator[Path]:
+    """Yield the lock files of all processes."""
+    for prefix in _PREFIXES:
+        yield from folder.glob(f'{prefix}*{_LOCK_SUFFIX}')
+
+
+def _user_name(user: int) -> str:
+    try:
+        return f'user {pwd.getpwuid(user).pw_name}'
+    except KeyError:
+        return f'user id {user}'

@@ -21,12 +21,13 @@ from pathlib import Path
 
 import pytest
 
-from flock_follower.checks.shared_memory import UNDELIVERED, undelivered
 from flock_follower.checks.system import ADVICE
+from flock_follower.fast_dds import UNDELIVERED, undelivered
 
 OWN = ['/dev/shm/fastrtps_ab_el', '/dev/shm/fastrtps_port7001_el', 'socket:[17]']
 
 
+@pytest.mark.parametrize('prefix', ['fastrtps_', 'fastdds_'])  # of Jazzy and Kilted
 @pytest.mark.parametrize(('opened', 'others', 'user', 'said'), [
     (['socket:[17]'], ['fastrtps_cd_el'], os.getuid() + 1, ''),  # UDP alone
     (OWN, ['fastrtps_cd_el'], os.getuid(), ''),
@@ -35,9 +36,12 @@ OWN = ['/dev/shm/fastrtps_ab_el', '/dev/shm/fastrtps_port7001_el', 'socket:[17]'
     (OWN, ['fastrtps_cd_el'], os.getuid() + 1, 'between two users'),
     (OWN, ['fastrtps_cd', 'sem.other'], os.getuid(), '--ipc host')])
 def test_lost_shared_memory_is_named_with_its_cause(
-        tmp_path: Path, opened: list[str], others: list[str], user: int, said: str) -> None:
+        tmp_path: Path, opened: list[str], others: list[str], user: int, said: str,
+        prefix: str) -> None:
+    opened, others = ([name.replace('fastrtps_', prefix) for name in names]
+                      for names in (opened, others))
     for name in ('fastrtps_ab_el', 'fastrtps_port7001_el', *others):
-        (tmp_path / name).touch()
+        (tmp_path / name.replace('fastrtps_', prefix)).touch()
     found = undelivered(opened, user, tmp_path)
     assert said in found and bool(found) == bool(said)
     assert not said or UNDELIVERED in found

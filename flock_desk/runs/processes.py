@@ -46,8 +46,7 @@ from flock_follower.checks.processor import (
     stopped,
     threads_of,
 )
-from flock_follower.checks.system import dead_segments
-from flock_follower.fast_dds import profile_variables
+from flock_follower.fast_dds import dead_segments, profile_variables
 from flock_follower.signals import ending
 
 TOO_BUSY_EXIT_CODE = 3

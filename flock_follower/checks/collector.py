@@ -23,7 +23,6 @@ import numpy as np
 
 from flock_follower.checks.image_motion import shift, small
 from flock_follower.checks.observations import (
-    FILES,
     NodeStatus,
     Observations,
     OwnMotion,
@@ -35,6 +34,7 @@ from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
 from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters.files import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
@@ -100,7 +100,7 @@ class Collector:
             self.observations.statuses[status.name] = NodeStatus(
                 level[0] if isinstance(level, bytes) else int(level), status.message,
                 {item.key: item.value for item in status.values})
-            files = self.observations.statuses[status.name].values.get(FILES)
+            files = self.observations.statuses[status.name].values.get(PARAMETER_FILES)
             known = self.observations.files.setdefault(status.name, [])
             if files is not None and files not in known:
                 known.append(files)

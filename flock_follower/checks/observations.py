@@ -34,8 +34,6 @@ from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.ranges import MAX_GAP
 
-#: Key of a node's diagnostics: its parameter files.
-FILES: Final = 'parameter_files'
 #: The nodes of a follower.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
 

@@ -17,10 +17,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import contextlib
-import fcntl
-from pathlib import Path
-import time
 from typing import Final
 
 from flock_follower.checks.findings import (
@@ -34,9 +30,8 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Machine, Observations, OURS
 from flock_follower.checks.processor import BUSY
-from flock_follower.checks.shared_memory import UNDELIVERED
 from flock_follower.checks.topic_names import full_name
-from flock_follower.fast_dds import PROFILE_VARIABLES, SEGMENT_PREFIXES
+from flock_follower.fast_dds import PROFILE_VARIABLES, UNDELIVERED
 
 STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.
@@ -44,8 +39,6 @@ ROOM = 32.0
 #: Segments of killed processes from which on there is a warning: 180 raised the latency of the
 #: demonstration from image to setpoint, 95 %, from 90 ms to 239 ms.
 DEAD_SEGMENTS = 20
-#: A younger segment may be one whose process is about to lock it, s.
-YOUNG = 10.0
 #: Keys of the bridge's diagnostics.
 PARAMETER: Final = 'parameter '
 MISSING: Final = 'missing parameter '
@@ -110,21 +103,6 @@ def _shared_memory(machine: Machine, image: int) -> Finding:
         (free is None, UNMEASURED, 'the space in /dev/shm is unknown', ''),
         (not image, UNMEASURED, 'no image was seen', ''),
         (True, OK, f'images of {image / 1024:.0f} kB', ''))
-
-
-def dead_segments(folder: Path = Path('/dev/shm')) -> list[Path]:
-    """
-    Return the lock files of Fast DDS's segments in shared memory whose processes were killed.
-
-    A process locks the file ``NAME_el`` beside each of its segments, and removes both at its end.
-    """
-    dead = []
-    for path in (path for prefix in SEGMENT_PREFIXES for path in folder.glob(f'{prefix}*_el')):
-        with contextlib.suppress(OSError), open(path, 'rb') as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if time.time() - path.stat().st_mtime > YOUNG:
-                dead.append(path)
-    return dead
 
 
 def check_diagnostics(seen: Observations) -> Iterator[Finding]:

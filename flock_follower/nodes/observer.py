@@ -39,7 +39,6 @@ from flock_follower.checks.collector import Collector
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LoadMeter, PERIOD
 from flock_follower.checks.reach import find_reach, Reach
-from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -51,6 +50,7 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
+from flock_follower.fast_dds import dead_segments
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class

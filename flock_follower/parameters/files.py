@@ -48,6 +48,8 @@ from flock_follower.parameters.tables import MAVLINK_BRIDGE, PLANNER, RELATIVE_P
 from flock_follower.perception.markers import load
 
 Table = Mapping[str, Sequence[Spec]]
+#: Key of a node's diagnostics: its parameter files.
+PARAMETER_FILES: Final = 'parameter_files'
 #: The parameters of the nodes that a flight needs.
 TABLE: Final = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER,
                 'mavlink_bridge': MAVLINK_BRIDGE}

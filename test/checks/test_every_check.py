@@ -43,8 +43,8 @@ from flock_follower.checks.observations import (
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.system import dead_segments
 from flock_follower.checks.topic_names import TYPES
+from flock_follower.fast_dds import dead_segments
 from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_multiply,

@@ -34,7 +34,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 
-from flock_follower.checks.shared_memory import open_files, undelivered
+from flock_follower.fast_dds import open_shared_memory, undelivered
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -145,7 +145,7 @@ class Input:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
         if self._sporadic:
             return ''
-        fault = undelivered(open_files(), os.getuid())
+        fault = undelivered(open_shared_memory(), os.getuid())
         return f'{len(publishers)} publisher(s), ' + (fault or 'none sending')
 
 

@@ -17,12 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import MutableMapping
-import contextlib
-import os
 from pathlib import Path
 from typing import Final
 
-from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables, SEGMENT_PREFIXES
+from flock_follower.fast_dds import largest_shared_memory, PROFILE_VARIABLES, profile_variables
 from flock_follower.files import resource
 
 #: Share of a file of shared memory that is for messages (measured with Fast DDS 2.14 and 3.2).
@@ -94,13 +92,7 @@ def receive_buffer_max() -> int:
 
 def shared_memory_size() -> int:
     """Return the size, bytes, of the largest shared memory that Fast DDS sends through; or 0."""
-    sizes = [0]
-    for link in Path('/proc/self/fd').glob('*'):
-        with contextlib.suppress(OSError):  # closed meanwhile by another thread
-            lock = Path(os.readlink(link))
-            if lock.parent == Path('/dev/shm') and lock.name.startswith(SEGMENT_PREFIXES):
-                sizes.append(lock.with_name(lock.name.removesuffix('_el')).stat().st_size)
-    return round(max(sizes) * _SEGMENT_SHARE)
+    return round(largest_shared_memory() * _SEGMENT_SHARE)
 
 
 def _is_own(profile: str) -> bool:

@@ -47,13 +47,12 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from flock_follower.checks.observations import FILES
 from flock_follower.files import read_text
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
 from flock_follower.odometry.reader import read_odometry
-from flock_follower.parameters.files import files_in, shared, unheeded
+from flock_follower.parameters.files import files_in, PARAMETER_FILES, shared, unheeded
 from flock_follower.parameters.spec import Spec
 
 Message = TypeVar('Message')
@@ -121,7 +120,7 @@ class FlockNode(Node):
         :raises ValueError: also for a parameter file that seems to mean the node and misses it.
         """
         name = self.get_fully_qualified_name()
-        self.diagnostics.values[FILES] = ', '.join(self.parameter_files)
+        self.diagnostics.values[PARAMETER_FILES] = ', '.join(self.parameter_files)
         for path in self.parameter_files:
             if warning := unheeded(path, name):
                 self.get_logger().warning(warning)
