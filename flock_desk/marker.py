@@ -48,7 +48,7 @@ from flock_follower.perception.markers import draw_marker, marker_cells, SIDE_LE
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}
 #: Sides of a panel, m: the first is seen from 1 to 8 m, the second from 0.3 to 2 m (640x480,
 #: 611 px).
-SIZE = 0.16  # m, side of the marker of config/neighbors.yaml
+DEFAULT_SIDE = 0.16  # m, side of the marker of config/neighbors.yaml
 SIZES = (0.3, 0.06)
 # White around the black border is a cell wide, and no less than this share of the side: OpenCV 4.6
 # drops a square with another, here the paper's edge, within 0.05 of its perimeter.
@@ -112,7 +112,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _write(options: argparse.Namespace) -> int:
     """Write the file and print the neighbours file."""
     ids, sizes = options.id, options.size
-    sizes = sizes or ([*SIZES] if options.panel else [SIZE])
+    sizes = sizes or ([*SIZES] if options.panel else [DEFAULT_SIDE])
     ids = ids or [*range(len(sizes))]
     if len(set(ids)) < len(ids):
         raise ValueError(f'--id = {ids}: must name each marker once')

@@ -12,7 +12,6 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """Whether commands point along the law, and setpoints along what they rest on."""
 
 from __future__ import annotations

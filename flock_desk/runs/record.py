@@ -211,16 +211,9 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         raise LateError('not one image was rendered in time')
     record = read_record(out / _RECORD)
     commands = record.get('/command/trajectory', [])
-    external = bool(str(log['pose_source']))
-    against = np.empty(0, dtype=bool) if external else opposed(log, commands)
-    state_flown = flown(log['state_time'])
-    log['clock'] = log['clock'][flown(log['clock'][:, 0])]
-    for name in log:
-        if name.startswith(('image_', 'follower_', 'leader_')):
-            log[name] = log[name][shown]
-        elif name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
-            log[name] = log[name][state_flown]
-    if external:
+    against = opposed(log, commands)  # no setpoints of an external autopilot are logged
+    _cut(log, shown, flown(log['state_time']), flown(log['clock'][:, 0]))
+    if str(log['pose_source']):
         log['setpoint_time'] = np.array([time for time, _ in commands])
         log['setpoint_acceleration'] = np.reshape(
             [from_trajectory(message, 'odom').acceleration for _, message in commands],
@@ -232,15 +225,12 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
         estimates(neighbors), own,
         _states(log, 'follower', stamps), _states(log, LEADER_NAME, stamps), stamps,
         judged(log['image_usable'], stamps, neighbors), epoch)
-    times, hidden = table['time'], table['visible'] == 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
     return LiveFlight(
         duration=ended - began, params=scenario.flight.planner(True), table=table,
         paths={name: log[f'{name}_position'] for name in (LEADER_NAME, 'follower')},
         speeds={'follower': (log['state_time'] - began, np.linalg.norm(log['velocity'], axis=1)),
-                'leader': (times, np.linalg.norm(log['leader_velocity'], axis=1))},
-        blind=[(float(times[begin]), float(times[min(end, len(times) - 1)]))
-               for begin, end in zip(edges[::2], edges[1::2])],
+                'leader': (table['time'], np.linalg.norm(log['leader_velocity'], axis=1))},
+        blind=_hidden(table),
         distance=log['distance'][flown(log['distance_time'])],
         setpoint_times=log['setpoint_time'][sent] - began,
         setpoints=log['setpoint_acceleration'][sent],
@@ -251,6 +241,24 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
                 for t, s in zip(log['planner_time'], log['planner_state'])],
         diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
         scenario=scenario, log=log)
+
+
+def _cut(log: dict[str, Any], images: Any, states: Any, clock: Any) -> None:
+    """Cut a log to the images, states and times of the clock that masks select."""
+    log['clock'] = log['clock'][clock]
+    for name in log:
+        if name.startswith(('image_', 'follower_', 'leader_')):
+            log[name] = log[name][images]
+        elif name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
+            log[name] = log[name][states]
+
+
+def _hidden(table: Table) -> list[tuple[float, float]]:
+    """Return the times, s, in which the leader could not be seen, from and to."""
+    times, hidden = table['time'], table['visible'] == 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
+    return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
+            for begin, end in zip(edges[::2], edges[1::2])]
 
 
 def _of(array: Any, namespace: str) -> Any:

@@ -27,16 +27,16 @@ from flock_follower.settings import Camera, judge
 #: Messages after which a rate counts as measured.
 MEASURED_MESSAGES = 10
 #: The nodes whose parameters are judged.
-JUDGED = ('planner', 'mavlink_bridge')
+JUDGED_NODES = ('planner', 'mavlink_bridge')
 
 
 def check_settings(seen: Observations) -> Iterator[Finding]:
     """Check that the parameters of a live system can fly; a bag is judged with ours."""
     wanted = 'parameters that can fly'
-    missing = ', '.join(node for node in JUDGED if not seen.parameters.get(node))
+    missing = ', '.join(node for node in JUDGED_NODES if not seen.parameters.get(node))
     if missing and seen.live:
         yield Finding(UNMEASURED, 'settings', f'no parameters received of {missing}', wanted)
-    values = {name: value for node in JUDGED
+    values = {name: value for node in JUDGED_NODES
               for name, value in seen.parameters.get(node, {}).items()}
     if not values:
         return

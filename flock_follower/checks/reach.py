@@ -44,7 +44,7 @@ def find_reach(process: int, domain: int, proc: Path = Path('/proc')) -> Reach |
     Return from where the ROS of a process is reached; None if no socket of ROS is found.
 
     A socket that is bound to the loopback interface is reached from this computer. So is one that
-    is bound to a multicast address: whoever calls it gets no answer from elsewhere. Firewalls are
+    is bound to a multicast address: a computer elsewhere gets no answer from it. Firewalls are
     not seen, nor is middleware that does not use the ports of DDS (Zenoh).
 
     :param process: its id. :param domain: its ROS_DOMAIN_ID.

@@ -47,7 +47,7 @@ NOT_READY: Final = 'not ready to arm'
 UNREAD: Final = 'parameters unread'
 #: That the autopilot answers nothing, or ''; the questions that have no answer.
 NO_ANSWERS: Final = 'no answers'
-UNKNOWN: Final = 'unanswered questions'
+UNANSWERED: Final = 'unanswered questions'
 REFUSED: Final = 'offboard would be refused'
 LINK_FAULT: Final = 'link fault'
 #: The action for a status of a node, by a part of its text.
@@ -139,7 +139,7 @@ def _autopilot(values: dict[str, str]) -> Iterator[Finding]:
         (fault, WARNING, vehicle, fault), (True, OK, vehicle, ''))
     if silent or link != 'alive':
         return
-    unknown = values.get(UNKNOWN, 'not reported')
+    unknown = values.get(UNANSWERED, 'not reported')
     yield first('answers', 'every question is answered',
                 (unknown, UNMEASURED, f'none about {unknown}', ''), (True, OK, 'all', ''))
     for key in values:

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Connection URLs, and the errors of their devices in words that name the remedy.
+Connection URLs, and the texts of errors of their devices, with remedies.
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
 ``/dev/DEVICE[,BAUD]`` is a serial port. The forms of other programs for the same are taken:
@@ -101,7 +101,7 @@ def parse_connection(url: str) -> Connection:
 
 def explain_error(error: BaseException, device: str = '', sending: bool = False) -> str:
     """
-    Return an OSError or termios.error in words, with its name and the remedy.
+    Return the text of an OSError or termios.error, with its name and the remedy.
 
     :param device: the serial port that it is about, '' for a network.
     :param sending: whether a datagram was sent, not an address taken.

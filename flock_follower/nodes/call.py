@@ -50,7 +50,7 @@ MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
 LONGEST = STREAM_TIMEOUT + CONFIRM_TIMEOUT + REASON_WAIT
 #: The services of our nodes, in no namespace.
-OURS = ('/planner/engage', *(f'/mavlink_bridge/{name}' for name in (
+OUR_SERVICES = ('/planner/engage', *(f'/mavlink_bridge/{name}' for name in (
     'arm', 'offboard', 'takeoff', 'land')), '/replay/pause')
 _HEIGHT = next(spec.range.high for spec in MAVLINK_BRIDGE if spec.name == 'takeoff_height')
 
@@ -68,7 +68,7 @@ def patience(service: str) -> float:
 def proposal(service: str, there: Iterable[str]) -> str:
     """Return which service is meant, as a question; ``there`` are full names. '' if none is."""
     last = service.rpartition('/')[2]
-    known = {*there, *OURS}
+    known = {*there, *OUR_SERVICES}
     meant = sorted(name for name in known if name.rpartition('/')[2] == last and name != service)
     meant = meant or difflib.get_close_matches(service, known - {service}, n=1)
     return f'; did you mean {" or ".join(name.lstrip("/") for name in meant)}?' if meant else ''

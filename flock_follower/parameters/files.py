@@ -103,7 +103,7 @@ def refuse_start(files: Sequence[str | Path], given: Mapping[str, Mapping[str, A
     Refuse what would end a node at each start: a launch would start it again for ever.
 
     :param files: parameter files. :param given: values of parameters beside them, by node.
-    :param neighbors: the neighbours' file.
+    :param neighbors: the neighbors file.
     :raises ValueError, OSError: naming the file or the parameter.
     """
     for path in files:

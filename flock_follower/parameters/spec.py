@@ -34,6 +34,8 @@ from flock_follower.ranges import Checked, Range, suggestion
 #: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
 #: stands in the name of one; in its default that is the camera's name, too.
 NAMES, EACH = 'cameras', 'NAME'
+#: More differences of two sets of parameters than this are counted, not listed.
+MOST_LISTED = 5
 #: Parameters that every ROS node has.
 OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
 #: Parameters of earlier versions, and the reason or the replacement.
@@ -241,3 +243,11 @@ def refuse_arguments(command_line: Sequence[str], file: str, known: Collection[s
         if assigned and name not in known:
             raise ValueError(f'{word}: unknown argument of {Path(file).name}: '
                              f'{suggestion(name, known)}')
+
+
+def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    """Return the parameters that differ, with both values: 'v_max 0.5 -> 1.0'; '' if none do."""
+    changed = [f'{name} {before.get(name, "not set")} -> {after.get(name, "not set")}'
+               for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
+    more = len(changed) - MOST_LISTED
+    return ', '.join([*changed[:MOST_LISTED], *([f'and {more} more'] if more > 0 else [])])

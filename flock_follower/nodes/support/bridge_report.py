@@ -42,7 +42,7 @@ from flock_follower.checks.system import (
     NOT_READY,
     PARAMETER,
     REFUSED,
-    UNKNOWN,
+    UNANSWERED,
     UNPROVEN,
     UNREAD,
 )
@@ -73,7 +73,7 @@ from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import RemoteParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.parameters.differences import differences
+from flock_follower.parameters.spec import differences
 from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
@@ -260,7 +260,7 @@ class BridgeReport:
             'link': ('one way' if unreceived else 'alive') if bridge.alive(now) else (
                 'lost' if telemetry.status else 'never received'),
             NO_ANSWERS: unreceived,
-            UNKNOWN: ', '.join(bridge.link.questions.unknown(now)),
+            UNANSWERED: ', '.join(bridge.link.questions.unknown(now)),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
             'firmware': str(bridge.housekeeping.parameters.version or ''),
             'mode': status.mode if status else '', 'armed': status.armed if status else '',

@@ -350,22 +350,12 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         return 1
     node: Node | None = None
     code: int | None = 0
-    # A node without a log flies better than none.
-    reason = unwritable_logs(os.environ)
-    silent = ['--ros-args', '--disable-external-lib-logs', '--'] if reason else []
     try:
         try:
-            rclpy.init(args=[*silent, *(sys.argv if args is None else args)])
+            _start_ros(sys.argv if args is None else args)
         except RuntimeError as error:  # malformed --ros-args
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
-        context = rclpy.get_default_context()
-        # From Kilted on a shutdown destroys the tracked nodes: in the handler of a signal, while
-        # the same thread may hold their locks, and nodes whose constructor raised. `run` does it.
-        context.track_node = lambda node: None
-        on_signal(context.try_shutdown)
-        if reason:
-            get_logger(LOGGER).warning(f'logs go to the terminal alone: {reason}')
         FlockNode.parameter_files = files_in(arguments)
         try:
             node = factory()
@@ -390,6 +380,25 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         rclpy.try_shutdown()
         ignore_signals()
     return code or 0
+
+
+def _start_ros(arguments: Sequence[str]) -> None:
+    """
+    Start ROS, and have the signals that end this process shut it down.
+
+    :raises RuntimeError: malformed ``--ros-args``.
+    """
+    # A node without a log flies better than none.
+    reason = unwritable_logs(os.environ)
+    silent = ['--ros-args', '--disable-external-lib-logs', '--'] if reason else []
+    rclpy.init(args=[*silent, *arguments])
+    context = rclpy.get_default_context()
+    # From Kilted on a shutdown destroys the tracked nodes: in the handler of a signal, while the
+    # same thread may hold their locks, and nodes whose constructor raised. `run` destroys its own.
+    context.track_node = lambda node: None
+    on_signal(context.try_shutdown)
+    if reason:
+        get_logger(LOGGER).warning(f'logs go to the terminal alone: {reason}')
 
 
 def unwritable_logs(environment: Mapping[str, str]) -> str:
