@@ -63,6 +63,7 @@ from flock_follower.nodes.support.inputs import (
     OwnOdometry,
 )
 from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.tables import cameras, planner_params
 from flock_follower.parameters.tables import PLANNER as SPECS
@@ -74,6 +75,7 @@ from flock_follower.planner.step import Decision
 from flock_follower.settings import judge
 
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node reports it
+FLOWN_TIME = 60.0  # s after the last flying tick in which a change of the bridge is reported
 
 
 class Planner(FlockNode):
@@ -89,6 +91,7 @@ class Planner(FlockNode):
         self._loop = PlannerLoop(values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
+        self._flown = -math.inf  # when the vehicle flew the commands last, monotonic, s
         configured = cameras(values)
         self._cameras = {camera.name: camera for camera in configured}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
@@ -124,8 +127,11 @@ class Planner(FlockNode):
         self._states = self.create_publisher(String, 'planner/state', LATCHED_QOS)
         self._distances = self.create_publisher(Range, 'planner/distance', best_effort())
         self.create_service(SetBool, 'planner/engage', self._serve_engage)
+        self._bridge_parameters = WatchedParameters(
+            self, 'mavlink_bridge', lambda: time.monotonic() - self._flown < FLOWN_TIME)
         self.diagnostics.checks += [
-            self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
+            self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem,
+            self._bridge_changed]
         self.diagnostics.sources.append(self._values)
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
@@ -233,6 +239,8 @@ class Planner(FlockNode):
             poll()
         nanoseconds = self._even_clock.now()
         self._ticked = time.monotonic()
+        if self._flying():
+            self._flown = self._ticked
         self.diagnostics.rate('tick').tick(self._ticked)
         decision, command = self._loop.tick(
             nanoseconds, self._settings.current, self._bridge_age())
@@ -301,6 +309,10 @@ class Planner(FlockNode):
         if not self._settings.values['require_bridge']:
             return None
         return rivals(self, BRIDGE_TOPIC, 'publish the bridge state on {}')
+
+    def _bridge_changed(self, now: float) -> Problem | None:
+        changed = self._bridge_parameters.changed_in_flight(now)
+        return (WARN, changed) if changed else None
 
 
 def main(args: list[str] | None = None) -> int:

@@ -393,6 +393,20 @@ def test_parameters_of_the_autopilot_and_limits_of_the_planner_that_differ_are_r
     assert bench.values['firmware'] == '1.20.0'
 
 
+@pytest.mark.parametrize('armed', [False, True])
+def test_a_node_with_other_parameters_in_flight_is_named(make_bench, armed):
+    bench = make_bench()
+    bench.beat(armed=armed)
+    bench.wait(lambda: bench.bridge.telemetry.status is not None)
+    planner = bench.node._report.planner
+    planner.take({'v_max': 0.5, 'd0': 1.0})
+    assert 'changed in flight' not in bench.problems()
+    planner.take({'v_max': 0.5, 'd0': 2.0})  # a planner that was started with another file
+    assert ('parameters of planner changed in flight: d0 1.0 -> 2.0' in bench.problems()) == armed
+    planner.take({'v_max': 0.5, 'd0': 2.0})
+    assert ('d0 1.0 -> 2.0' in bench.problems()) == armed
+
+
 def test_the_timestamps_of_signatures_follow_a_clock_that_is_set_after_the_start(
         make_bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'key').write_bytes(bytes(32))

@@ -267,3 +267,19 @@ def test_a_system_clock_that_is_set_does_not_silence_it(
         'system clock was set', 'odom stamped before the system clock was set',
         'neighbors stamped before the system clock was set'), 1)
     rig.close()
+
+
+def test_a_bridge_started_anew_in_flight_with_other_parameters_is_named(rig):
+    bridge = rig.node._bridge_parameters
+    bridge.take({'altitude_max': 3.0})
+    bridge.take({'altitude_max': 4.0})  # on the ground
+    assert 'changed in flight' not in rig.problems()
+    rig.bridge_state = 'ACTIVE'
+    rig.run(0.2)
+    rig.engage()
+    rig.run(0.2)
+    rig.bridge_state = 'INACTIVE'
+    bridge.take({'altitude_max': 9.0})
+    rig.run(0.2)
+    assert 'parameters of mavlink_bridge changed in flight: altitude_max 4.0 -> 9.0' in (
+        rig.problems())

@@ -70,15 +70,13 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import LATCHED_QOS
-from flock_follower.nodes.support.parameters import RemoteParameters
+from flock_follower.nodes.support.parameters import WatchedParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.parameters.spec import differences
 from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so the state is repeated
-PLANNER_PERIOD = 5.0  # s between two requests for the planner's limits
 SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
 HEIGHTS_DIFFER = 1.0  # m: a larger difference of barometer and estimate is reported
@@ -95,9 +93,8 @@ class BridgeReport:
         self._start = time.monotonic()
         self.place: tuple[OdometryState, float] | None = None
         """The newest odometry, and its time of arrival on the monotonic clock, s."""
-        self._planner_before: dict[str, Any] | None = None
-        self._planner_difference = ''
-        self.planner = RemoteParameters(node, 'planner', self._take_planner)
+        self.planner = WatchedParameters(node, 'planner', self._is_armed)
+        perception = WatchedParameters(node, 'relative_pose', self._is_armed)
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._last: Cycle | None = None
         self._stuck_since = math.inf
@@ -112,7 +109,6 @@ class BridgeReport:
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
         self._states = node.create_publisher(String, modes.TOPIC, LATCHED_QOS)
         self._armed_at = node.create_publisher(PointStamped, modes.ARMED_AT_TOPIC, LATCHED_QOS)
-        node.create_timer(PLANNER_PERIOD, self.planner.ask)
         self._diagnostics.sources += [
             self._vehicle_values, self._gate_values, self._link_values]
         self._diagnostics.checks += [
@@ -123,8 +119,9 @@ class BridgeReport:
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
                 (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
-                (WARN, self._planner_differs), (WARN, self._planner_changed),
-                (WARN, self._heights_differ), (WARN, self._battery_unknown)))]
+                (WARN, self._planner_differs), (WARN, self.planner.changed_in_flight),
+                (WARN, perception.changed_in_flight), (WARN, self._heights_differ),
+                (WARN, self._battery_unknown)))]
 
     # From any thread.
 
@@ -372,19 +369,9 @@ class BridgeReport:
         return 'the autopilot reports no battery charge: battery_low cannot act' if (
             status and status.armed and self._bridge.end.battery_unknown(now)) else ''
 
-    def _take_planner(self, values: dict[str, Any]) -> None:
-        """Take the planner's parameters, which have changed, or are those of a new planner."""
-        before, self._planner_before = self._planner_before, values
+    def _is_armed(self) -> bool:
         status = self._bridge.telemetry.status
-        if before is not None and status is not None and status.armed:
-            self._planner_difference = differences(before, values)
-
-    def _planner_changed(self, now: float) -> str:
-        status = self._bridge.telemetry.status
-        if status is None or not status.armed:
-            self._planner_difference = ''
-        return self._planner_difference and (
-            f'parameters of the planner changed in flight: {self._planner_difference}')
+        return status is not None and status.armed
 
     def _planner_differs(self, now: float) -> str:
         """Return the limits that differ from those of the planner as text, or ''."""

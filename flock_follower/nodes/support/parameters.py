@@ -38,9 +38,18 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from flock_follower.parameters.spec import check_values, expanded, refuse_unknown, Spec
+from flock_follower.nodes.support.diagnostics import STEADY
+from flock_follower.parameters.spec import (
+    check_values,
+    differences,
+    expanded,
+    refuse_unknown,
+    Spec,
+)
 
 T = TypeVar('T')
+
+WATCH_PERIOD = 2.0  # s between two requests for the parameters of a node that is watched
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -156,9 +165,42 @@ class RemoteParameters:
         found = map(parameter_value_to_python, future.result().values)
         values = {name: list(value) if isinstance(value, array) else value
                   for name, value in zip(names, found)}
+        self.take(values)
+
+    def take(self, values: dict[str, Any]) -> None:
+        """Take all values of the other node."""
         if values != self.values:
             self.values = values
             self._changed(values)
+
+
+class WatchedParameters(RemoteParameters):
+    """
+    Parameters of another node, asked for every ``WATCH_PERIOD``; a change in flight is a problem.
+
+    The other node may have been started anew with another file meanwhile.
+
+    :param flying: whether the vehicle flies, or may fly.
+    """
+
+    def __init__(self, node: Node, other: str, flying: Callable[[], bool]) -> None:
+        super().__init__(node, other, self._compare)
+        self._other, self._flying = other, flying
+        self._before: dict[str, Any] | None = None
+        self._difference = ''
+        node.create_timer(WATCH_PERIOD, self.ask, clock=STEADY)
+
+    def _compare(self, values: dict[str, Any]) -> None:
+        before, self._before = self._before, values
+        if before is not None and self._flying():
+            self._difference = differences(before, values)
+
+    def changed_in_flight(self, now: float) -> str:
+        """Return the last change of this flight, with both values; '' if there was none."""
+        if not self._flying():
+            self._difference = ''
+        return self._difference and (
+            f'parameters of {self._other} changed in flight: {self._difference}')
 
 
 _HOW = """\
