@@ -35,6 +35,7 @@ import numpy as np
 from flock_desk.runs.console import guarded, logs_in
 from flock_desk.runs.figure_table import bounds
 from flock_desk.runs.flight import COUNTED, RECORDED, start
+from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
     explained,
@@ -49,14 +50,13 @@ from flock_desk.runs.summary import replay_figures
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.checks.processor import Load
 from flock_follower.files import resource
-from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
+from flock_follower.parameters.files import parameters_flown, TABLE
+from flock_follower.parameters.tables import planner_params
 from flock_follower.planner.params import PlannerParams
 
-# The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
-# faster than the 0.5 m/s of a first flight.
-PARAMS = PlannerParams(FlockingParams(beta=0.25, d0=1.0, d1=8.0), a_max=2.5, v_max=2.0)
+BAG = resource('bags/sample')
 PLAYED = ['/image_raw/compressed', '/camera_info', '/odom']
 STATE = 'planner/state:std_msgs/msg/String'
 TITLE = 'flock_follower: a recorded bag, flown by an embedded autopilot'
@@ -64,9 +64,21 @@ INTRODUCTION = (
     'The bag is replayed through the nodes, and an embedded autopilot flies their commands. '
     'The camera in the bag does not move with that vehicle: its speed is shown, its path would '
     'mean nothing. Distance, path and errors are those of the recorded flight.')
-BOUNDS = [*bounds('demo', {
-    'near': round(PARAMS.law.d0**0.5, 2), 'far': round(PARAMS.law.d1**0.5, 2),
-    'a_max': PARAMS.a_max, 'speed': PARAMS.v_max}).values()]
+
+
+def flown() -> PlannerParams:
+    """Return the planner's parameters of the flight in the bag, from the file beside it."""
+    values = parameters_flown(BAG, TABLE)
+    if values is None:
+        raise ValueError(f'{BAG}: no parameters.yaml beside the bag')
+    return planner_params(values['planner'])
+
+
+def demo_bounds(params: PlannerParams) -> list[FigureBound]:
+    """Return the bounds of the demonstration for the parameters flown."""
+    return [*bounds('demo', {
+        'near': round(params.law.d0**0.5, 2), 'far': round(params.law.d1**0.5, 2),
+        'a_max': params.a_max, 'speed': params.v_max}).values()]
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -79,19 +91,20 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _demonstrate(out: Path) -> int:
-    bag = resource('bags/sample')
+    params = flown()
     with locked(out):
         clear(out)
-        exit_codes, load = fly(bag, out)
+        exit_codes, load = fly(BAG, out, params)
         with explained(None if failed(exit_codes) else load):
-            flight = read_replayed(bag, out, PARAMS)
+            flight = read_replayed(BAG, out, params)
         summary = replay_figures(flight, exit_codes, load)
-        judgements = report(out, TITLE, INTRODUCTION, summary, BOUNDS, chapters(flight), load=load)
+        judgements = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
+                            chapters(flight), load=load)
         print()
         return announce(summary, judgements, [out / 'report.html'], out, load)
 
 
-def fly(bag: Path, out: Path) -> tuple[dict[str, int | None], Load | None]:
+def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | None], Load | None]:
     """
     Replay the bag through all nodes, leaving logs and records in ``out``.
 
@@ -101,10 +114,10 @@ def fly(bag: Path, out: Path) -> tuple[dict[str, int | None], Load | None]:
     """
     begin = first_odometry(bag)
     port = free_udp_port()
-    common = ['use_sim_time:=true', f'a_max:={PARAMS.a_max}', f'v_max:={PARAMS.v_max}']
+    common = ['use_sim_time:=true', f'a_max:={params.a_max}', f'v_max:={params.v_max}']
     parameters = {
         'relative_pose': ['use_sim_time:=true', 'image_transport:=compressed'],
-        'planner': [*common, f'd0:={PARAMS.law.d0}', f'd1:={PARAMS.law.d1}'],
+        'planner': [*common, f'd0:={params.law.d0}', f'd1:={params.law.d1}'],
         # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: only
         # the autopilot knows its velocity.
         'mavlink_bridge': [*common, f'connection:=udpin:127.0.0.1:{port}',

@@ -49,6 +49,7 @@ from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import odometry as odometry_message
+from flock_follower.parameters.files import FLOWN
 from flock_follower.ranges import Range
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
@@ -202,6 +203,16 @@ class Recording:
         yield from odom
 
 
+#: The file beside the bag: the parameters of the flight that are not the defaults.
+PARAMETERS = """\
+# The parameters of this flight that are not the defaults. `evaluate` and `make demo` read them;
+# beside a replay start planner and bridge with --params-file and this file.
+/**/follower:
+  ros__parameters:
+    v_max: 2.0                 # m/s; a first flight has 0.5
+"""
+
+
 def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
     """
     Write a bag, in place of an older one there, rendering in processes of its own.
@@ -219,6 +230,7 @@ def write(variant: Variant, seed: int, out: Path, jobs: int) -> None:
         with BagWriter(Path(scratch) / out.name) as bag:
             for message in recording.messages(_counted(images, count, out.name)):
                 bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
+        (Path(scratch) / out.name / FLOWN).write_text(PARAMETERS, encoding='utf-8')
         if out.exists():
             shutil.rmtree(out)
         shutil.move(str(Path(scratch) / out.name), out)

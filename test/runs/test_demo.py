@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_desk.demo import BOUNDS, PARAMS
+from flock_desk.demo import demo_bounds, flown
 from flock_desk.runs.evaluation import evaluate
 from flock_desk.runs.judge import judge
 from flock_desk.runs.plots import chapters
@@ -39,6 +39,8 @@ from flock_follower.parameters.files import read_parameters, TABLE
 pytestmark = pytest.mark.slow
 
 BAG = resource('bags/sample')
+PARAMS = flown()
+BOUNDS = demo_bounds(PARAMS)
 LATER = 5.0  # s from the bag's clock to that of the logs, but for the bag's start
 COUNTED = {'relative_pose': {'images_processed': '360', 'stamp_to_estimate_p50_ms': '20.0'},
            'planner': {'missed_ticks': '0'},

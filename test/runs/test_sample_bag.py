@@ -48,6 +48,7 @@ def test_the_bag_is_small_and_holds_what_it_should(bag):
     size = sum(file.stat().st_size for file in resource('bags/sample').iterdir())
     assert size <= 12_000_000
     assert {topic: len(messages) for topic, messages in bag.items()} == TOPICS
+    assert resource('bags/sample/parameters.yaml').read_text() == sample.PARAMETERS
 
 
 @pytest.mark.parametrize('k', [0, 181])
