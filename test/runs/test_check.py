@@ -58,7 +58,7 @@ def test_a_report_holds_what_a_bug_report_needs(
         assert {finding['what'] for finding in reported} == set(findings)
         assert json.loads(found.read('diagnostics.json')) == {}
         assert {name for name in found.namelist() if 'recording' in name} == {
-            'recording/sample.mcap', 'recording/metadata.yaml'}
+            'recording/sample.mcap', 'recording/metadata.yaml', 'recording/parameters.yaml'}
     assert main([str(SAMPLE), '--report', str(tmp_path / 'missing' / 'report.zip')]) == 2
     assert 'missing/report.zip' in capsys.readouterr().err
 
