@@ -51,7 +51,8 @@ figcaption { color: #555; font-size: .9em; } code { color: #777; font-size: .85e
 table { border-collapse: collapse; width: 100%; break-inside: avoid; margin-bottom: 1em; }
 caption { text-align: left; font-weight: 600; padding: .2em 0; }
 td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: right;
-     font-variant-numeric: tabular-nums; padding-left: 1em; }
+     font-variant-numeric: tabular-nums; padding-left: 1em; overflow-wrap: break-word;
+     max-width: 14em; }
 body { overflow-wrap: anywhere; }
 @media (max-width: 700px) { figure { width: 100%; margin: 0 0 1em; } .bounds td + td { white-space:
        normal; } .bounds code { display: none; } }
