@@ -45,11 +45,11 @@ import numpy as np
 from flock_desk.closed_loop.real_time_flight import SKIPPED
 from flock_desk.runs.console import guarded, logs_in, within
 from flock_desk.runs.figure_table import bounds, LATE
-from flock_desk.runs.flight import fly, links, namespaces, own, SIH_TRUTH, spacing
+from flock_desk.runs.flight import Flown, fly, links, namespaces, own, SIH_TRUTH, spacing
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.moving_picture import moving_picture
 from flock_desk.runs.plots import scenario_chapters
-from flock_desk.runs.processes import explained, failed
+from flock_desk.runs.processes import explained, failed, LateError
 from flock_desk.runs.record import along, clear, LiveFlight, locked, read_flown
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import (
@@ -62,7 +62,6 @@ from flock_desk.runs.summary import (
 )
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
-from flock_follower.checks.processor import Load
 from flock_follower.files import whole_file
 from flock_follower.planner.modes import TAKEN_OVER
 from flock_follower.ranges import Range
@@ -127,18 +126,19 @@ def _fly(options: argparse.Namespace) -> int:
     with locked(options.output):
         for namespace in ('', *namespaces(options.followers)):
             clear(options.output / namespace)
-        cores, exit_codes, load = fly(scenario, options.scenario, options.seed, duration,
-                                      options.output, external, options.followers)
-        with explained(None if failed(exit_codes) else load):
-            code = conclude(scenario, options.output, options.followers, cores, exit_codes, load)
+        flown = fly(scenario, options.scenario, options.seed, duration, options.output, external,
+                    options.followers)
+        with explained(None if failed(flown.exit_codes) else flown.load):
+            code = conclude(scenario, options.output, options.followers, flown)
+            if flown.late and code != 1:
+                raise LateError(flown.late)
         if options.moving:
             with whole_file(options.moving) as file:
                 file.write(moving_picture(read_flown(scenario, options.output)))
         return code
 
 
-def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, float],
-             exit_codes: Mapping[str, int | None], load: Load | None = None) -> int:
+def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int:
     """Write summaries and reports, print the figures, and return the exit code."""
     flights: dict[str, LiveFlight] = {}
     summaries: dict[str, dict[str, Any]] = {}
@@ -147,25 +147,25 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
     for namespace in namespaces(followers):
         flight = flights[namespace] = read_flown(scenario, out / namespace, namespace)
         summary = summaries[namespace] = scenario_figures(
-            flight, own(cores, namespace), own(exit_codes, namespace), load)
+            flight, own(flown.cores, namespace), own(flown.exit_codes, namespace), flown.load)
         demanded = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in demanded]
         judgements = report(
             out / namespace, f'{title} {namespace}'.rstrip(), scenario.summary, summary, demanded,
-            scenario_chapters(flight), cautions(summary), load=load)
+            scenario_chapters(flight), cautions(summary), load=flown.load)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         nearest = FigureBound('nearest_m', nearest_allowed(scenario), load=LATE)
         judgements = report(
             out, f'{title}, a column of {followers}', scenario.summary, summary,
-            [nearest, *limits], (), parts=summaries, load=load)
+            [nearest, *limits], (), parts=summaries, load=flown.load)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
     print()
     for each in summaries.values():
         for warning in cautions(each):
             print(f'warning: {warning}', file=sys.stderr)
-    return announce(summary, judgements, pages, out, load)
+    return announce(summary, judgements, pages, out, flown.load)
 
 
 def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[FigureBound]:

@@ -35,7 +35,6 @@ import numpy as np
 
 from flock_desk.runs.processes import (
     free_udp_port,
-    LateError,
     private_environment,
     Processes,
     wait_until,
@@ -74,6 +73,19 @@ class External(NamedTuple):
     """That of a second one; '': the scenario's own leader."""
 
 
+class Flown(NamedTuple):
+    """What ``fly`` returns beside the records."""
+
+    cores: dict[str, float]
+    """Of each process: its CPU time as a share of the flight."""
+    exit_codes: dict[str, int | None]
+    """See ``Processes.stop``."""
+    load: Load | None
+    """During the flight; None if it is unknown."""
+    late: str
+    """What was too late to fly the scenario to its end; '' if it was flown."""
+
+
 def links(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
     """
     Return the links to an autopilot; without a truth the usual one.
@@ -108,15 +120,13 @@ def spacing(scenario: Scenario) -> float:
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         external: External | None = None, followers: int = 1
-        ) -> tuple[dict[str, float], dict[str, int | None], Load | None]:
+        ) -> Flown:
     """
     Fly a scenario through all nodes, leaving logs and records in ``out``.
 
     :param name: of the scenario, as the simulator shall load it.
     :param external: the autopilot that flies the follower; None: the embedded one.
     :param followers: how many fly in a column; the logs of each are in ``namespaces``.
-    :returns: each process's CPU time as a share of the flight, its exit code, see
-        ``Processes.stop``, and the load during the flight, None if it is unknown.
     :raises RuntimeError: if a process ends early or a service refuses, with the reason.
     :raises TooBusyError: if something came too late because the machine was too busy.
     """
@@ -141,7 +151,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
                 call(processes, f'{prefix}mavlink_bridge/offboard')
                 call(processes, f'{prefix}planner/engage')
             began = time.monotonic()
-            cores = watch(processes, duration, external is not None)
+            cores, late = watch(processes, duration, external is not None)
             early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
             if early:
                 print(f'\nthe bridge has ended the flight: {early}', flush=True)
@@ -162,7 +172,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         for recorder, code in exit_codes.items():
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
-        return cores, exit_codes, processes.load.worst(began)
+        return Flown(cores, exit_codes, processes.load.worst(began), late)
 
 
 def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorded: Sequence[str],
@@ -257,17 +267,17 @@ def take_off(processes: Processes) -> None:
                 raise
 
 
-def watch(processes: Processes, duration: float, external: bool) -> dict[str, float]:
+def watch(processes: Processes, duration: float, external: bool) -> tuple[dict[str, float], str]:
     """
-    Wait for the end of the scenario, and return how many cores each process used.
+    Wait for the end of the scenario; return the cores of each process, and ``Flown.late``.
 
     The simulator of an embedded vehicle ends with the scenario. That of an external one ends when
     the vehicle is disarmed, which is not waited for here; the scenario has also ended if the
     bridge reports so.
 
-    :raises LateError: if the simulator does not keep up.
-    :raises RuntimeError: if it ends early.
+    :raises RuntimeError: if the simulator ends early.
     """
+    late = ''
     simulators = simulators_of(processes)
     begin = now = time.monotonic()
     used = before = processes.cpu()
@@ -277,13 +287,15 @@ def watch(processes: Processes, duration: float, external: bool) -> dict[str, fl
                          or ended_by_bridge(processes.log('mavlink_bridge'))):
             break
         if now > begin + duration + PATIENCE:
-            raise LateError('the simulator does not keep up with the clock')
+            late = 'the simulator does not keep up with the clock'
+            break
         used = {**used, **processes.cpu()}
         time.sleep(0.2)
     else:
         if external and not any(codes) and not ended_by_bridge(processes.log('mavlink_bridge')):
             raise RuntimeError('the simulator ended early')
-    return {name: (used[name] - before[name]) / (now - begin) for name in before if now > begin}
+    return {name: (used[name] - before[name]) / (now - begin)
+            for name in before if now > begin}, late
 
 
 def ended_by_bridge(log: str) -> str:

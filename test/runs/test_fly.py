@@ -256,7 +256,7 @@ def pretended(monkeypatch):
 
 def test_each_follower_has_nodes_of_its_own_and_the_one_before_it_as_its_leader(
         tmp_path, pretended):
-    _, exit_codes, _ = fly(load('straight'), 'straight', 7, 1.0, tmp_path, followers=2)
+    exit_codes = fly(load('straight'), 'straight', 7, 1.0, tmp_path, followers=2).exit_codes
     started, asked = Pretended.last.started, Pretended.last.asked
     assert set(exit_codes) == set(started) == {
         f'follower_{i}/{node}' for i in (1, 2) for node in (
@@ -293,6 +293,18 @@ def test_a_flight_that_fails_ends_with_the_reason_and_nothing_runs_on(tmp_path, 
     with pytest.raises(RuntimeError, match='^arm refused: compass$'):
         fly(load('hover'), 'hover', 0, 1.0, tmp_path)
     assert Pretended.last.children == {}
+
+
+@pytest.mark.parametrize(('busy', 'judged', 'code'), [(True, 0, 3), (True, 1, 1), (False, 0, 1)])
+def test_a_flight_that_is_too_late_is_judged_by_what_was_flown(
+        tmp_path, pretended, busy, judged, code):
+    pretended.setattr('flock_desk.runs.flight.PATIENCE', -1.0)
+    load = SimpleNamespace(busy=busy)
+    pretended.setattr(Pretended, 'load', property(
+        lambda _: SimpleNamespace(worst=lambda *_: load, sample=lambda _: None),
+        lambda *_: None), raising=False)
+    pretended.setattr('flock_desk.fly.conclude', lambda *_: judged)
+    assert main(['--scenario', 'hover', '--duration', '0.1', '--output', str(tmp_path)]) == code
 
 
 def test_on_an_external_autopilot_it_takes_off_and_lands(tmp_path, pretended):
