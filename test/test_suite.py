@@ -21,7 +21,7 @@ from types import SimpleNamespace
 
 from conftest import Progress
 import pytest
-from suite import environment, main, progress, read_status, Run, Status, STATUS, verdict
+from suite import environment, main, progress, read_status, Run, STATUS, Status, verdict
 
 GREEN = Run(0, Status(9, 9))
 RED = Run(1, Status(9, 9, 2, ('a',)))
