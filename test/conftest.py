@@ -218,6 +218,14 @@ def keep_to_the_marker(request, monkeypatch):
 
 
 @pytest.fixture
+def undrawn(monkeypatch):
+    """Put an empty picture in place of each of a report of ``evaluate``: they take a second."""
+    from flock_desk.runs import plots
+    for picture in ('_flight_picture', '_error_picture'):
+        monkeypatch.setattr(plots, picture, lambda _: plots.Illustration(b'\x89PNG', 'empty'))
+
+
+@pytest.fixture
 def default_hangup():
     """Let children inherit no ignored SIGHUP: the suite itself may run under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
