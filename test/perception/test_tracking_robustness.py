@@ -218,7 +218,7 @@ def clutter(count: int, uneven: bool) -> Iterator[tuple[str, GrayImage]]:
 
 @pytest.mark.parametrize(('count', 'uneven'), [
     (60, False), *(pytest.param(*each, marks=pytest.mark.sweep) for each in (
-        (240, False), (1000, True)))])
+        (120, False), (1000, True)))])
 def test_clutter_where_the_marker_was_a_moment_ago_is_never_taken_for_it(
         count: int, uneven: bool) -> None:
     follower, marker_image = Hovering(CAMERA, MOUNTING), render(CAMERA, {0: HERE})
