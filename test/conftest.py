@@ -29,6 +29,7 @@ from functools import cache
 import json
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -81,6 +82,12 @@ def loads_ros(path):
             or any(loads_ros(path) for path in helpers if path.exists()))
 
 
+def may_use_ros(path):
+    """Whether a module of tests may have some with the marker ``ros``."""
+    return (HERE / 'nodes' in path.parents or loads_ros(path)
+            or re.search(r'\bros\b', path.read_text()) is not None)
+
+
 def is_slow(path):
     """Whether a module says of all its tests that they are slow."""
     return 'pytestmark = pytest.mark.slow' in path.read_text().splitlines()
@@ -92,6 +99,8 @@ def pytest_ignore_collect(collection_path, config):
         return None
     asked = config.option.markexpr
     if asked.startswith(('unit', 'not ros')) and loads_ros(collection_path):
+        return True
+    if asked.startswith('ros') and not may_use_ros(collection_path):
         return True
     if asked in ('unit', 'not slow') and is_slow(collection_path):
         return True
@@ -206,6 +215,14 @@ def keep_to_the_marker(request, monkeypatch):
     before = 'rclpy' in sys.modules
     yield
     assert before or 'rclpy' not in sys.modules, 'loads rclpy: mark it with @pytest.mark.ros'
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Put an empty picture in place of each of a report of ``evaluate``: they take a second."""
+    from flock_desk.runs import plots
+    for picture in ('_flight_picture', '_error_picture'):
+        monkeypatch.setattr(plots, picture, lambda _: plots.Illustration(b'\x89PNG', 'empty'))
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ class Fault:
 
     kind: str
     at: float
-    """Since the start, or since what ``after`` says."""
+    """Since the start."""
     duration: float = math.inf
     direction: str = 'both'  # or sent, received: as the autopilot sees it
     share: float = 1.0
@@ -59,7 +59,6 @@ class Fault:
     """The mode that the pilot switches to."""
     remaining: float = 1.0
     """Remaining charge of the battery, a share."""
-    after: str = 'start'  # or setpoint: the first that was received
 
     def active(self, now):
         return self.at <= now < self.at + self.duration
@@ -108,7 +107,7 @@ class FaultyAutopilot(EmbeddedAutopilot):
         super().__init__(personality, now=now, seed=seed, **options)
         self.faults = list(faults)
         self._begun = set()
-        self._zero, self._first_setpoint = now, math.inf
+        self._zero = now
         self._sent = FaultyLine(faults, 'sent', seed)
         self._received = FaultyLine(faults, 'received', seed)
 
@@ -118,8 +117,7 @@ class FaultyAutopilot(EmbeddedAutopilot):
     def step(self, now):
         since = now - self._zero
         for fault in self.faults:
-            begins = fault.at + (self._first_setpoint if fault.after == 'setpoint' else 0.0)
-            if begins <= since and fault not in self._begun:
+            if fault.at <= since and fault not in self._begun:
                 self._begun.add(fault)
                 self._begin(fault, now)
         return self._sent.carry([*self._answers([], now), *super().step(now)], since)
@@ -135,8 +133,6 @@ class FaultyAutopilot(EmbeddedAutopilot):
     def _answers(self, datagrams, now):
         answers = []
         for data in self._received.carry(datagrams, now - self._zero):
-            if message_id(data) == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
-                self._first_setpoint = min(self._first_setpoint, now - self._zero)
             answers += super().receive(data, now)
         return answers
 

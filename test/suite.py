@@ -113,7 +113,7 @@ def run(runs: Mapping[str, Sequence[str]]) -> list[Run]:
             children[name] = stack.enter_context(subprocess.Popen(
                 ['nice', '-n', str(NICENESS if name == COMPUTING else 0), *PYTEST, *arguments],
                 cwd=ROOT, stdout=log, stderr=subprocess.STDOUT,
-                env={**os.environ, STATUS: str(build / f'{name}.json')}))
+                env=environment(build / f'{name}.json')))
         due = began
         # Ctrl-C reaches them, too; they end, and are waited for.
         while any(child.poll() is None for child in children.values()):
@@ -130,6 +130,13 @@ def run(runs: Mapping[str, Sequence[str]]) -> list[Run]:
             print(f'build/{name}.log: {text.strip().splitlines()[-1].strip("= ")}', flush=True)
     return [Run(child.returncode, read_status(build / f'{name}.json'))
             for name, child in children.items()]
+
+
+def environment(status: Path) -> dict[str, str]:
+    """Return the environment of a run that writes its status to a file."""
+    # Hundreds of processes load the same modules: each is compiled once, whoever starts the suite.
+    kept = {name: value for name, value in os.environ.items() if name != 'PYTHONDONTWRITEBYTECODE'}
+    return {**kept, STATUS: str(status)}
 
 
 def progress(statuses: Mapping[str, Status], elapsed: float) -> str:

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 
 from conftest import Progress
 import pytest
-from suite import main, progress, read_status, Run, Status, verdict
+from suite import environment, main, progress, read_status, Run, STATUS, Status, verdict
 
 GREEN = Run(0, Status(9, 9))
 RED = Run(1, Status(9, 9, 2, ('a',)))
@@ -55,6 +55,15 @@ def test_the_status_is_what_a_run_of_tests_wrote(tmp_path: Path) -> None:
     assert read_status(path) == Status()
     path.write_text(json.dumps({'total': 3, 'done': 2, 'failed': 1, 'busy': ['a::b']}))
     assert read_status(path) == Status(3, 2, 1, ('a::b',))
+
+
+def test_a_run_keeps_what_it_compiles_whatever_it_is_started_with(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('PYTHONDONTWRITEBYTECODE', '1')
+    monkeypatch.setenv('LANG', 'C')
+    given = environment(Path('status.json'))
+    assert 'PYTHONDONTWRITEBYTECODE' not in given
+    assert (given['LANG'], given[STATUS]) == ('C', 'status.json')
 
 
 def test_a_run_counts_each_test_once_and_names_those_of_a_busy_machine(tmp_path: Path) -> None:

@@ -318,11 +318,11 @@ class Gate:
         engaged = status is not None and status.offboard and armed and not withheld
         # In flight only a lasting landed report counts: a false one must not remove thrust.
         airborne = self._airborne is True or self._was_active
-        self._compare(engaged, now)
+        known = self._compare(self._known(now), engaged, now)
         # While nothing is received the height is missing, too, without a fault of its sensor.
         heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
         self._heightless_since = min(self._heightless_since, now) if heightless else math.inf
-        known, place = self._known(now), self.place(now)
+        place = self.place(now)
         self._hold(known, place, engaged, now)
         velocity = None if known.contradiction else known.velocity
         usable = velocity is not None and not self._displaced and self._source() == ODOM
@@ -392,9 +392,9 @@ class Gate:
             source=self._source(), disagreeing_for=self._comparison.disagreeing_for(now),
             distrusted_for=now - self._distrusted_since)
 
-    def _compare(self, engaged: bool, now: float) -> None:
-        """Compare the velocities and the displacements of the sources."""
-        known, odom = self._known(now), self._sources[ODOM]
+    def _compare(self, known: KnownMotion, engaged: bool, now: float) -> KnownMotion:
+        """Compare the sources' velocities and displacements; return what is known after that."""
+        odom, before = self._sources[ODOM], self._comparison.disagreeing_for(now)
         self._comparison.take(
             known.difference, self.limits.velocity_tolerance, engaged, now)
         # An estimate that rests on our odometry, or on no sensor, is no evidence.
@@ -404,6 +404,7 @@ class Gate:
             known.turned or 0.0, self._height_path, now)
         self._displaced_since = min(self._displaced_since, now) if engaged and (
             self._displaced) else math.inf
+        return known if self._comparison.disagreeing_for(now) == before else self._known(now)
 
     def _hold(self, known: KnownMotion, place: Location, engaged: bool, now: float) -> None:
         """Store the yaw and height that braking holds, and the origin of the radius."""

@@ -166,7 +166,7 @@ def finite_vector(value: ArrayLike | None) -> Array | None:
         vector = np.array(value, dtype=float)
     except (TypeError, ValueError):
         return None
-    return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
+    return vector if vector.shape == (3,) and all(map(math.isfinite, vector.tolist())) else None
 
 
 def plausible_velocity(value: ArrayLike) -> Array | None:
@@ -282,9 +282,16 @@ class Path:
 
     def between(self, start: float, end: float) -> Array:
         """Return the displacement (3,), m, from one time within the span to another."""
-        times, places = zip(*self._kept)
-        return np.array([np.diff(np.interp((start, end), times, column))[0]
-                         for column in zip(*places)])
+        return self._at(end) - self._at(start)
+
+    def _at(self, time: float) -> Array:
+        """Return the position (3,), m, at a time, s, within the span."""
+        after = bisect_right(self._kept, time, key=itemgetter(0))
+        before, place = self._kept[after - 1]
+        if time == before:
+            return place
+        later, next_place = self._kept[after]
+        return (next_place - place) / (later - before) * (time - before) + place
 
 
 def difference(one: Path, other: Path, turn: float, now: float) -> Array:

@@ -48,24 +48,27 @@ def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:
     for tag in recording.tags:
         if recording.side_length(tag.number) is not None:
             visits[tag.number, tag.stamp // VISIT].append(tag)
+    seen = []
+    for visit in visits.values():
+        rows = []
+        for tag in visit[::max(1, len(visit) // USED)]:
+            fitted = fitted_corners(recording.camera, recording.side_length(tag.number) or 0.0,
+                                    tag.corners, None)
+            if fitted is not None:
+                rows.append((tag.stamp * 1e-9, *(
+                    recording.T_base_camera.rotation @ fitted[0].translation)))
+        times, arms = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+        quaternions, known = path.attitude(times)
+        if np.any(known):
+            seen.append((arms[known], path.motion(times[known])[0],
+                         np.array([quaternion_to_matrix(q) for q in quaternions[known]])))
     for size in (1.0, 1.25):
         found: list[Ratio] = []
-        for visit in visits.values():
-            rows = []
-            for tag in visit[::max(1, len(visit) // USED)]:
-                side = recording.side_length(tag.number) or 0.0
-                seen = fitted_corners(recording.camera, size * side, tag.corners, None)
-                if seen is not None:
-                    rows.append((tag.stamp * 1e-9, *(
-                        recording.T_base_camera.rotation @ seen[0].translation)))
-            times, arms = np.array(rows)[:, 0], np.array(rows)[:, 1:]
-            quaternions, known = path.attitude(times)
-            if np.any(known):
-                one = distance_ratio(
-                    arms[known], path.motion(times[known])[0],
-                    np.array([quaternion_to_matrix(q) for q in quaternions[known]]),
-                    recording.T_base_camera.translation)
-                found += [one] if one is not None and one.at_rest else []
+        for arms, places, rotations in seen:
+            # With another size in the configuration, all distances are so many times those.
+            one = distance_ratio(size * arms, places, rotations,
+                                 recording.T_base_camera.translation)
+            found += [one] if one is not None and one.at_rest else []
         sure = [one for one in found if one.deviation < SIZE]
         named = [abs(one.ratio - 1.0) > max(SIZE, SURE * one.deviation)
                  for one in (found if size == 1.0 else sure)]

@@ -44,8 +44,8 @@ def flown(name: str, runs: list[int], **changes: Any) -> tuple[Flights, Any]:
 
 
 def test_a_run_is_the_same_alone_and_among_others() -> None:
-    (together, _), (alone, _) = (flown('flock_wedge', runs, duration=5.0)
-                                 for runs in ([0, 1, 2], [1]))
+    (together, _), (alone, _) = (flown('flock_wedge', runs, duration=3.0)
+                                 for runs in ([0, 1], [1]))
     for name in ('follower', 'velocity', 'command', 'state', 'edges', 'shown'):
         assert np.array_equal(getattr(together, name)[4:8], getattr(alone, name), equal_nan=True)
     assert np.array_equal(together.positions[1], alone.positions[0])
@@ -77,8 +77,9 @@ LAST = {'duration': 12.0}
     pytest.param('flock_line', 87_000, {
         'duration': 50.0, 'flock': {'fails': FollowerFailure(1, 12.0)}}, 0.0,
         marks=pytest.mark.sweep),
-    ('flock_line', 51_000_001, {'duration': 35.0, 'outages': (Outage('marker', 20.0, 5.0),)},
-     0.0)])
+    pytest.param('flock_line', 51_000_001, {
+        'duration': 35.0, 'outages': (Outage('marker', 20.0, 5.0),)}, 0.0,
+        marks=pytest.mark.sweep)])
 def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[str, Any],
                                            in_band: float) -> None:
     _, figures = flown(name, [run], **changes)
@@ -87,8 +88,8 @@ def test_flocks_keep_apart_and_lose_nobody(name: str, run: int, changes: dict[st
 
 
 def test_with_messages_a_ring_keeps_clear_of_a_leader_that_nobody_sees() -> None:
-    """In these runs it strolled on to 0.25 and 0.45 m from one of the ring around it."""
-    _, figures = flown('flock_ring', [51_000_003, 51_000_004], duration=13.0,
+    """In this run it strolled on to 0.25 m from one of the ring around it."""
+    _, figures = flown('flock_ring', [51_000_003], duration=13.0,
                        outages=(Outage('marker', 6.0, 5.0),))
     assert figures['min_separation'].min() >= 0.9
 

@@ -217,7 +217,7 @@ def garbage(draw: Any) -> OdometryState | None:
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.sampled_from(['own', 'seen', 'message']), garbage(), STAMPS),
                 max_size=12))
 def test_no_nonsense_breaks_it_or_comes_out_of_it(events: list[Any]) -> None:

@@ -280,7 +280,7 @@ def usable(motion):
 
 
 @pytest.mark.slow
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(LIMIT_SETS, BOTH_MOTIONS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments):
     setpoint, again, still = (
@@ -319,7 +319,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, both, arguments)
         assert abs(setpoint.acceleration[2]) <= THRUST_OFFSET_MAX
 
 
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(st.floats(1.5, 20.0), st.floats(V_MAX.low, 2.0), DIRECTION, st.floats(0.0, 3.0),
        st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.tuples(*[st.floats(-2.0, 2.0)] * 3),
        st.none() | st.floats(-math.pi, math.pi), st.sampled_from([True, False]))
@@ -347,7 +347,7 @@ def test_the_offset_is_added_to_the_command_except_along_too_fast_a_velocity(
 SHORT = st.floats(0.0, 3e-7) | st.floats(-1.0, 1.0)  # by this share a vector misses a limit
 
 
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(a_max=st.floats(A_MAX.low, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
        v_max=st.sampled_from([0.5, 5.0]), direction=DIRECTION, short=SHORT,
        velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 4.9]),

@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -28,9 +29,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import String
 
 from flock_desk.runs.processes import free_udp_port, TooBusyError, wait_until
-from flock_desk.simulator_node import Simulator
+from flock_desk.simulator_node import ExternalVehicle, Simulator
 from flock_follower.checks.processor import Load
 from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.perception.markers import detect
@@ -48,6 +50,25 @@ def test_a_flight_behind_the_clock_is_excused_by_a_load_and_by_nothing_else(load
     with expected:
         Simulator._blame(SimpleNamespace(_load=meter), '9 images lost')
     Simulator._blame(SimpleNamespace(_load=None), '9 images lost')  # end_if_busy is false
+
+
+def test_a_flight_that_the_bridge_ends_is_over_once_landed_and_its_log_has_time_and_reason():
+    follower, log = SimpleNamespace(armed=True, motion=SimpleNamespace(times=[])), Mock()
+    node = SimpleNamespace(
+        _vehicle=Mock(spec=ExternalVehicle), _early=None, _duration=60.0, _ahead=None, _log=log,
+        _flight=SimpleNamespace(began_ns=10**10, skipped_images=0), _start=100.0, _epoch_ns=0,
+        _external=SimpleNamespace(follower=follower, sources={}), _values={'log': 'flight.npz'})
+    for seconds, state in ((-1.0, 'READY: no obstacle'), (0.5, 'ACTIVE'), (1.0, 'NO_AUTOPILOT'),
+                           (3.0, 'TAKEN_OVER: the pilot took over'), (3.1, 'INACTIVE: landed')):
+        node._flight.time, node._flight.time_ns = seconds, 10**10 + round(seconds * 1e9)
+        Simulator._take_permission(node, String(data=state))
+        assert not Simulator._finished(node)
+    follower.armed = False
+    assert Simulator._finished(node)
+    Simulator._save_log(node)
+    saved = log.save.call_args.kwargs
+    assert (saved['began'], saved['ended'], saved['duration'], saved['ended_early']) == (
+        110.0, 113.0, 60.0, 'TAKEN_OVER: the pilot took over')
 
 
 def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(ros):

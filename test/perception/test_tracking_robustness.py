@@ -217,7 +217,8 @@ def clutter(count: int, uneven: bool) -> Iterator[tuple[str, GrayImage]]:
 
 
 @pytest.mark.parametrize(('count', 'uneven'), [
-    (120, False), pytest.param(1000, True, marks=pytest.mark.sweep)])
+    (60, False), *(pytest.param(*each, marks=pytest.mark.sweep) for each in (
+        (120, False), (1000, True)))])
 def test_clutter_where_the_marker_was_a_moment_ago_is_never_taken_for_it(
         count: int, uneven: bool) -> None:
     follower, marker_image = Hovering(CAMERA, MOUNTING), render(CAMERA, {0: HERE})

@@ -83,7 +83,7 @@ def worst_second(evaluation: Evaluation) -> float:
     return max(worst)
 
 
-USUAL = ('IMU axes, twist in odom, no rates, no covariances', 'no twist', '10 Hz, 60 ms late',
+USUAL = ('IMU axes, twist in odom, no rates, no covariances', '10 Hz, 60 ms late',
          'images 20 ms late')  # the others are more cases of the same
 
 

@@ -73,6 +73,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return one, two
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_second_camera_that_sees_nobody_changes_nothing(
         bags: tuple[Path, Path], tmp_path: Path) -> None:
     alone = evaluated(bags[0], tmp_path / 'one')

@@ -52,8 +52,10 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def result(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp('out') / 'deep' / 'result'
-    assert main([str(bag), '--output', str(out)]) == 0
+    folder = tmp_path_factory.mktemp('out')
+    out, bounds = folder / 'deep' / 'result', folder / 'bounds.yaml'
+    bounds.write_text('planner.ticks: {min: 11}')  # it is 11
+    assert main([str(bag), '--output', str(out), '--expect', str(bounds)]) == 0
     return out
 
 
@@ -84,6 +86,7 @@ def with_ranges(path: Path, seen: float, seconds: float) -> Path:
     return path
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_ranges_in_a_bag_are_used_where_the_neighbour_is_not_in_sight(tmp_path: Path) -> None:
     bag_path = with_ranges(tmp_path / 'bag', 3.0, 7.0)
     assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
@@ -120,6 +123,7 @@ def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:
     assert not re.search(r'(src|href)="(?!data:)', report)  # it needs no other file
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_bag_faster_than_v_max_is_told_first(
         bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     slow = tmp_path / 'slow.yaml'
@@ -140,6 +144,7 @@ def late(message: BagMessage) -> BagMessage:
     return message._replace(stamp_ns=message.stamp_ns + 400_000_000 * (message.topic == '/odom'))
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     what = 'odom latency: '
@@ -159,8 +164,10 @@ def test_errors_of_check_fail_the_run_and_stand_before_the_figures(
     assert summary(out)['check'] == {'errors': [], 'warnings': []}
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize(('first', 'step', 'stamped', 'level', 'what'), [
-    (0.6, 3600, True, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s'),
+    pytest.param(0.6, 3600, True, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s',
+                 marks=pytest.mark.sweep),
     (0.6, 3600, False, 'error', 'bag clock: times jump by +3600.0 s after 0.6 s'),
     (0.6, 6, True, 'error', 'bag clock: times jump by +6.0 s after 0.6 s'),
     # Played in the order of their times, what was recorded later comes first.
@@ -188,6 +195,7 @@ def test_a_clock_set_in_flight_is_an_error(
         'ok', 'ok']
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_bytes_that_are_no_message_are_counted_and_said(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     count = Counter[str]()
@@ -214,16 +222,17 @@ def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Pat
     assert (tmp_path / 'report.html').read_text().count('base64,') == 1
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_broken_bound_is_exit_code_1_and_named(
         bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bounds = tmp_path / 'bounds.yaml'
-    for least, code in ((11, 0), (12, 1)):
-        bounds.write_text(f'planner.ticks: {{min: {least}}}\nrejections.invalid image: {{max: 0}}')
-        assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == code
+    bounds.write_text('planner.ticks: {min: 12}\nrejections.invalid image: {max: 0}')
+    assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 1
     assert capsys.readouterr().err == 'FAILED: planner.ticks = 11: must be at least 12\n'
     assert (tmp_path / 'report.html').read_text().count('>FAILED<') == 1
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_truth_of_another_name_is_reported_and_topics_may_be_in_a_namespace(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def renamed(message: BagMessage) -> BagMessage:
@@ -280,6 +289,7 @@ def test_bad_files_are_exit_code_2_and_one_line(
     assert str(wrong) in refusal([str(bag), '--output', str(wrong)], capsys)
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
         result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     box = excerpt(tmp_path / 'box')
@@ -298,6 +308,7 @@ def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
     assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_topics_of_other_names_are_taken(
         result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = {'/image_raw/compressed': '/cam/infra1/image_rect_raw/compressed',

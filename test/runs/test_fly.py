@@ -221,6 +221,7 @@ class Pretended(Processes):
     """What was started and requested, without processes."""
 
     refusal = ''
+    bridge_says = ''
 
     def __init__(self, environment, log_folder):
         super().__init__(environment, log_folder)
@@ -230,7 +231,8 @@ class Pretended(Processes):
     def start(self, name, module, arguments=(), *, show=False, ends=False):
         self.started[name] = (module, list(arguments), show)
         codes = iter([None] * 4 + [0] * 99)  # it ends after a while
-        (self.log_folder / f'{name}.log').touch()
+        (self.log_folder / f'{name}.log').write_text(
+            self.bridge_says if name == 'mavlink_bridge' else '')
         self.children[name] = SimpleNamespace(pid=0, returncode=0, poll=lambda: (
             next(codes) if name.endswith('simulator') else None))
 
@@ -314,6 +316,19 @@ def test_on_an_external_autopilot_it_takes_off_and_lands(tmp_path, pretended):
     assert Pretended.last.asked == [
         'mavlink_bridge/arm', 'mavlink_bridge/takeoff', 'mavlink_bridge/offboard',
         'planner/engage', 'planner/engage', 'mavlink_bridge/offboard', 'mavlink_bridge/land']
+
+
+def test_a_flight_that_is_taken_from_the_bridge_ends_at_once_with_the_reason_and_lands(
+        tmp_path, pretended, capsys):
+    pretended.setattr(Pretended, 'bridge_says', ''.join(
+        f'[INFO] [17.4] [mavlink_bridge]: state: {state}\n'
+        for state in ('ACTIVE', 'TAKEN_OVER: the pilot took over')))
+    fly(load('hover'), 'hover', 0, 60.0, tmp_path, External('tcp:a:1', 'tcp:a:3', True))
+    assert Pretended.last.asked == [
+        'mavlink_bridge/arm', 'mavlink_bridge/takeoff', 'mavlink_bridge/offboard',
+        'planner/engage', 'mavlink_bridge/land']
+    assert ('the bridge has ended the flight: TAKEN_OVER: the pilot took over\n'
+            in capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(('states', 'ended'), [
