@@ -37,11 +37,11 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from flock_follower.flock.exchange import Sharing
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.setpoint_rules import NONE, Setpoint
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT, ODOM
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
-from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
     Command,

@@ -40,22 +40,25 @@ ROOMS = {
     'messages': ('', 'numpy'),
     'flocking': ('', 'numpy'),
     'flock': ('flocking messages', 'numpy'),
-    'planner': ('flock flocking messages', 'numpy'),
+    'planner': ('bridge_state flock flocking messages', 'numpy'),
     'odometry': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
+    'bridge_state': ('', ''),
     # The planner, for its limits: the gate holds every setpoint to them once more.
-    'mavlink': ('messages planner', 'numpy pymavlink'),
+    'gate': ('bridge_state messages planner', 'numpy'),
+    'mavlink': ('bridge_state gate messages', 'numpy pymavlink'),
     'bags': ('', 'mcap numpy rosbags yaml'),
     # Defaults and ranges stand in the classes that they are for.
-    'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
+    'parameters': ('flock flocking gate mavlink odometry perception planner', 'yaml'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'follower': ('flock mavlink messages perception planner', ''),
+    'follower': ('flock gate messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters planner',
+    'support': ('bridge_state checks gate mavlink messages odometry parameters planner',
                 'ROS numpy pymavlink'),
-    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support',
+    'nodes': ('bags bridge_state checks flock gate mavlink messages odometry parameters '
+              'perception planner support',
               'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),
@@ -63,16 +66,16 @@ ROOMS = {
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock flocking follower mavlink messages odometry perception '
-                    'planner scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
+                    'perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
-    'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
-             'parameters perception planner scenarios sensors',
+    'runs': ('bags camera checks closed_loop flocking flocks follower gate mavlink messages '
+             'odometry parameters perception planner scenarios sensors',
              'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
-    'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
-                   'mavlink messages nodes parameters perception planner runs scenarios '
-                   'sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
+    'flock_desk': ('bags bridge_state camera check checks closed_loop external flocking flocks '
+                   'follow gate mavlink messages nodes parameters perception planner runs '
+                   'scenarios sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
 }
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 import pytest
 
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.parameters.spec import specs_of
 from flock_follower.parameters.tables import gate_limits, planner_params
 from flock_follower.planner.params import PlannerParams

@@ -53,10 +53,10 @@ from flock_follower.checks.topic_names import (
     TYPES,
 )
 from flock_follower.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import Array
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_odometry,
     from_range,

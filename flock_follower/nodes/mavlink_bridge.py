@@ -50,18 +50,18 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.gate.flight_end import CommandSources, EndParams
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Phase
+from flock_follower.gate.velocity_check import ODOM
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
-from flock_follower.mavlink.flight_end import CommandSources, EndParams
-from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.mavlink.velocity_check import ODOM
 from flock_follower.messages import from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import (

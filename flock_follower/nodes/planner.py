@@ -46,6 +46,8 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.bridge_state import ARMED_AT_TOPIC, BridgeState
+from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
 from flock_follower.messages import (
     from_acceleration,
     from_odometry,
@@ -68,8 +70,7 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.tables import cameras, planner_params
 from flock_follower.parameters.tables import PLANNER as SPECS
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.modes import ARMED_AT_TOPIC, BridgeState, State
-from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 from flock_follower.settings import judge

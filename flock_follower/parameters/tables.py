@@ -30,11 +30,11 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from flock_follower.files import resource
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.flight_end import EndParams
+from flock_follower.gate.gate import VELOCITY_SOURCES
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
 from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.flight_end import EndParams
-from flock_follower.mavlink.gate import VELOCITY_SOURCES
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.odometry.reader import SourceParams

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 
 from flock_follower.files import resource
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.parameters.spec import check_values
 from flock_follower.parameters.tables import (

@@ -37,7 +37,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.mavlink.permission import Permission
+from flock_follower.gate.permission import Permission
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge

@@ -24,6 +24,16 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
+from flock_follower.bridge_state import (
+    ACTIVE,
+    BRIDGE_STATES,
+    BridgeState,
+    effective_state,
+    INACTIVE,
+    NO_AUTOPILOT,
+    parse,
+    SILENCE,
+)
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import (
     Command,
@@ -33,17 +43,7 @@ from flock_follower.messages import (
 )
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory, NONE
-from flock_follower.planner.modes import (
-    ACTIVE,
-    BRIDGE_STATES,
-    BridgeState,
-    effective_state,
-    INACTIVE,
-    NO_AUTOPILOT,
-    parse,
-    SILENCE,
-    State,
-)
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 

@@ -35,6 +35,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
+from flock_follower import bridge_state
 from flock_follower.checks.system import (
     LINK_FAULT,
     MISSING,
@@ -46,19 +47,19 @@ from flock_follower.checks.system import (
     UNPROVEN,
     UNREAD,
 )
-from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import TAKEOFF
-from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
-from flock_follower.mavlink.parameter_check import ASK
-from flock_follower.mavlink.permission import (
+from flock_follower.gate.permission import (
     FELL_SILENT,
     MODE_TIMEOUT,
     MODE_UNKNOWN,
     Phase,
     TWO_COMMAND,
 )
-from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
+from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
+from flock_follower.mavlink import estimator_health
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import TAKEOFF
+from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
+from flock_follower.mavlink.parameter_check import ASK
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     from_state,
@@ -73,7 +74,6 @@ from flock_follower.nodes.support.inputs import LATCHED_QOS
 from flock_follower.nodes.support.parameters import WatchedParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so the state is repeated
@@ -107,8 +107,9 @@ class BridgeReport:
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
             bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = node.create_publisher(String, modes.TOPIC, LATCHED_QOS)
-        self._armed_at = node.create_publisher(PointStamped, modes.ARMED_AT_TOPIC, LATCHED_QOS)
+        self._states = node.create_publisher(String, bridge_state.TOPIC, LATCHED_QOS)
+        self._armed_at = node.create_publisher(
+            PointStamped, bridge_state.ARMED_AT_TOPIC, LATCHED_QOS)
         self._diagnostics.sources += [
             self._vehicle_values, self._gate_values, self._link_values]
         self._diagnostics.checks += [
