@@ -51,7 +51,6 @@ ROOMS = {
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flock flocking gate mavlink odometry perception planner', 'yaml'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'follower': ('flock gate messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
@@ -65,6 +64,7 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
+    'follower': ('flock gate messages perception planner', ''),
     'sensors': ('scenarios', 'numpy'),
     'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
                     'perception planner scenarios sensors vehicles', 'numpy'),
@@ -103,11 +103,16 @@ def imports_of(path: Path) -> Iterator[str]:
 
 
 def room_of(name: str, path: Path) -> str:
-    """Return the innermost folder of a module; of a module beside the folders its own name."""
+    """
+    Return the innermost folder of a module; of a module beside the folders its own name.
+
+    The modules beside the folders of the desk are commands, one room, unless the plan names them.
+    """
     package, *folders = name.split('.') if path.stem == '__init__' else name.split('.')[:-1]
     if folders:
         return folders[-1]
-    return name.rpartition('.')[2] if package == 'flock_follower' else package
+    own = name.rpartition('.')[2]
+    return own if package == 'flock_follower' or own in ROOMS else package
 
 
 def read_house() -> dict[str, Module]:

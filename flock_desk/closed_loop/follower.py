@@ -34,11 +34,11 @@ import numpy as np
 
 from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
 from flock_desk.closed_loop.world import GATE_STEPS
+from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
-from flock_follower.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint

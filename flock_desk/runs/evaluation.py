@@ -35,6 +35,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from flock_desk.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.live_line import LiveLine
@@ -52,7 +53,6 @@ from flock_follower.checks.topic_names import (
     RAW_IMAGES,
     TYPES,
 )
-from flock_follower.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT

@@ -22,9 +22,9 @@ from bag_excerpts import Change, excerpt
 import numpy as np
 import pytest
 
+from flock_desk.follower import Follower
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_follower.bags.bag import BagMessage
-from flock_follower.follower import Follower
 from flock_follower.messages import OdometryState
 from flock_follower.parameters.files import parse_parameters, TABLE
 
