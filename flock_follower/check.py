@@ -55,11 +55,11 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag, judge_all
-from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.files import resource, whole_file
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
 from flock_follower.parameters.tables import recordings_folder
 from flock_follower.ranges import Range
+from flock_follower.topic_names import parse_remaps
 
 SECONDS = 6.0
 VALID_SECONDS = Range(1.0, 600.0, 's')

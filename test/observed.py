@@ -32,14 +32,12 @@ from flock_follower.checks.observations import (
     Machine,
     NodeStatus,
     Observations,
-    OURS,
     Picture,
     TopicEnd,
     TopicSeen,
 )
 from flock_follower.checks.processor import Load
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.topic_names import names_there, TYPES
 from flock_follower.files import resource
 from flock_follower.geometry import (
     Array,
@@ -54,6 +52,7 @@ from flock_follower.geometry import (
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
 from flock_follower.parameters.files import read_parameters, TABLE
 from flock_follower.perception.camera import CameraModel
+from flock_follower.topic_names import names_there, OURS, TYPES
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

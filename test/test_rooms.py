@@ -43,24 +43,26 @@ ROOMS = {
     'planner': ('bridge_state flock flocking messages', 'numpy'),
     'odometry': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
+    'bridge_keys': ('', ''),
     'bridge_state': ('', ''),
+    'topic_names': ('messages', ''),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'gate': ('bridge_state messages planner', 'numpy'),
     'mavlink': ('bridge_state gate messages', 'numpy pymavlink'),
     'bags': ('', 'mcap numpy rosbags yaml'),
     # Defaults and ranges stand in the classes that they are for.
-    'parameters': ('flock flocking gate mavlink odometry perception planner', 'yaml'),
-    'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'check': ('bags checks nodes parameters perception', ''),
+    'parameters': ('gate mavlink odometry perception planner', 'yaml'),
+    'checks': ('bags bridge_keys messages odometry parameters perception topic_names',
+               'cv2 numpy'),
+    'check': ('bags checks nodes parameters topic_names', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('bridge_state checks gate mavlink messages odometry parameters planner',
+    'support': ('bridge_keys bridge_state gate mavlink messages odometry parameters',
                 'ROS numpy pymavlink'),
     'nodes': ('bags bridge_state checks flock gate mavlink messages odometry parameters '
-              'perception planner support',
-              'ROS numpy yaml'),
+              'perception planner support topic_names', 'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
-    'vehicles': ('', 'numpy pymavlink yaml'),
+    'vehicles': ('', 'numpy pymavlink'),
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
@@ -70,12 +72,12 @@ ROOMS = {
                     'perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks follower gate mavlink messages '
-             'odometry parameters perception planner scenarios sensors',
+             'odometry parameters perception planner scenarios topic_names',
              'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
-    'flock_desk': ('bags bridge_state camera check checks closed_loop external flocking flocks '
-                   'follow gate mavlink messages nodes parameters perception planner runs '
-                   'scenarios sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
+    'flock_desk': ('bags bridge_state camera checks closed_loop external flocking flocks mavlink '
+                   'messages nodes parameters perception planner runs scenarios sensors support '
+                   'topic_names vehicles', 'ROS cv2 matplotlib numpy'),
 }
 
 

@@ -44,15 +44,6 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import LONGEST, RecordedSystem
-from flock_follower.checks.topic_names import (
-    COMPRESSED_IMAGES,
-    full_name,
-    images_by_type,
-    names_there,
-    offer,
-    RAW_IMAGES,
-    TYPES,
-)
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
@@ -81,6 +72,15 @@ from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
+from flock_follower.topic_names import (
+    COMPRESSED_IMAGES,
+    full_name,
+    images_by_type,
+    names_there,
+    offer,
+    RAW_IMAGES,
+    TYPES,
+)
 
 STATES = tuple(state.value for state in State)
 #: The assumed status of the autopilot while the bag was recorded.

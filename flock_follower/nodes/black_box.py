@@ -42,8 +42,6 @@ from flock_follower.bags.bag import deserialize, serialize
 from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording
-from flock_follower.checks.observations import OURS
-from flock_follower.checks.topic_names import COMPRESSED, full_name, IMAGE, INFO, TYPES
 from flock_follower.files import resource
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
@@ -67,6 +65,7 @@ from flock_follower.parameters.files import FLOWN
 from flock_follower.parameters.tables import BLACK_BOX as SPECS
 from flock_follower.parameters.tables import cameras, recordings_folder
 from flock_follower.perception.images import decode_image, encode_jpeg
+from flock_follower.topic_names import COMPRESSED, full_name, IMAGE, INFO, OURS, TYPES
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
 WRITE_PERIOD = 0.3  # s between writes: still less than a second if one takes long

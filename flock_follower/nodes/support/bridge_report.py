@@ -36,7 +36,7 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower import bridge_state
-from flock_follower.checks.system import (
+from flock_follower.bridge_keys import (
     LINK_FAULT,
     MISSING,
     NO_ANSWERS,
