@@ -48,6 +48,7 @@ from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import Array
+from flock_follower.mavlink.parameter_table import gate_limits
 from flock_follower.messages import (
     from_odometry,
     from_range,
@@ -59,19 +60,15 @@ from flock_follower.messages import (
     TRAJECTORY,
 )
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
+from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.parameters.spec import filled
-from flock_follower.parameters.tables import (
-    cameras,
-    CameraValues,
-    gate_limits,
-    planner_params,
-    tracker,
-)
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
+from flock_follower.planner.parameter_table import planner_params
 from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
     full_name,

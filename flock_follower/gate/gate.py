@@ -27,6 +27,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_follower.command_messages import Command
 from flock_follower.gate import disturbance, envelope, setpoint_rules, velocity_check
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
@@ -51,7 +52,7 @@ from flock_follower.gate.velocity_check import (
     YAWS_DISAGREE,
 )
 from flock_follower.geometry import Array
-from flock_follower.messages import Command, OdometryState, SANE
+from flock_follower.messages import OdometryState, SANE
 from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
 
 #: A command may rest on an image of at most this age, s; planners coast before.

@@ -36,8 +36,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_follower.command_messages import Command
 from flock_follower.gate import envelope
 from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.level_limit import limit_level
 from flock_follower.gate.permission import MODE_TIMEOUT, MODE_UNKNOWN
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.velocity_check import (
@@ -49,12 +51,11 @@ from flock_follower.gate.velocity_check import (
     Velocity,
 )
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.messages import Command, OLDEST_MARKER, RELATIVE_MAX, SANE
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
     INSIDE,
     limit_command,
-    limit_level,
     limit_norm,
     LimitedCommand,
     SENT_INSIDE,

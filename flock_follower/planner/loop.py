@@ -23,10 +23,10 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from flock_follower.bridge_state import ACTIVE, BridgeState, effective_state, parse, TAKEN_OVER
+from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.messages import (
     AccelerationState,
-    Command,
     OdometryChoice,
     OdometryState,
     RELATIVE,

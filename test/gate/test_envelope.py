@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import (
     approach_speed,
     exceeded,
@@ -36,7 +37,6 @@ from flock_follower.gate.permission import Permission
 from flock_follower.gate.relative_flight import Relative
 from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, Held
 from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.messages import Command
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', True)
 STEP, CYCLE = 0.01, 5  # 20 Hz

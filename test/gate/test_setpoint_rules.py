@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.command_messages import Command
 from flock_follower.gate.envelope import GateLimits, Location
 from flock_follower.gate.permission import MODE_TIMEOUT
 from flock_follower.gate.relative_flight import Relative
@@ -34,7 +35,7 @@ from flock_follower.gate.velocity_check import (
     ODOM,
 )
 from flock_follower.mavlink.setpoint_encoding import encode_setpoint
-from flock_follower.messages import Command, FASTEST_OWN
+from flock_follower.messages import FASTEST_OWN
 from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX, V_MAX
 
 LIMITS = GateLimits()

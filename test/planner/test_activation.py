@@ -34,13 +34,9 @@ from flock_follower.bridge_state import (
     parse,
     SILENCE,
 )
+from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.messages import (
-    Command,
-    from_odometry,
-    odometry,
-    OdometryState,
-)
+from flock_follower.messages import from_odometry, odometry, OdometryState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.memory import Memory, NONE
 from flock_follower.planner.modes import State

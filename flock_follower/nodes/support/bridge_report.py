@@ -30,7 +30,6 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import all as mavlink
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
@@ -60,6 +59,7 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import TAKEOFF
 from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
 from flock_follower.mavlink.parameter_check import ASK
+from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     from_state,
@@ -71,8 +71,8 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import LATCHED_QOS
-from flock_follower.nodes.support.parameters import WatchedParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
+from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
@@ -176,7 +176,7 @@ class BridgeReport:
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
         for text in self._bridge.texts.new(now):
-            log = self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info
+            log = self._warn if text.severity <= WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
     def _send_arming(self, now: float) -> None:
