@@ -81,7 +81,7 @@ ROOMS = {
              'topic_names', 'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags bridge_state camera checks closed_loop external flight_parameters '
-                   'flocking flocks mavlink messages neighbors_file nodes parameters perception '
+                   'flocks mavlink messages neighbors_file nodes parameters perception '
                    'planner runs scenarios sensors support topic_names vehicles',
                    'ROS cv2 matplotlib numpy'),
 }
