@@ -38,7 +38,8 @@ import cv2
 from flock_desk.runs.evaluation import evaluate, Evaluation
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.files import resource
-from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.flight_parameters import TABLE
+from flock_follower.parameters.files import read_parameters
 from flock_follower.perception.images import decode_image
 
 #: The aim is 3: perception, planner, gate and images alone take 2.4 of it.

@@ -50,15 +50,10 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.neighbors_file import Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.markers import (
-    draw_marker,
-    Marker,
-    marker_cells,
-    NeighborConfig,
-    parse,
-)
+from flock_follower.perception.markers import draw_marker, marker_cells, parse
 from flock_follower.perception.tracker import Tracker
 
 DICTIONARY = 'DICT_4X4_50'

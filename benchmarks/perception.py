@@ -71,6 +71,7 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.files import resource
 from flock_follower.geometry import Array, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
@@ -441,7 +442,7 @@ class Waiting(Tracker):
         return Sighting()
 
 
-def perceiver(config: neighbors.NeighborConfig,
+def perceiver(config: NeighborConfig,
               mountings: Sequence[Transform] = ()) -> Perceiver:
     """Return what perceives with one camera, or with several, named '0', '1' and so on."""
     several = {str(k): MountedCamera(place) for k, place in enumerate(mountings)}

@@ -54,9 +54,10 @@ from flock_desk.runs.processes import computed
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import evaluation_figures
 from flock_follower.checks.findings import ERROR, ready, WARNING
-from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.files import resource
-from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
+from flock_follower.flight_parameters import TABLE
+from flock_follower.parameters.files import parameters_flown, read_parameters
+from flock_follower.topic_names import parse_remaps
 
 
 class BagOutcome(NamedTuple):

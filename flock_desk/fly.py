@@ -62,9 +62,9 @@ from flock_desk.runs.summary import (
 )
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
-from flock_follower.files import whole_file
-from flock_follower.planner.modes import TAKEN_OVER
+from flock_follower.bridge_state import TAKEN_OVER
 from flock_follower.ranges import Range
+from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 SPEED_TOLERANCE = 0.05  # m/s: added by noise and gusts to a speed that is held at v_max

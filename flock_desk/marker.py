@@ -41,8 +41,9 @@ from matplotlib.transforms import Affine2D
 import numpy as np
 
 from flock_desk.runs.console import guarded
-from flock_follower.files import whole_file
-from flock_follower.perception.markers import draw_marker, marker_cells, SIDE_LENGTHS
+from flock_follower.neighbors_file import SIDE_LENGTHS
+from flock_follower.perception.markers import draw_marker, marker_cells
+from flock_follower.whole_file import whole_file
 
 #: Width and height, mm.
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}

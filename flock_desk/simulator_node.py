@@ -62,13 +62,13 @@ from flock_desk.sensors.vio import Odometry
 from flock_desk.simulator_outputs import LATCHED, ODOMETRY, SimulatorOutputs, VehicleAhead
 from flock_desk.vehicles.embedded import STEP
 from flock_follower.bags.live_line import LiveLine
+from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT
 from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
-from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT
 from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer

@@ -43,6 +43,7 @@ import textwrap
 from typing import Any, Final
 import zipfile
 
+from flock_follower.bags.parameter_table import recordings_folder
 from flock_follower.bags.recording import NAME
 from flock_follower.checks.findings import (
     ERROR,
@@ -55,11 +56,12 @@ from flock_follower.checks.findings import (
 )
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import check_bag, judge_all
-from flock_follower.checks.topic_names import parse_remaps
-from flock_follower.files import resource, whole_file
-from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
-from flock_follower.parameters.tables import recordings_folder
+from flock_follower.files import resource
+from flock_follower.flight_parameters import TABLE
+from flock_follower.parameters.files import parameters_flown, read_parameters
 from flock_follower.ranges import Range
+from flock_follower.topic_names import parse_remaps
+from flock_follower.whole_file import whole_file
 
 SECONDS = 6.0
 VALID_SECONDS = Range(1.0, 600.0, 's')

@@ -12,16 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files: paths of those that the package ships, for every kind of installation; atomic writes."""
+"""Files: paths of those that the package ships, for every kind of installation; their text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-import os
+from contextlib import suppress
 from pathlib import Path
 import sys
-from typing import BinaryIO
 
 
 def resource(relative: str) -> Path:
@@ -56,26 +53,3 @@ def read_text(path: str | Path) -> str:
         return Path(path).read_text(encoding='utf-8')
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
-
-
-@contextmanager
-def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """
-    Open a file for writing that gets its name only once everything in it is on the disk.
-
-    :raises OSError: naming the file, if it cannot be written; nothing is left of it then.
-    """
-    path = Path(path)
-    part = path.with_name(f'{path.name}.part')
-    try:
-        with part.open('wb') as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except BaseException as error:
-        with suppress(OSError):
-            part.unlink()
-        if isinstance(error, OSError):
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise

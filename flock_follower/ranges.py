@@ -22,7 +22,7 @@ import difflib
 from functools import cache
 import math
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Final
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,8 @@ class Range:
 #: Time between two messages of a recording, s; if it is more, the clock was set or nothing was
 #: recorded.
 MAX_GAP = 5.0
+#: Largest offset between the clocks of images and odometry that is applied, s.
+MAX_OFFSET: Final[float] = 0.2
 #: Largest error of the hover thrust that the gate offsets, m/s^2.
 THRUST_OFFSET_MAX = 1.2
 #: Values of parameters that planner and gate have in common.

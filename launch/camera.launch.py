@@ -28,7 +28,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
-from flock_follower.parameters.spec import refuse_arguments
+from flock_follower.parameters.launch_arguments import refuse_arguments
 
 FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 #: RealSense D435i: the left infrared image, emitter off. The IMU is 12 mm behind the lens, 6 mm to

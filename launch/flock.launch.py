@@ -30,7 +30,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
-from flock_follower.parameters.spec import refuse_arguments
+from flock_follower.parameters.launch_arguments import refuse_arguments
 
 MOST = 8  # each takes about one core
 EACH = {'namespace', 'target_system', 'connection'}  # every follower has its own

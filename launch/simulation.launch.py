@@ -38,7 +38,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from flock_follower.parameters.spec import END_WITH_LAUNCH, refuse_arguments
+from flock_follower.parameters.launch_arguments import END_WITH_LAUNCH, refuse_arguments
 
 FOLLOWER = str(Path(__file__).with_name('follower.launch.py'))
 ARGUMENTS = {

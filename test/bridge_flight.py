@@ -22,11 +22,12 @@ import numpy as np
 import pytest
 
 from flock_desk.vehicles.embedded import STEP
+from flock_follower.command_messages import Command
+from flock_follower.gate.gate import Gate
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.messages import Command, OdometryState
+from flock_follower.messages import OdometryState
 
 PERIOD = 5  # steps of a cycle: 20 Hz
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])

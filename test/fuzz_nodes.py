@@ -45,7 +45,7 @@ from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.mavlink.permission import Phase
+from flock_follower.gate.permission import Phase
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.messages import to_array
 from flock_follower.nodes.flock import SharingNode

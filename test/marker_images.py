@@ -24,17 +24,12 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import markers
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import (
-    detect,
-    MarkedNeighbor,
-    Marker,
-    marker_corners,
-    NeighborConfig,
-)
+from flock_follower.perception.markers import detect, marker_corners
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.tracker import Sighting, Tracker

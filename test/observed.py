@@ -32,15 +32,14 @@ from flock_follower.checks.observations import (
     Machine,
     NodeStatus,
     Observations,
-    OURS,
     Picture,
     TopicEnd,
     TopicSeen,
 )
 from flock_follower.checks.processor import Load
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.topic_names import names_there, TYPES
 from flock_follower.files import resource
+from flock_follower.flight_parameters import TABLE
 from flock_follower.geometry import (
     Array,
     quaternion_conjugate,
@@ -52,8 +51,9 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, to_nanoseconds
-from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.parameters.files import read_parameters
 from flock_follower.perception.camera import CameraModel
+from flock_follower.topic_names import names_there, OURS, TYPES
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

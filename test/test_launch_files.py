@@ -25,7 +25,10 @@ from typing import Any
 from launch_files import Context, LAUNCH, launched, stand_ins
 import pytest
 
-from flock_follower.parameters.tables import BLACK_BOX, MAVLINK_BRIDGE, PLANNER, RELATIVE_POSE
+from flock_follower.bags.parameter_table import BLACK_BOX
+from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
+from flock_follower.perception.parameter_table import RELATIVE_POSE
+from flock_follower.planner.parameter_table import PLANNER
 
 PAGE = (LAUNCH.parent / 'docs' / 'sensors.md').read_text(encoding='utf-8')
 SPECS = {'relative_pose': RELATIVE_POSE, 'planner': PLANNER, 'mavlink_bridge': MAVLINK_BRIDGE,

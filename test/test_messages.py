@@ -23,20 +23,18 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
+from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
     acceleration,
-    Command,
     from_acceleration,
     from_odometry,
     from_state,
-    from_trajectory,
     Make,
     odometry,
     RELATIVE,
     SANE,
     stamp_age,
-    trajectory,
 )
 from flock_follower.odometry.reader import OdometrySource
 

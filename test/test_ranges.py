@@ -27,7 +27,7 @@ import pytest
 
 from flock_desk import scenarios
 import flock_follower
-from flock_follower.parameters.tables import origin
+from flock_follower.mavlink.parameter_table import origin
 from flock_follower.ranges import Checked, parameter, Range
 
 SPEED = Range(0.05, 20.0, 'm/s')

@@ -25,6 +25,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
+import subprocess
 import sys
 from typing import NamedTuple
 
@@ -34,45 +35,63 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals'}
+SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals', 'whole_file'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
+    'command_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
-    'flock': ('flocking messages', 'numpy'),
-    'planner': ('flock flocking messages', 'numpy'),
+    'bridge_keys': ('', ''),
+    'bridge_state': ('', ''),
+    'topic_names': ('messages', ''),
+    # The markers by name and size alone: the planner reads the file, too.
+    'neighbors_file': ('', 'yaml'),
     'odometry': ('messages', 'numpy'),
-    'perception': ('messages odometry', 'cv2 numpy yaml'),
+    # Tables, defaults and ranges stand with what they are for.
+    'parameters': ('odometry', 'yaml'),
+    'flock': ('flocking messages', 'numpy'),
+    'planner': ('bridge_state command_messages flock flocking messages neighbors_file odometry '
+                'parameters', 'numpy'),
+    'perception': ('messages neighbors_file odometry parameters', 'cv2 numpy'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
-    'mavlink': ('messages planner', 'numpy pymavlink'),
-    'bags': ('', 'mcap numpy rosbags yaml'),
-    # Defaults and ranges stand in the classes that they are for.
-    'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
-    'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'follower': ('flock mavlink messages perception planner', ''),
-    'check': ('bags checks nodes parameters perception', ''),
+    'gate': ('bridge_state command_messages messages planner', 'numpy'),
+    'mavlink': ('bridge_state gate messages odometry parameters', 'numpy pymavlink'),
+    'bags': ('parameters', 'mcap numpy rosbags yaml'),
+    'flight_parameters': ('mavlink parameters perception planner', ''),
+    'checks': ('bags bridge_keys messages neighbors_file odometry parameters perception '
+               'topic_names', 'cv2 numpy'),
+    'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
     'follow': ('check checks nodes', ''),
-    # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters planner',
-                'ROS numpy pymavlink'),
-    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support',
-              'ROS numpy yaml'),
+    'support': ('bridge_keys bridge_state gate mavlink messages odometry parameters',
+                'ROS numpy'),
+    'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
+              'parameters perception planner support topic_names', 'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
-    'vehicles': ('', 'numpy pymavlink yaml'),
+    'vehicles': ('', 'numpy pymavlink'),
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
+    'follower': ('command_messages flock gate messages perception planner', ''),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock flocking follower mavlink messages odometry perception '
-                    'planner scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
+                    'perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
-    'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
-             'parameters perception planner scenarios sensors',
-             'PIL cv2 distributed matplotlib numpy tqdm yaml'),
+    'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
+             'mavlink messages neighbors_file odometry parameters perception planner scenarios '
+             'topic_names', 'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
-    'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
-                   'mavlink messages nodes parameters perception planner runs scenarios '
-                   'sensors support vehicles', 'ROS cv2 matplotlib numpy yaml'),
+    'flock_desk': ('bags bridge_state camera checks closed_loop external flight_parameters '
+                   'flocks mavlink messages neighbors_file nodes parameters perception '
+                   'planner runs scenarios sensors support topic_names vehicles',
+                   'ROS cv2 matplotlib numpy'),
+}
+
+#: The libraries that each node that flies may load, itself or by what it imports.
+FLIES = {
+    'relative_pose': 'ROS ament_index_python cv2 numpy yaml',
+    'planner': 'ROS ament_index_python numpy yaml',
+    'mavlink_bridge': 'ROS ament_index_python numpy pymavlink yaml',
+    'flock': 'ROS ament_index_python numpy yaml',
 }
 
 
@@ -100,11 +119,16 @@ def imports_of(path: Path) -> Iterator[str]:
 
 
 def room_of(name: str, path: Path) -> str:
-    """Return the innermost folder of a module; of a module beside the folders its own name."""
+    """
+    Return the innermost folder of a module; of a module beside the folders its own name.
+
+    The modules beside the folders of the desk are commands, one room, unless the plan names them.
+    """
     package, *folders = name.split('.') if path.stem == '__init__' else name.split('.')[:-1]
     if folders:
         return folders[-1]
-    return name.rpartition('.')[2] if package == 'flock_follower' else package
+    own = name.rpartition('.')[2]
+    return own if package == 'flock_follower' or own in ROOMS else package
 
 
 def read_house() -> dict[str, Module]:
@@ -122,6 +146,21 @@ def read_house() -> dict[str, Module]:
 
 
 HOUSE = read_house()
+
+
+def loaded(name: str) -> set[str]:
+    """Return the modules of the packages that Python loads with one of them."""
+    found, waiting = set(), [name]
+    while waiting:
+        module = waiting.pop()
+        if module not in found:
+            found.add(module)
+            waiting += HOUSE[module].ours
+            if '.' in module:  # the packages around it
+                waiting.append(module.rpartition('.')[0])
+    return found
+
+
 ROOM_NAMES = sorted({module.room for module in HOUSE.values()} - SHARED - {'flock_follower'})
 
 
@@ -173,3 +212,41 @@ def test_no_rooms_import_each_other_in_a_circle():
     for source, target in ARROWS:
         graph[source].add(target)
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize('node', FLIES)
+def test_a_node_that_flies_loads_only_the_libraries_it_may(node):
+    libraries = set().union(*(HOUSE[name].libraries
+                              for name in loaded(f'flock_follower.nodes.{node}')))
+    assert {'ROS' if is_ros(library) else library
+            for library in libraries - sys.stdlib_module_names} == {*FLIES[node].split()}
+
+
+@pytest.mark.parametrize('node', FLIES)
+def test_a_node_that_flies_loads_no_checks_and_bags_and_no_table_but_its_own(node):
+    rooms = {HOUSE[name].room for name in loaded(f'flock_follower.nodes.{node}')}
+    assert not rooms & {'checks', 'bags', 'flight_parameters'}
+    assert rooms & {'gate', 'mavlink', 'perception'} == {
+        'relative_pose': {'perception'}, 'mavlink_bridge': {'gate', 'mavlink'}}.get(node, set())
+
+
+def test_no_node_loads_the_tables_of_all():
+    assert not [name for name, module in HOUSE.items() if module.room in ('nodes', 'support')
+                and 'flock_follower.flight_parameters' in loaded(name)]
+
+
+def test_the_law_loads_geometry_and_ranges_alone():
+    assert loaded('flock_follower.flocking') == {'flock_follower', *(
+        f'flock_follower.{name}' for name in ('flocking', 'geometry', 'ranges', 'signals'))}
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('node', FLIES)
+def test_a_node_that_flies_starts_without_the_libraries_of_others(node):
+    missing = {'cv2', 'pymavlink', 'rosbags', 'mcap', 'scipy', 'matplotlib'} - {
+        *FLIES[node].split()}
+    code = (f'import sys; sys.modules.update(dict.fromkeys({sorted(missing)}));'
+            f'from flock_follower.nodes.{node} import main; sys.exit(main())')
+    ran = subprocess.run([sys.executable, '-c', code, '--ros-args', '-p', 'unknown:=1'],
+                         capture_output=True, text=True, check=False)
+    assert ran.returncode == 1 and f'unknown parameter unknown for node {node}' in ran.stderr

@@ -22,9 +22,10 @@ from hypothesis import strategies as st
 import pytest
 
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.mavlink.parameter_table import gate_limits
 from flock_follower.parameters.spec import specs_of
-from flock_follower.parameters.tables import gate_limits, planner_params
+from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import A_MAX, V_MAX
 from flock_follower.settings import Camera, judge, NARROWEST, NEAREST, refuse, UNKNOWN

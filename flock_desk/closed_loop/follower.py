@@ -34,11 +34,15 @@ import numpy as np
 
 from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
 from flock_desk.closed_loop.world import GATE_STEPS
+from flock_desk.follower import ControlCycle, Follower, Listener, Tick
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
-from flock_follower.follower import ControlCycle, Follower, Listener, Tick
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.setpoint_rules import NONE, Setpoint
+from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.geometry import (
     Array,
     quaternion_from_yaw,
@@ -46,10 +50,7 @@ from flock_follower.geometry import (
     Transform,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.dialects import PX4, VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.mavlink.dialects import PX4
 from flock_follower.messages import (
     AccelerationState,
     OdometryState,

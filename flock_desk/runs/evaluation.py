@@ -35,6 +35,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from flock_desk.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
 from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.live_line import LiveLine
@@ -43,20 +44,11 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
 from flock_follower.checks.recorded_system import LONGEST, RecordedSystem
-from flock_follower.checks.topic_names import (
-    COMPRESSED_IMAGES,
-    full_name,
-    images_by_type,
-    names_there,
-    offer,
-    RAW_IMAGES,
-    TYPES,
-)
-from flock_follower.follower import ControlCycle, Follower, ImageOutcome, Listener, Tick
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import Array
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.velocity_check import AUTOPILOT
+from flock_follower.mavlink.parameter_table import gate_limits
 from flock_follower.messages import (
     from_odometry,
     from_range,
@@ -68,19 +60,24 @@ from flock_follower.messages import (
     TRAJECTORY,
 )
 from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
+from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.parameters.spec import filled
-from flock_follower.parameters.tables import (
-    cameras,
-    CameraValues,
-    gate_limits,
-    planner_params,
-    tracker,
-)
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
+from flock_follower.planner.parameter_table import planner_params
+from flock_follower.topic_names import (
+    COMPRESSED_IMAGES,
+    full_name,
+    images_by_type,
+    names_there,
+    offer,
+    RAW_IMAGES,
+    TYPES,
+)
 
 STATES = tuple(state.value for state in State)
 #: The assumed status of the autopilot while the bag was recorded.

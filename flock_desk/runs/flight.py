@@ -41,7 +41,7 @@ from flock_desk.runs.processes import (
 )
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.checks.processor import Load
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.mavlink.transport import open_transport
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',

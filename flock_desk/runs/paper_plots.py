@@ -36,8 +36,8 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from flock_desk.flocks.agents import Simulation
-from flock_follower.files import whole_file
 from flock_follower.flocking import FlockingParams
+from flock_follower.whole_file import whole_file
 
 WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.

@@ -34,17 +34,17 @@ from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_desk.runs.processes import LateError
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.command_messages import from_trajectory
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import (
     from_odometry,
-    from_trajectory,
     NANOSECONDS,
     OdometryState,
     RELATIVE,
     stamp_to_nanoseconds,
 )
+from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.odometry.reader import OdometrySource
-from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.planner.params import PlannerParams
 

@@ -30,18 +30,19 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.pictures import camera_model
-from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters.files import PARAMETER_FILES
+from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
-from flock_follower.perception.markers import Detections, NeighborConfig
+from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 from flock_follower.perception.search import everywhere
+from flock_follower.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 
 #: Number of images that are searched for markers, and least time between them, s.
 PICTURES: Final = 25

@@ -22,22 +22,20 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
-from flock_follower.checks.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.ranges import MAX_GAP
+from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
+
 
 #: The nodes of a follower.
-OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
-
-
 class TopicEnd(NamedTuple):
     """A publisher of a topic; ``node`` is '' if unknown, as in bags."""
 

@@ -46,8 +46,8 @@ from flock_follower.geometry import (
     rpy_from_matrix,
 )
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
+from flock_follower.parameters.cameras import ALONE
 from flock_follower.parameters.files import COMMON
-from flock_follower.parameters.tables import ALONE
 
 #: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02

@@ -28,8 +28,16 @@ from flock_follower.checks.flight_settings import check_settings
 from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
 from flock_follower.checks.own_motion import check_own_motion
 from flock_follower.checks.pictures import check_pictures
+from flock_follower.checks.single_camera import alone
 from flock_follower.checks.system import check_diagnostics, check_machine
-from flock_follower.checks.topic_names import (
+from flock_follower.checks.topics import check_nodes, check_topics
+from flock_follower.files import resource
+from flock_follower.messages import NANOSECONDS, ODOMETRY
+from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
+from flock_follower.parameters.spec import filled
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import load
+from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
     images_by_type,
     names_there,
@@ -37,14 +45,6 @@ from flock_follower.checks.topic_names import (
     topics_of_camera,
     TYPES,
 )
-from flock_follower.checks.topics import check_nodes, check_topics
-from flock_follower.files import resource
-from flock_follower.messages import NANOSECONDS, ODOMETRY
-from flock_follower.odometry.reader import OdometrySource, read_odometry, SourceParams
-from flock_follower.parameters.spec import filled
-from flock_follower.parameters.tables import alone
-from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import load
 
 #: s: of a longer bag only the beginning is checked.
 LONGEST: Final = 300.0

@@ -19,6 +19,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from flock_follower.bridge_keys import (
+    LINK_FAULT,
+    MISSING,
+    NO_ANSWERS,
+    NOT_READY,
+    PARAMETER,
+    REFUSED,
+    UNANSWERED,
+    UNPROVEN,
+    UNREAD,
+)
 from flock_follower.checks.findings import (
     ERROR,
     Finding,
@@ -28,10 +39,10 @@ from flock_follower.checks.findings import (
     UNMEASURED,
     WARNING,
 )
-from flock_follower.checks.observations import Machine, Observations, OURS
+from flock_follower.checks.observations import Machine, Observations
 from flock_follower.checks.processor import BUSY
-from flock_follower.checks.topic_names import full_name
 from flock_follower.fast_dds import PROFILE_VARIABLES, UNDELIVERED
+from flock_follower.topic_names import full_name, OURS
 
 STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.
@@ -39,17 +50,6 @@ ROOM = 32.0
 #: Segments of killed processes from which on there is a warning: 180 raised the latency of the
 #: demonstration from image to setpoint, 95 %, from 90 ms to 239 ms.
 DEAD_SEGMENTS = 20
-#: Keys of the bridge's diagnostics.
-PARAMETER: Final = 'parameter '
-MISSING: Final = 'missing parameter '
-UNPROVEN: Final = 'unproven firmware'
-NOT_READY: Final = 'not ready to arm'
-UNREAD: Final = 'parameters unread'
-#: That the autopilot answers nothing, or ''; the questions that have no answer.
-NO_ANSWERS: Final = 'no answers'
-UNANSWERED: Final = 'unanswered questions'
-REFUSED: Final = 'offboard would be refused'
-LINK_FAULT: Final = 'link fault'
 #: The action for a status of a node, by a part of its text.
 ADVICE: Final[Mapping[str, str]] = {
     'cannot keep up': 'fly behind a slower leader, or raise v_max',

@@ -29,16 +29,10 @@ from flock_follower.checks.findings import (
     UNMEASURED,
     WARNING,
 )
-from flock_follower.checks.observations import Observations, OURS, TopicSeen
+from flock_follower.checks.observations import Observations, TopicSeen
 from flock_follower.checks.reach import Reach
-from flock_follower.checks.topic_names import (
-    COMPRESSED_IMAGES,
-    full_name,
-    offer,
-    RAW_IMAGES,
-    TYPES,
-)
 from flock_follower.ranges import MAX_GAP
+from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, offer, OURS, RAW_IMAGES, TYPES
 
 #: Only one node may publish these.
 ONE_PUBLISHER: Final = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom',

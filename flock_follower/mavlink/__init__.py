@@ -13,8 +13,7 @@
 # limitations under the License.
 
 """
-MAVLink connection to the autopilot: link, dialects, requests, setpoint gate.
+How to talk to the autopilot: transport, link, telemetry, dialects, commands, requests, texts.
 
-NED exists only here. The planner is imported for its limits, which the gate applies again, and for
-the names of the bridge's states.
+NED and pymavlink exist only here. The gate (``flock_follower.gate``) decides what may be sent.
 """

@@ -27,26 +27,28 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_follower.bridge_state import NO_AUTOPILOT
+from flock_follower.gate.flight_end import EndParams, FlightEnd, HOLD
+from flock_follower.gate.gate import AcceptedCommand, Gate
+from flock_follower.gate.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
+from flock_follower.gate.setpoint_rules import NONE, Setpoint
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import commands, estimator_health
 from flock_follower.mavlink.commands import NOT_RECEIVED, Request
-from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
-from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
-from flock_follower.mavlink.gate import AcceptedCommand, Gate
+from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, Link
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
 from flock_follower.mavlink.requests import Requests
-from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
+from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 from flock_follower.mavlink.status_texts import GroundStationReport, StatusTexts
 from flock_follower.mavlink.sticks import KINDS, StickWatch
 from flock_follower.mavlink.takeover import AFTER, failsafe, PILOT, TakeoverWatch, UNNAMED
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
-from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import OdometryState, to_nanoseconds
-from flock_follower.planner.modes import NO_AUTOPILOT
 from flock_follower.ranges import first_reason
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.

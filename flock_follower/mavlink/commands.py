@@ -32,7 +32,8 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialects import Dialect, enum_name, VehicleStatus
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, enum_name
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.ranges import first_reason
 

@@ -24,6 +24,8 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.gate.vehicle_status import VehicleStatus
+
 AUTO: Final[str] = 'auto'
 #: PX4 enters its failsafe when fewer setpoints than this arrive, Hz, and accepts OFFBOARD only
 #: after a stream of this rate has lasted 1 s.
@@ -68,15 +70,6 @@ def firmware_version(message: Any) -> Version | None:
     number = message.flight_sw_version
     version = Version(number >> 24 & 0xFF, number >> 16 & 0xFF, number >> 8 & 0xFF)
     return version if any(version) else None
-
-
-class VehicleStatus(NamedTuple):
-    """The vehicle's state by HEARTBEAT, or by a CURRENT_MODE after it."""
-
-    armed: bool
-    mode: str
-    offboard: bool
-    """Whether the mode obeys our setpoints: OFFBOARD, GUIDED."""
 
 
 class Rule(NamedTuple):

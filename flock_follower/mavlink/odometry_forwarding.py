@@ -29,6 +29,7 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.gate.velocity_check import plausible_velocity
 from flock_follower.geometry import (
     Array,
     enu_to_ned,
@@ -40,7 +41,6 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.mavlink.velocity_check import plausible_velocity
 from flock_follower.messages import (
     FUTURE_TOLERANCE,
     ODOMETRY_STD,

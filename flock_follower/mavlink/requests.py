@@ -27,16 +27,18 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, envelope, parameter_check
+from flock_follower.gate import envelope
+from flock_follower.gate.flight_end import FlightEnd
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Phase
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.mavlink import commands, parameter_check
 from flock_follower.mavlink.commands import Goal, NOT_RECEIVED, Request, Vehicle
-from flock_follower.mavlink.dialects import Dialect, PX4, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, PX4
 from flock_follower.mavlink.estimator_health import explained, misplaced
-from flock_follower.mavlink.flight_end import FlightEnd
-from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.identity import not_hovering
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.ranges import first_reason
 

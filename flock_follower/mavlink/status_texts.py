@@ -57,8 +57,8 @@ _MODES: Final[Mapping[str, int]] = MappingProxyType({
 _EVERY_MODE: Final[int] = 0xFFFFFFFF
 _PILOT_MODES: Final[tuple[str, ...]] = ('MANUAL', 'ALTCTL', 'POSCTL', 'ACRO', 'STABILIZED')
 _STICKS: Final[str] = 'check_modes_manual_control'
-#: The worst level of a check that prevents nothing.
-_WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
+#: MAV_SEVERITY, the worst level of a check that prevents nothing.
+WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
 _ENTERS: Final[tuple[str, ...]] = (
     'commander_failsafe_enter', 'commander_failsafe_enter_generic',
@@ -226,7 +226,7 @@ class StatusTexts:
         return [failure.text for failure in self._failures
                 if mode in _MODES and failure.modes >> _MODES[mode] & 1
                 # Reports for every mode include warnings, which prevent none,
-                and (failure.modes != _EVERY_MODE or failure.level < _WARNING
+                and (failure.modes != _EVERY_MODE or failure.level < WARNING
                      # and this one, which prevents the pilot's modes.
                      or (failure.text == _EVENTS[_STICKS].text and mode in _PILOT_MODES))]
 

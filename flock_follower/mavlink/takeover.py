@@ -29,8 +29,8 @@ import re
 from types import MappingProxyType
 from typing import Any, Final
 
+from flock_follower.gate.permission import Cause, UNKNOWN
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.mavlink.permission import Cause, UNKNOWN
 from flock_follower.mavlink.status_texts import event_number
 
 PILOT: Final[Cause] = Cause('the pilot took over', True)

@@ -27,6 +27,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_follower.gate.envelope import pressure_altitude
+from flock_follower.gate.permission import MODE_TIMEOUT
+from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.geometry import (
     Array,
     frd_to_flu,
@@ -37,8 +40,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
 )
-from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
-from flock_follower.mavlink.envelope import pressure_altitude
+from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of
 from flock_follower.mavlink.estimator_health import (
     Arrivals,
     estimator_status,
@@ -46,7 +48,6 @@ from flock_follower.mavlink.estimator_health import (
     gps_fix,
     GpsFix,
 )
-from flock_follower.mavlink.permission import MODE_TIMEOUT
 from flock_follower.messages import OdometryState
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.

@@ -41,32 +41,26 @@ import yaml
 from flock_follower.bags.bag import deserialize, serialize
 from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.parameter_table import BLACK_BOX as SPECS
+from flock_follower.bags.parameter_table import recordings_folder
 from flock_follower.bags.recording import FlightRecording
-from flock_follower.checks.observations import OURS
-from flock_follower.checks.topic_names import COMPRESSED, full_name, IMAGE, INFO, TYPES
 from flock_follower.files import resource
 from flock_follower.messages import MOTION_TOPIC
 from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
-from flock_follower.nodes.support.inputs import best_effort
-from flock_follower.nodes.support.middleware import (
+from flock_follower.nodes.support.image_middleware import (
     avoid_shared_memory_for_images,
     receive_buffer_max,
 )
-from flock_follower.nodes.support.parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import (
-    FlockNode,
-    LONGEST_WAIT,
-    never_block_output,
-    run,
-    spin,
-    Waiting,
-)
+from flock_follower.nodes.support.inputs import best_effort
+from flock_follower.nodes.support.output import never_block_output
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
+from flock_follower.nodes.support.runtime import FlockNode, LONGEST_WAIT, run, spin, Waiting
+from flock_follower.parameters.cameras import cameras
 from flock_follower.parameters.files import FLOWN
-from flock_follower.parameters.tables import BLACK_BOX as SPECS
-from flock_follower.parameters.tables import cameras, recordings_folder
 from flock_follower.perception.images import decode_image, encode_jpeg
+from flock_follower.topic_names import COMPRESSED, full_name, IMAGE, INFO, OURS, TYPES
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
 WRITE_PERIOD = 0.3  # s between writes: still less than a second if one takes long

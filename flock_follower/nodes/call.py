@@ -42,8 +42,8 @@ from flock_follower.mavlink.commands import (
     STREAM_TIMEOUT,
     TAKEOFF_DELAY,
 )
+from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
 from flock_follower.nodes.support.runtime import run
-from flock_follower.parameters.tables import MAVLINK_BRIDGE
 
 POLL_PERIOD = 0.1  # s between looks for the service
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine

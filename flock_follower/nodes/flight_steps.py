@@ -28,8 +28,8 @@ from ipaddress import ip_address
 import math
 from typing import Final
 
+from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT, READY
 from flock_follower.mavlink.connection import parse_connection
-from flock_follower.planner.modes import ACTIVE, NO_AUTOPILOT, READY
 
 NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
 #: Time to receive a report of every node at the start, s; each reports once per second.

@@ -21,7 +21,7 @@ Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's 
 ``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
 ``offboard``, ``takeoff`` and ``land``.
-``flock_follower.mavlink`` decides which setpoints are sent.
+``flock_follower.gate`` decides which setpoints are sent.
 
 Odometry is taken ODOM_RATE times a second, with all messages since the last time: a callback for
 each message of a fast source would cost more than the rest of the bridge.
@@ -50,19 +50,22 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.command_messages import from_trajectory
+from flock_follower.gate.flight_end import CommandSources, EndParams
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Phase
+from flock_follower.gate.velocity_check import ODOM
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
-from flock_follower.mavlink.flight_end import CommandSources, EndParams
-from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.parameter_table import gate_limits, origin, recommendations
+from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE as SPECS
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.status_texts import DISTANCE_PERIOD
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.mavlink.velocity_check import ODOM
-from flock_follower.messages import from_trajectory, OdometryState, stamp_age
+from flock_follower.messages import OdometryState, stamp_age
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import (
     internal_error,
@@ -70,18 +73,13 @@ from flock_follower.nodes.support.diagnostics import (
     publishers,
     STEADY,
 )
-from flock_follower.nodes.support.inputs import (
-    best_effort,
-    EvenClock,
-    LATCHED_QOS,
-    OwnOdometry,
-)
+from flock_follower.nodes.support.even_clock import EvenClock
+from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
+from flock_follower.nodes.support.output import never_block_output
 from flock_follower.nodes.support.publisher_thread import PublisherThread
-from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
+from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import filled
-from flock_follower.parameters.tables import gate_limits, origin, recommendations
-from flock_follower.parameters.tables import MAVLINK_BRIDGE as SPECS
 
 # Not only the newest: otherwise a second commanding node would not be detected.
 COMMANDS_QOS = best_effort(10)

@@ -36,20 +36,10 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
+from flock_follower.checks.observations import Machine, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load, LoadMeter, PERIOD
 from flock_follower.checks.reach import find_reach, Reach
-from flock_follower.checks.topic_names import (
-    COMPRESSED,
-    COMPRESSED_IMAGES,
-    full_name,
-    IMAGE,
-    INFO,
-    names_there,
-    RAW_IMAGES,
-    topics_of_camera,
-    TYPES,
-)
+from flock_follower.checks.single_camera import alone
 from flock_follower.fast_dds import dead_segments
 from flock_follower.files import resource
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
@@ -57,12 +47,23 @@ from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort, StaticChild
 from flock_follower.nodes.support.middleware import shared_memory_size
-from flock_follower.nodes.support.parameters import RemoteParameters
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.odometry.reader import read_odometry
 from flock_follower.parameters.spec import NAMES
-from flock_follower.parameters.tables import alone
 from flock_follower.perception.markers import load
+from flock_follower.topic_names import (
+    COMPRESSED,
+    COMPRESSED_IMAGES,
+    full_name,
+    IMAGE,
+    INFO,
+    names_there,
+    OURS,
+    RAW_IMAGES,
+    topics_of_camera,
+    TYPES,
+)
 
 DISCOVERY = 2.0  # s for the discovery of other nodes
 POLL_PERIOD = 0.25  # s between two searches for new topics

@@ -46,30 +46,28 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.bridge_state import ARMED_AT_TOPIC, BridgeState
+from flock_follower.bridge_state import TOPIC as BRIDGE_TOPIC
+from flock_follower.command_messages import trajectory
 from flock_follower.messages import (
     from_acceleration,
     from_odometry,
     MOTION_TOPIC,
     OdometryState,
     stamp_to_nanoseconds,
-    trajectory,
 )
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
-from flock_follower.nodes.support.inputs import (
-    best_effort,
-    EvenClock,
-    LATCHED_QOS,
-    OwnOdometry,
-)
+from flock_follower.nodes.support.even_clock import EvenClock
+from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory
-from flock_follower.nodes.support.parameters import WatchedParameters
+from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.tables import cameras, planner_params
-from flock_follower.parameters.tables import PLANNER as SPECS
+from flock_follower.parameters.cameras import cameras
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.modes import ARMED_AT_TOPIC, BridgeState, State
-from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
+from flock_follower.planner.modes import State
+from flock_follower.planner.parameter_table import PLANNER as SPECS
+from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 from flock_follower.settings import judge

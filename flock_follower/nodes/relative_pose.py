@@ -51,11 +51,12 @@ from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.tables import cameras, CameraValues, tracker
-from flock_follower.parameters.tables import RELATIVE_POSE as SPECS
+from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
+from flock_follower.perception.parameter_table import RELATIVE_POSE as SPECS
+from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
 

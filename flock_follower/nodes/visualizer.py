@@ -37,11 +37,10 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
+from flock_follower.command_messages import Command, from_trajectory
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, matrix_to_quaternion
 from flock_follower.messages import (
-    Command,
     from_odometry,
-    from_trajectory,
     NANOSECONDS,
     OdometryState,
     set_quaternion,

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The recent own odometry, interpolated to the stamp of an image; static frames of the vehicle.
+The recent own odometry, interpolated to the stamp of an image.
 
 A position from visual-inertial odometry is noisy and jumps with every correction; a measured
 velocity does not. The buffer therefore keeps a second position, ``travel``, the integral of the
@@ -43,35 +43,6 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import FASTEST, MAX_JUMP
-
-
-class StaticFrames:
-    """The tree of static frames of the vehicle, from ``tf_static``."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Transform]] = {}
-
-    def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Set the pose of a frame in its parent."""
-        self._parents[child] = parent, T_parent_child
-
-    def pose(self, frame: str, on: str) -> Transform | None:
-        """Return ``T_on_frame``, or None if the two frames are not connected."""
-        above, below = self._to_root(frame), self._to_root(on)
-        common = next((name for name in above if name in below), None)
-        return None if common is None else below[common].inverse() @ above[common]
-
-    def _to_root(self, frame: str) -> dict[str, Transform]:
-        """Return ``T_ancestor_frame`` of the frame itself and its ancestors, nearest first."""
-        chain = {frame: Transform()}
-        while frame in self._parents:
-            parent, T_parent_frame = self._parents[frame]
-            if parent in chain:
-                break  # a cycle: an invalid tree
-            chain[parent] = T_parent_frame @ chain[frame]
-            frame = parent
-        return chain
-
 
 #: Columns of a row, after the stamp.
 _POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))

@@ -17,7 +17,7 @@ A parameter as a table row: name, default, meaning and valid values.
 
 The nodes declare these tables to ROS; ``evaluate`` reads the same values from a file. Every value
 passes the same checks, and every refusal names the parameter, its value and the valid range.
-Unknown names are refused, those of launch arguments, too.
+Unknown names are refused.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
 import re
 from typing import Any, TypeVar
 
@@ -34,8 +33,6 @@ from flock_follower.ranges import Checked, Range, suggestion
 #: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
 #: stands in the name of one; in its default that is the camera's name, too.
 NAMES, EACH = 'cameras', 'NAME'
-#: More differences of two sets of parameters than this are counted, not listed.
-MOST_LISTED = 5
 #: Parameters that every ROS node has.
 OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
 #: Parameters of earlier versions, and the reason or the replacement.
@@ -60,8 +57,6 @@ REMOVED = {
         'period', 'heard_timeout', 'brake_time_constant', 'response_time', 'altitude_frequency',
         'max_vertical_acceleration', 'jpeg_quality', 'file_size', 'kept'),
         'it is a constant now: remove the line')}
-#: A launch that is terminated leaves its nodes running: the kernel ends each node with its launch.
-END_WITH_LAUNCH = 'setpriv --pdeathsig TERM'
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -222,32 +217,3 @@ def refuse_unknown(names: Iterable[str], known: Collection[str], node: str) -> N
         hint = (f'it was removed, {REMOVED[name]}' if name in REMOVED else
                 suggestion(name, known))
         raise ValueError(f'unknown parameter {name} for node {node}: {hint}')
-
-
-def refuse_arguments(command_line: Sequence[str], file: str, known: Collection[str]) -> None:
-    """
-    Refuse an argument that a launch file does not have: ROS would ignore it.
-
-    Nothing is checked unless the command line names the file: another launch file that includes
-    it may have arguments of its own.
-
-    :param command_line: ``sys.argv``.
-    :param file: path of the launch file; :param known: names of its arguments, and of those of
-        the files that it includes.
-    :raises ValueError: naming the argument, and the name that is nearest to it.
-    """
-    if not any(Path(word).name == Path(file).name for word in command_line):
-        return
-    for word in command_line:
-        name, assigned, _ = word.partition(':=')
-        if assigned and name not in known:
-            raise ValueError(f'{word}: unknown argument of {Path(file).name}: '
-                             f'{suggestion(name, known)}')
-
-
-def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """Return the parameters that differ, with both values: 'v_max 0.5 -> 1.0'; '' if none do."""
-    changed = [f'{name} {before.get(name, "not set")} -> {after.get(name, "not set")}'
-               for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
-    more = len(changed) - MOST_LISTED
-    return ', '.join([*changed[:MOST_LISTED], *([f'and {more} more'] if more > 0 else [])])

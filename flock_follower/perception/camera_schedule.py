@@ -33,8 +33,8 @@ import numpy as np
 
 from flock_follower.geometry import Transform
 from flock_follower.messages import MAX_JUMP
+from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.time_offset import MountedCamera
 

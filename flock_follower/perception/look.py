@@ -32,9 +32,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.markers import MarkedNeighbor, Marker, marker_corners
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
 from flock_follower.perception.pose import refine

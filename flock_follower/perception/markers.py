@@ -18,55 +18,22 @@ The one place that calls ``cv2.aruco``, the same for OpenCV 4.6 and 4.7 to 5.
 OpenCV 4.6 (Ubuntu 24.04) has free functions and ``DetectorParameters_create()``, and crashes on
 ``DetectorParameters()``; 4.7 brought ``ArucoDetector`` and 5 dropped the functions.
 Pixel coordinates are OpenCV's: (0, 0) at the centre of the top-left pixel.
-
-The neighbours and the markers they carry, read from YAML.
-
-A file holds the dictionary of the markers and a list of neighbours::
-
-    dictionary: DICT_4X4_50
-    neighbors:
-      - name: leader             # child_frame_id of its estimates
-        marker_id: 0
-        side_length: 0.16        # m, outer edge to outer edge of the black border
-        position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
-        rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
-
-A neighbour that carries several has, instead of the last four keys, a list of them::
-
-      - name: leader
-        markers:
-          - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
-          - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
-
-Each neighbour may have keys for the planner::
-
-        role: follower           # leader (the default), follower, or avoid: kept clear of only
-        radius: 0.3              # m, of its hull: distances are kept between hulls; 0
-
-``tag_position: [x, y, z]``, m, on its body, is the antenna that ranges are measured to;
-without it ranges are measured to the body's origin.
-
-The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-import yaml
 
-from flock_follower.files import read_text
-from flock_follower.geometry import Array, quaternion_from_rpy, Transform
+from flock_follower import neighbors_file
+from flock_follower.geometry import Array
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.perception.images import GrayImage
-from flock_follower.ranges import Range, suggestion
 
 # Any: neither version's type stubs know the other's names.
 _cv_aruco: Any = cv2.aruco
@@ -206,53 +173,6 @@ def _cv_params() -> Any:
     return cv_params
 
 
-#: A marker's side, m: shorter than the thickness of its print or larger than the drone is a slip.
-SIDE_LENGTHS = Range(0.01, 2.0, 'm')
-#: Each coordinate of a marker on the body.
-POSITIONS = Range(-5.0, 5.0, 'm')
-ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
-#: Of a hull; the planner has the same.
-RADII = Range(0.0, 5.0, 'm')
-ROLES = ('leader', 'follower', 'avoid')
-_MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
-
-
-@dataclass(frozen=True, eq=False)
-class Marker:
-    """A marker: its id, its side, m, and where it sits on its neighbour's body (FLU)."""
-
-    marker_id: int
-    side_length: float
-    T_body_marker: Transform
-
-
-@dataclass(frozen=True, eq=False)
-class MarkedNeighbor:
-    """One neighbour, and the markers mounted rigidly on it, at least one."""
-
-    name: str
-    markers: tuple[Marker, ...]
-    role: str = 'leader'
-    """One of ``ROLES``."""
-    radius: float = 0.0
-    """Radius of its hull, m."""
-    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
-
-
-@dataclass(frozen=True, eq=False)
-class NeighborConfig:
-    """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
-
-    dictionary: str
-    neighbors: tuple[MarkedNeighbor, ...]
-
-    def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
-        """Return the neighbours with their markers, by marker id."""
-        return {marker.marker_id: (neighbor, marker)
-                for neighbor in self.neighbors for marker in neighbor.markers}
-
-
 def marker_corners(side_length: float) -> Array:
     """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
     return 0.5 * side_length * np.array(
@@ -261,91 +181,17 @@ def marker_corners(side_length: float) -> Array:
 
 def load(path: str | Path) -> NeighborConfig:
     """
-    Read a neighbours file.
+    Read a neighbours file; its dictionary is one of the OpenCV at hand.
 
-    :raises ValueError: naming the file, the key, its value and the valid range.
-    :raises OSError: if the file cannot be read.
+    :raises ValueError, OSError: see :func:`flock_follower.neighbors_file.load`.
     """
-    text = read_text(path)
-    try:
-        return parse(yaml.safe_load(text))
-    except yaml.YAMLError as error:
-        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
+    return neighbors_file.load(path, dictionary_size)
 
 
 def parse(document: Any) -> NeighborConfig:
     """
-    Return the configuration of a parsed YAML document.
+    Return the configuration of a parsed YAML document; see :func:`load`.
 
     :raises ValueError: naming the key, its value and the valid range.
     """
-    _check_keys('the document', document, {'dictionary', 'neighbors'})
-    dictionary = str(document['dictionary'])
-    ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
-    neighbors = tuple(_parse_neighbor(where, entry, ids)
-                      for where, entry in _entries('neighbors', document['neighbors']))
-    taken: set[object] = set()
-    for i, neighbor in enumerate(neighbors):
-        for key, value in (('name', neighbor.name),
-                           *(('marker_id', marker.marker_id) for marker in neighbor.markers)):
-            if value in taken:
-                raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique')
-            taken.add(value)
-    return NeighborConfig(dictionary, neighbors)
-
-
-def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
-    several = isinstance(entry, Mapping) and 'markers' in entry
-    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
-                {'role', 'radius', 'tag_position'})
-    name, role, radius = entry['name'], entry.get('role', 'leader'), entry.get('radius', 0.0)
-    if not isinstance(name, str) or name.split() != [name]:
-        raise ValueError(f'{where}.name = {name!r}: must be a word')
-    if role not in ROLES:
-        raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
-    RADII.check(f'{where}.radius', radius)
-    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0] * 3), POSITIONS)
-    if several:
-        places = _entries(f'{where}.markers', entry['markers'])
-        for place, marker in places:
-            _check_keys(place, marker, _MARKER_KEYS)
-    else:
-        places = [(where, entry)]
-    markers = tuple(_parse_marker(place, marker, ids) for place, marker in places)
-    return MarkedNeighbor(name, markers, role, float(radius), (x, y, z))
-
-
-def _parse_marker(where: str, entry: Any, ids: Range) -> Marker:
-    ids.check(f'{where}.marker_id', entry['marker_id'])
-    SIDE_LENGTHS.check(f'{where}.side_length', entry['side_length'])
-    position = _triple(f'{where}.position', entry['position'], POSITIONS)
-    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], ANGLES)
-    return Marker(entry['marker_id'], float(entry['side_length']), Transform.from_quaternion(
-        position, quaternion_from_rpy(roll, pitch, yaw)))
-
-
-def _entries(where: str, values: Any) -> list[tuple[str, Any]]:
-    """Return the entries of a list, each with its place in the file."""
-    if not isinstance(values, list) or not values:
-        raise ValueError(f'{where} = {values!r}: must be a list of at least one entry')
-    return [(f'{where}[{i}]', value) for i, value in enumerate(values)]
-
-
-def _check_keys(where: str, entry: Any, keys: set[str],
-                optional: Collection[str] = frozenset()) -> None:
-    if not isinstance(entry, Mapping):
-        raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
-    unknown = sorted(map(str, set(entry) - keys - {*optional}))
-    if unknown:
-        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + suggestion(
-            unknown[0], {*keys, *optional}, 'must be one of'))
-    for key in sorted(keys - set(entry)):
-        raise ValueError(f'{where} lacks {key}')
-
-
-def _triple(where: str, values: Any, valid: Range) -> list[float]:
-    if not isinstance(values, list) or len(values) != 3 or not all(map(valid.holds, values)):
-        raise ValueError(f'{where} = {values!r}: must be three values, each {valid}')
-    return [float(value) for value in values]
+    return neighbors_file.parse(document, dictionary_size)

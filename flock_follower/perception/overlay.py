@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import marker_corners, NeighborConfig
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import Sighting
 

@@ -32,11 +32,12 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, marker_corners
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import (
     angle,
     Choice,

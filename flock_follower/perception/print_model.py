@@ -34,12 +34,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.images import GrayImage, grey_levels
 from flock_follower.perception.markers import (
     correctable_cells,
     dictionary_words,
-    MarkedNeighbor,
-    Marker,
     marker_cells,
     marker_code,
 )

@@ -38,8 +38,8 @@ import numpy as np
 
 from flock_follower.geometry import Array, SHORTEST
 from flock_follower.messages import RangeState
+from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
-from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
 from flock_follower.perception.range_gate import RangeBias

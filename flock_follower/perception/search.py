@@ -32,13 +32,12 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     detect,
     Detections,
-    MarkedNeighbor,
-    Marker,
     marker_cells,
     marker_code,
     marker_corners,

@@ -34,6 +34,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, skew, Transform
+from flock_follower.neighbors_file import Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
     cross,
@@ -43,7 +44,7 @@ from flock_follower.perception.edges import (
     within_reason,
 )
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, marker_code
+from flock_follower.perception.markers import marker_code
 from flock_follower.perception.print_model import cell_code, median
 
 #: Samples per cell, each way; beyond the black border; and away from where a marker is expected

@@ -42,10 +42,10 @@ from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.neighbor_motion import FilterParams
+from flock_follower.ranges import MAX_OFFSET
 
-#: Initial standard deviation of an offset, s; largest offset that is applied, s.
+#: Initial standard deviation of an offset, s.
 PRIOR: Final[float] = 0.1
-MAX_OFFSET: Final[float] = 0.2
 #: Step and half width of the grid of offsets about the initial one, s.
 STEP, FURTHEST = 0.01, 0.14
 GRID: Final[Array] = np.arange(-FURTHEST, FURTHEST + 0.5 * STEP, STEP)

@@ -43,6 +43,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import duplicate_name
+from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
@@ -50,7 +51,7 @@ from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import Look, reported, row_delay, Sighting, straightened, View
-from flock_follower.perception.markers import Detections, NeighborConfig
+from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
     Estimate,

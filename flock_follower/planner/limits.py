@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
 from flock_follower.messages import FASTEST_OWN, SANE
-from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
+from flock_follower.planner.projection import Discs, lexicographic, product, TOLERANCE
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in
 # a caller's check, cannot exceed it; a limited vector thus passes a second time unchanged.
@@ -195,25 +195,6 @@ def _separation_first(a: Array, v: Array, axis: Array, a_max: float, v_max: floa
     point = cut.best(complex(float(x @ a), float(y @ a)))
     found = level * axis + point.real * x + point.imag * y
     return limit_command(found, v, a_max, fastest, period).acceleration
-
-
-def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: float, v_max: float,
-                period: float) -> Array:
-    """
-    Return the acceleration (3,) within the limits whose vertical part comes first.
-
-    The vertical part is ``up``, m/s^2, or as near to it as both limits allow. The horizontal part
-    is the nearest one to that of ``a`` in the discs that this level cuts out of the limits and,
-    in their order, within bounds of the plane.
-    """
-    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
-    strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
-    side = Discs(0j, strongest, complex(centre[2], math.hypot(*centre[:2])), reach)
-    up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)
-    level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*centre[:2]),
-                  math.sqrt(max(reach ** 2 - (up - centre[2]) ** 2, 0.0)))
-    point = lexicographic(complex(*a[:2].tolist()), sides, level)
-    return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration
 
 
 def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Bound], a_max: float,

@@ -22,10 +22,11 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from flock_follower.bridge_state import ACTIVE, BridgeState, effective_state, parse, TAKEN_OVER
+from flock_follower.command_messages import Command
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.messages import (
     AccelerationState,
-    Command,
     OdometryChoice,
     OdometryState,
     RELATIVE,
@@ -33,15 +34,7 @@ from flock_follower.messages import (
 )
 from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.modes import (
-    ACTIVE,
-    BridgeState,
-    effective_state,
-    odometry_fault,
-    parse,
-    State,
-    TAKEN_OVER,
-)
+from flock_follower.planner.modes import odometry_fault, State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView, View
 from flock_follower.planner.step import Decision, step
@@ -104,7 +97,7 @@ class PlannerLoop:
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
         """
-        Take, and return, the state that the bridge reports; see ``modes``.
+        Take, and return, the state that the bridge reports; see ``bridge_state``.
 
         A takeover, by the pilot or a failsafe, disengages the planner: it commands only after it
         is engaged again. The bridge may name the cause later.

@@ -34,28 +34,12 @@ Braking is zero acceleration for a vehicle at rest; for one that moves, zero acc
 let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD the vehicle
 moves a little out of the way of the lost neighbor. In SEARCH and HOLD the planner
 follows again by itself until ``resume_timeout``. After that the state stays, and the planner sends
-no command until it is engaged again.
-
-``mavlink_bridge/state`` reports whether the vehicle flies the planner's commands.
-
-Its text is a state and, after a colon, the reason::
-
-    NO_AUTOPILOT: none received yet
-    INACTIVE: offboard was not requested
-    READY: waiting for offboard mode
-    ACTIVE
-    TAKEN_OVER: offboard was left for POSCTL
-
-The bridge sends it at each change, and at 2 Hz: otherwise ``ACTIVE`` of a dead bridge would stay
-on the latched topic. Nothing here reads a clock.
+no command until it is engaged again. Nothing here reads a clock.
 """
 
 from __future__ import annotations
 
 import enum
-import math
-import re
-from typing import NamedTuple
 
 from flock_follower.planner.inputs import OwnState, untimely
 from flock_follower.planner.params import PlannerParams
@@ -143,46 +127,3 @@ def blind(looked: float | None, now: float, params: PlannerParams) -> str:
     # The tolerance lets a timer that fires exactly at the timeout brake at once.
     return (f'no image processed for {silent:.2f} s'
             if silent > params.perception_timeout - 1e-6 else '')
-
-
-NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = BRIDGE_STATES = (
-    'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
-TOPIC = 'mavlink_bridge/state'
-#: Where the vehicle was armed, in the frame of the odometry; latched.
-ARMED_AT_TOPIC = 'mavlink_bridge/armed_at'
-SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
-_LONGEST_REASON = 200  # characters
-
-
-class BridgeState(NamedTuple):
-    """One of ``BRIDGE_STATES``, and the reason for it."""
-
-    name: str
-    reason: str = ''
-
-    def __str__(self) -> str:
-        return f'{self.name}: {self.reason}' if self.reason else self.name
-
-
-def parse(text: str) -> BridgeState:
-    """Return the state in a message; an unknown state, or none, counts as ``INACTIVE``."""
-    name, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
-        r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
-    if name not in BRIDGE_STATES:
-        return BridgeState(INACTIVE, f'unknown state of the bridge: {text[:40]!r}')
-    return BridgeState(name, ' '.join(reason.split())[:_LONGEST_REASON])
-
-
-def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
-    """
-    Return the state of the bridge; after a silence it counts as absent.
-
-    :param reported: the state in its last message; None without one.
-    :param age: of that message, s, by a clock that neither stops nor jumps.
-    """
-    if reported is None or math.isinf(age):
-        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (if another program flies '
-                           'the commands, set require_bridge:=false)')
-    if not age <= SILENCE:  # written so that NaN fails
-        return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
-    return reported

@@ -33,17 +33,10 @@ from flock_follower.check import main
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.marker_size import HOW
-from flock_follower.checks.observations import (
-    NodeStatus,
-    Observations,
-    OURS,
-    TopicEnd,
-    TopicSeen,
-)
+from flock_follower.checks.observations import NodeStatus, Observations, TopicEnd, TopicSeen
 from flock_follower.checks.processor import Load
 from flock_follower.checks.reach import Reach
 from flock_follower.checks.recorded_system import judge_all
-from flock_follower.checks.topic_names import TYPES
 from flock_follower.fast_dds import dead_segments
 from flock_follower.geometry import (
     quaternion_from_rpy,
@@ -51,6 +44,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.topic_names import OURS, TYPES
 
 LIVE, BAG, BOTH = (True,), (False,), (True, False)
 CAMERA = '/camera/camera/infra1/image_rect_raw'

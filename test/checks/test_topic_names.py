@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import pytest
 
-from flock_follower.checks.topic_names import (
+from flock_follower.messages import ODOMETRY
+from flock_follower.topic_names import (
     COMPRESSED,
     full_name,
     IMAGE,
@@ -28,7 +29,6 @@ from flock_follower.checks.topic_names import (
     offer,
     parse_remaps,
 )
-from flock_follower.messages import ODOMETRY
 
 D435I = {
     '/camera/camera/color/image_raw': IMAGE, '/camera/camera/color/camera_info': INFO,

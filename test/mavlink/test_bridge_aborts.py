@@ -20,8 +20,8 @@ from memory_line import MemoryLine
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.permission import Phase
 from flock_follower.mavlink.dialects import PX4
-from flock_follower.mavlink.permission import Phase
 
 pytestmark = pytest.mark.slow
 SET_MODE, DISARM = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_COMPONENT_ARM_DISARM

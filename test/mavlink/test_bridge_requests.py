@@ -22,7 +22,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 
 pytestmark = pytest.mark.slow

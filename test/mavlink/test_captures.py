@@ -20,10 +20,11 @@ from captured import captured, decoded, link
 from embedded_flight import BLIND, Flight, odometry, setpoint
 import pytest
 
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import arm, hold, offboard, Request, Vehicle
-from flock_follower.mavlink.dialects import PX4, VehicleStatus
-from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.status_texts import StatusTexts
 
 

@@ -17,9 +17,10 @@
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.mavlink import commands
 from flock_follower.mavlink.commands import Request, Vehicle
-from flock_follower.mavlink.dialects import ARDUPILOT, PX4, VehicleStatus
+from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.status_texts import StatusTexts
 
 SET_MODE, TAKEOFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF

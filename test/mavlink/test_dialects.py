@@ -24,15 +24,15 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.gate import Gate
 from flock_follower.geometry import wrap_angle
 from flock_follower.mavlink import dialects
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import NOT_RECEIVED
 from flock_follower.mavlink.dialects import ARDUPILOT, dialect_of, DIALECTS, PX4, Rule
-from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import obstacle
-from flock_follower.mavlink.setpoint_rules import encode_setpoint
+from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 
 GENERIC = mavlink.MAV_AUTOPILOT_GENERIC
 QUADROTOR, ROVER = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_GROUND_ROVER

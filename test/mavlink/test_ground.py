@@ -18,12 +18,10 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import (
-    Permission,
-)
-from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Permission
+from flock_follower.gate.setpoint_rules import NONE
+from flock_follower.gate.vehicle_status import VehicleStatus
 
 pytestmark = pytest.mark.slow
 OURS = VehicleStatus(True, 'OFFBOARD', True)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import (
+from flock_follower.gate.envelope import (
     HeightEstimator,
     MAX_CORRECTION,
     pressure_altitude,

@@ -19,8 +19,8 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.permission import Phase
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.sticks import Sticks, StickWatch, take_over_slowly
 from flock_follower.mavlink.telemetry import Telemetry
 

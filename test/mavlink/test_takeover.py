@@ -21,8 +21,8 @@ from fuzz_mavlink import frame
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.gate.permission import Phase, UNKNOWN
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4
-from flock_follower.mavlink.permission import Phase, UNKNOWN
 from flock_follower.mavlink.status_texts import event_number, EventMessage, MESSAGE_ID
 from flock_follower.mavlink.takeover import (
     AFTER,

@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 from flock_desk.vehicles.embedded import STEP
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.geometry import quaternion_from_yaw
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams

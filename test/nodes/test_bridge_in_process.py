@@ -33,13 +33,14 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 from std_srvs.srv import SetBool, Trigger
 
+from flock_follower.command_messages import Command, trajectory
+from flock_follower.gate.setpoint_rules import COMMAND
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.mavlink.bridge import Cycle
 from flock_follower.mavlink.commands import Outcome
 from flock_follower.mavlink.dialects import Version
 from flock_follower.mavlink.parameter_check import CheckResult
-from flock_follower.mavlink.setpoint_rules import COMMAND
-from flock_follower.messages import Command, to_array, trajectory
+from flock_follower.messages import to_array
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 

@@ -22,9 +22,11 @@ from unittest import mock
 import pytest
 import rclpy
 
+from flock_follower.flight_parameters import TABLE
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.parameters.files import files_in, read_parameters, TABLE
+from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.sections import files_in
 
 OWN = 'planner:\n  ros__parameters:\n    v_max: 0.9\n'
 FOLLOWER = '/**/follower:\n  ros__parameters:\n    v_max: 0.6\n    link_timeout: 2.0\n'

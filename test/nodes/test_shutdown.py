@@ -34,7 +34,7 @@ from flock_follower.files import resource
 MOMENTS = (0.3, 1.2, 2.5)  # s: during the imports, at the start, and in flight
 WRITER = """
 import os
-from flock_follower.nodes.support.runtime import never_block_output
+from flock_follower.nodes.support.output import never_block_output
 never_block_output()
 for _ in range(64):
     try:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from flock_follower.geometry import quaternion_from_rpy, Transform
-from flock_follower.odometry.buffer import StaticFrames
+from flock_follower.odometry.static_frames import StaticFrames
 
 A = Transform.from_quaternion([1.0, 0.0, 0.5], quaternion_from_rpy(0.0, 0.0, 1.0))
 B = Transform.from_quaternion([0.0, 2.0, 0.0], quaternion_from_rpy(0.3, 0.0, 0.0))

@@ -14,7 +14,7 @@
 
 """The difference of two sets of parameters, as text."""
 
-from flock_follower.parameters.spec import differences, MOST_LISTED
+from flock_follower.parameters.differences import differences, MOST_LISTED
 
 
 def test_each_parameter_that_differs_is_named_with_both_values() -> None:

@@ -23,18 +23,12 @@ from typing import Any
 import pytest
 import yaml
 
+from flock_follower import neighbors_file
 from flock_follower.files import resource
-from flock_follower.parameters.files import (
-    files_in,
-    parse_parameters,
-    read_parameters,
-    SHARED,
-    shared,
-    TABLE,
-    unheeded,
-)
-from flock_follower.parameters.tables import planner_params
-from flock_follower.perception import markers as neighbors
+from flock_follower.flight_parameters import TABLE
+from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.sections import files_in, SHARED, shared, unheeded
+from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import Member, RADIUS, ROLES
 
 
@@ -170,5 +164,5 @@ def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Pa
 
 
 def test_planner_and_neighbours_file_know_the_same_roles_and_radii() -> None:
-    assert (neighbors.ROLES, neighbors.RADII) == (ROLES, RADIUS)
-    assert neighbors.MarkedNeighbor('x', ()).role == Member().role
+    assert (neighbors_file.ROLES, neighbors_file.RADII) == (ROLES, RADIUS)
+    assert neighbors_file.MarkedNeighbor('x', ()).role == Member().role

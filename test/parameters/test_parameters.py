@@ -16,7 +16,7 @@
 
 import pytest
 
-from flock_follower.parameters.files import unheeded
+from flock_follower.parameters.sections import unheeded
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 

@@ -22,18 +22,17 @@ from typing import Any
 
 import pytest
 
+from flock_follower.bags.parameter_table import BLACK_BOX, recordings_folder
 from flock_follower.files import resource
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
-from flock_follower.parameters.spec import check_values
-from flock_follower.parameters.tables import (
-    BLACK_BOX,
-    cameras,
-    MAVLINK_BRIDGE,
-    planner_params,
-    recordings_folder,
-    tracker,
-)
+from flock_follower.flight_parameters import TABLE
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.mavlink.parameter_table import MAVLINK_BRIDGE
+from flock_follower.parameters.cameras import cameras
+from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.flight_names import FLIGHT_NAMES
+from flock_follower.parameters.spec import check_values, EACH
+from flock_follower.perception.parameter_table import tracker
+from flock_follower.planner.parameter_table import planner_params
 
 BUILT = {'relative_pose': tracker, 'planner': planner_params}
 
@@ -102,3 +101,8 @@ def test_a_user_without_a_home_folder_has_a_folder_of_recordings(
     usual = recordings_folder({'record_folder': ''}, '', '')
     assert usual == Path('/.ros/flock_follower/black_box')
     assert recordings_folder({'record_folder': '~/x'}, '', '') == Path('/x')
+
+
+def test_the_names_of_flight_parameters_are_those_of_the_tables() -> None:
+    assert {spec.name for specs in TABLE.values() for spec in specs
+            if EACH not in spec.name} == FLIGHT_NAMES

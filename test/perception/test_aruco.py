@@ -21,6 +21,7 @@ from marker_images import DICTIONARY
 import numpy as np
 import pytest
 
+from flock_follower.neighbors_file import DICTIONARY_SIZES
 from flock_follower.perception import markers as aruco
 
 
@@ -70,3 +71,8 @@ def test_detected_corners_have_no_bias_inwards(turn: float) -> None:
         outside.append(np.linalg.norm(found.corners[0] - middle, axis=1).mean() / 2**0.5
                        - 0.5 * side)
     assert abs(np.mean(outside)) < 0.2
+
+
+def test_each_dictionary_of_opencv_is_known_by_its_size_without_opencv():
+    for dictionary in aruco.dictionary_names():
+        assert DICTIONARY_SIZES[dictionary] == aruco.dictionary_size(dictionary)

@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.neighbors_file import Marker
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker
 from flock_follower.perception.print_model import cell_code, CellCode, shows_code
 
 DICTIONARIES = ('DICT_4X4_50', 'DICT_5X5_100', 'DICT_6X6_250', 'DICT_7X7_50',

@@ -39,12 +39,12 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import edge_fit
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit
 from flock_follower.perception.edges import MAX_INFLATION, normal_covariance, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.print_model import edge_model
 
 MODEL = edge_model(MarkedNeighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)

@@ -21,12 +21,8 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.markers import (
-    MarkedNeighbor,
-    Marker,
-    marker_corners,
-    NeighborConfig,
-)
+from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.overlay import (
     annotate,

@@ -40,9 +40,10 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker, marker_corners
+from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import (
     choose,
     Hypothesis,

@@ -25,9 +25,9 @@ import pytest
 
 from flock_follower.geometry import quaternion_from_yaw, Transform
 from flock_follower.messages import RangeState
+from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.perception import range_tracking
-from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
 

@@ -22,10 +22,11 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker, marker_corners
+from flock_follower.perception.markers import marker_corners
 
 LEADER = MarkedNeighbor('leader', (Marker(3, SIDE, Transform()),))
 CAMERA = make_camera()

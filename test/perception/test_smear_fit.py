@@ -29,8 +29,8 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker
 from flock_follower.perception.smear_fit import fit_smeared, smear_model
 
 CAMERA = make_camera(width=240, height=180)

@@ -28,12 +28,12 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
-from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams
 from flock_follower.perception.tracker import camera_mounting, MARGIN, MIRRORED_EVERY, Tracker
 

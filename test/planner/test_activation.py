@@ -24,16 +24,7 @@ import numpy as np
 import pytest
 
 from flock_follower.bags.message_types import empty
-from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.messages import (
-    Command,
-    from_odometry,
-    odometry,
-    OdometryState,
-)
-from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.memory import Memory, NONE
-from flock_follower.planner.modes import (
+from flock_follower.bridge_state import (
     ACTIVE,
     BRIDGE_STATES,
     BridgeState,
@@ -42,8 +33,13 @@ from flock_follower.planner.modes import (
     NO_AUTOPILOT,
     parse,
     SILENCE,
-    State,
 )
+from flock_follower.command_messages import Command
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
+from flock_follower.messages import from_odometry, odometry, OdometryState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.memory import Memory, NONE
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
 

@@ -33,8 +33,9 @@ from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.writer import BagWriter
 from flock_follower.files import resource
+from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import NANOSECONDS
-from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.parameters.files import read_parameters
 
 pytestmark = pytest.mark.slow
 

@@ -22,11 +22,12 @@ from bag_excerpts import Change, excerpt
 import numpy as np
 import pytest
 
+from flock_desk.follower import Follower
 from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
 from flock_follower.bags.bag import BagMessage
-from flock_follower.follower import Follower
+from flock_follower.flight_parameters import TABLE
 from flock_follower.messages import OdometryState
-from flock_follower.parameters.files import parse_parameters, TABLE
+from flock_follower.parameters.files import parse_parameters
 
 IMAGE, ODOM = '/image_raw/compressed', '/odom'
 

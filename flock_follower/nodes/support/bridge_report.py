@@ -30,12 +30,12 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import all as mavlink
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from flock_follower.checks.system import (
+from flock_follower import bridge_state
+from flock_follower.bridge_keys import (
     LINK_FAULT,
     MISSING,
     NO_ANSWERS,
@@ -46,19 +46,20 @@ from flock_follower.checks.system import (
     UNPROVEN,
     UNREAD,
 )
-from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import TAKEOFF
-from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
-from flock_follower.mavlink.parameter_check import ASK
-from flock_follower.mavlink.permission import (
+from flock_follower.gate.permission import (
     FELL_SILENT,
     MODE_TIMEOUT,
     MODE_UNKNOWN,
     Phase,
     TWO_COMMAND,
 )
-from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
+from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
+from flock_follower.mavlink import estimator_health
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import TAKEOFF
+from flock_follower.mavlink.odometry_forwarding import FORWARDING_GAP
+from flock_follower.mavlink.parameter_check import ASK
+from flock_follower.mavlink.status_texts import WARNING
 from flock_follower.mavlink.telemetry import Battery, estimate
 from flock_follower.messages import (
     from_state,
@@ -70,10 +71,9 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.inputs import LATCHED_QOS
-from flock_follower.nodes.support.parameters import WatchedParameters
 from flock_follower.nodes.support.publisher_thread import PublisherThread
+from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.planner import modes
 
 PLACE_TIMEOUT = 1.0  # s: with odometry older than this the place of arming is unknown
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so the state is repeated
@@ -107,8 +107,9 @@ class BridgeReport:
         self._motions = node.create_publisher(Odometry, MOTION_TOPIC, 10) if (
             bridge.gate.limits.relative_flight) else None
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = node.create_publisher(String, modes.TOPIC, LATCHED_QOS)
-        self._armed_at = node.create_publisher(PointStamped, modes.ARMED_AT_TOPIC, LATCHED_QOS)
+        self._states = node.create_publisher(String, bridge_state.TOPIC, LATCHED_QOS)
+        self._armed_at = node.create_publisher(
+            PointStamped, bridge_state.ARMED_AT_TOPIC, LATCHED_QOS)
         self._diagnostics.sources += [
             self._vehicle_values, self._gate_values, self._link_values]
         self._diagnostics.checks += [
@@ -175,7 +176,7 @@ class BridgeReport:
         if state != before:
             self._publisher.submit(lambda: self._info(f'state: {state}'))
         for text in self._bridge.texts.new(now):
-            log = self._warn if text.severity <= mavlink.MAV_SEVERITY_WARNING else self._info
+            log = self._warn if text.severity <= WARNING else self._info
             self._publisher.submit(partial(log, f'autopilot: {text.text}'))
 
     def _send_arming(self, now: float) -> None:

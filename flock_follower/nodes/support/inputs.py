@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Inputs of the nodes: the own state from ``odom``, static frames, and steps of the clock."""
+"""Inputs of the nodes: the own state from ``odom``, and static frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -26,12 +26,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState, stamp_to_nanoseconds, to_array
-from flock_follower.nodes.support.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.odometry.buffer import StaticFrames
 from flock_follower.odometry.derivation import AUTO, NONE
 from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.odometry.static_frames import StaticFrames
 from flock_follower.parameters.spec import filled
 
 BASE = 'base_link'
@@ -46,38 +45,16 @@ def best_effort(depth: int = 1) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class EvenClock(ClockWatch):
-    """
-    The time of a node, which goes on evenly if the system clock is set.
+class NodeClock(Protocol):
+    """A clock of a node that goes on evenly if the system clock is set: ``EvenClock``."""
 
-    ``shift`` is the sum of all steps of the system clock, ns. With ``use_sim_time`` the time is
-    that of /clock, and every stamp is used.
-    """
-
-    def __init__(self, node: FlockNode) -> None:
-        super().__init__()
-        self._node = node
-        self.simulated = bool(node.get_parameter('use_sim_time').value)
+    shift: int
 
     def now(self) -> int:
-        """Return the time, ns; find a step of the system clock, and count it."""
-        if self.simulated:
-            return int(self._node.get_clock().now().nanoseconds)
-        system, monotonic = self._node.read_clocks()
-        if step := self.take(system, monotonic):
-            self._node.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
-        return system - self.shift
-
-    def dated(self, stamp: int, arrival: int) -> int:
-        """Return a stamp of a message, ns, on this clock, and no later than its arrival."""
-        return stamp if self.simulated else min(stamp, arrival) - self.shift
+        """Return the time, ns."""
 
     def fresh(self, topic: str, stamp: int) -> bool:
-        """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
-        fresh = self.simulated or not self.before_step(stamp)
-        if not fresh:
-            self._node.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
-        return fresh
+        """Return whether a stamp, ns, can be used."""
 
 
 class StaticChild:
@@ -118,7 +95,7 @@ class OwnOdometry:
     """
 
     def __init__(self, node: FlockNode, values: Mapping[str, Any],
-                 use: Callable[[OdometryState, int], None], clock: EvenClock | None = None,
+                 use: Callable[[OdometryState, int], None], clock: NodeClock | None = None,
                  depth: int = 200, **options: Any) -> None:
         self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
         self._node, self._use, self._clock, self._placed = node, use, clock, ''

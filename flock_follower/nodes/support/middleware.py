@@ -28,11 +28,7 @@ _SEGMENT_SHARE: Final = 64 / 67
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _OWN_PROFILE = 'config/fastdds.xml'
-_UDP_PROFILE = 'config/fastdds_udp.xml'
-#: With a receive buffer for images: for ROS on this computer alone, and otherwise.
-_UDP_IMAGES_PROFILE = 'config/fastdds_udp_images.xml'
-_IMAGES_PROFILE = 'config/fastdds_images.xml'
-IMAGES_BUFFER: Final = 4 * 1024 * 1024
+UDP_PROFILE = 'config/fastdds_udp.xml'
 
 
 def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
@@ -55,39 +51,13 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     if get('ROS_LOCALHOST_ONLY') == '1' or get(_RANGE, '').upper() == 'LOCALHOST':
         # Here rmw_fastrtps adds shared memory by itself: the profile keeps it local instead.
         if own and not get('ROS_STATIC_PEERS'):
-            environment.update(profile_variables(_UDP_PROFILE))
+            environment.update(profile_variables(UDP_PROFILE))
             environment[_RANGE] = 'SYSTEM_DEFAULT'
             environment.pop('ROS_LOCALHOST_ONLY', None)
     elif own and profiles:
-        environment.update(profile_variables(_UDP_PROFILE))
+        environment.update(profile_variables(UDP_PROFILE))
     else:
         environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
-
-
-def avoid_shared_memory_for_images(environment: MutableMapping[str, str], most: int) -> bool:
-    """
-    Do as ``avoid_shared_memory``, with a buffer for images; return whether the kernel allows it.
-
-    Otherwise nothing is changed: without the buffer an image of 300 kB rarely arrives whole.
-
-    :param most: the largest receive buffer that the kernel allows, bytes.
-    """
-    if most < IMAGES_BUFFER:
-        return False
-    avoid_shared_memory(environment)
-    if profile_variables(_UDP_PROFILE).items() <= environment.items():
-        environment.update(profile_variables(_UDP_IMAGES_PROFILE))
-    elif environment.keys().isdisjoint(PROFILE_VARIABLES):
-        environment.update(profile_variables(_IMAGES_PROFILE))
-    return True
-
-
-def receive_buffer_max() -> int:
-    """Return the largest receive buffer that the kernel allows, bytes."""
-    try:
-        return int(Path('/proc/sys/net/core/rmem_max').read_text(encoding='ascii'))
-    except OSError:
-        return 0
 
 
 def shared_memory_size() -> int:

@@ -15,41 +15,32 @@
 """
 Parameters of a node: declared in one table, validated in one place, settable while flying.
 
-Those of other nodes are read by their services.
-
 A node has its parameters as a table of ``Spec`` and gives a ``build`` function that turns the
-values into one frozen object of the pure core; both are in ``flock_follower.parameters``. Every
+values into one frozen object of the pure core; both stand beside what they configure. Every
 value, from the command line, a file or ``ros2 param set``, passes the same checks; a change is
 taken whole or refused with a reason that names the parameter, its value and the valid range.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 import math
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor
-from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter import Parameter
 
-from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.parameters.spec import (
     check_values,
-    differences,
     expanded,
     refuse_unknown,
     Spec,
 )
 
 T = TypeVar('T')
-
-WATCH_PERIOD = 2.0  # s between two requests for the parameters of a node that is watched
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -132,75 +123,6 @@ class Parameters(Generic[T]):
         if changes:
             values = {**self.values, **changes}
             self.current, self.values = self._build(values), values
-
-
-class RemoteParameters:
-    """
-    Parameters of another node; ``values`` is None until it has answered.
-
-    :param other: its name, in the namespace of ``node`` unless it begins with /.
-    :param changed: is called with the values if they differ from those before.
-    """
-
-    def __init__(self, node: Node, other: str,
-                 changed: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
-        self.values: dict[str, Any] | None = None
-        self._changed = changed
-        self._list = node.create_client(ListParameters, f'{other}/list_parameters')
-        self._get = node.create_client(GetParameters, f'{other}/get_parameters')
-
-    def ask(self) -> bool:
-        """Ask for all; return False if the node was not found, as one that has just started."""
-        if not (self._list.service_is_ready() and self._get.service_is_ready()):
-            return False
-        self._list.call_async(ListParameters.Request()).add_done_callback(self._take_names)
-        return True
-
-    def _take_names(self, future: Any) -> None:
-        names = future.result().result.names
-        self._get.call_async(GetParameters.Request(names=names)).add_done_callback(
-            partial(self._take_values, names))
-
-    def _take_values(self, names: list[str], future: Any) -> None:
-        found = map(parameter_value_to_python, future.result().values)
-        values = {name: list(value) if isinstance(value, array) else value
-                  for name, value in zip(names, found)}
-        self.take(values)
-
-    def take(self, values: dict[str, Any]) -> None:
-        """Take all values of the other node."""
-        if values != self.values:
-            self.values = values
-            self._changed(values)
-
-
-class WatchedParameters(RemoteParameters):
-    """
-    Parameters of another node, asked for every ``WATCH_PERIOD``; a change in flight is a problem.
-
-    The other node may have been started anew with another file meanwhile.
-
-    :param flying: whether the vehicle flies, or may fly.
-    """
-
-    def __init__(self, node: Node, other: str, flying: Callable[[], bool]) -> None:
-        super().__init__(node, other, self._compare)
-        self._other, self._flying = other, flying
-        self._before: dict[str, Any] | None = None
-        self._difference = ''
-        node.create_timer(WATCH_PERIOD, self.ask, clock=STEADY)
-
-    def _compare(self, values: dict[str, Any]) -> None:
-        before, self._before = self._before, values
-        if before is not None and self._flying():
-            self._difference = differences(before, values)
-
-    def changed_in_flight(self, now: float) -> str:
-        """Return the last change of this flight, with both values; '' if there was none."""
-        if not self._flying():
-            self._difference = ''
-        return self._difference and (
-            f'parameters of {self._other} changed in flight: {self._difference}')
 
 
 _HOW = """\

@@ -17,14 +17,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import contextlib
 import functools
 import gc
 import inspect
 import itertools
 import os
 from pathlib import Path
-import stat
 import sys
 import tempfile
 import time
@@ -52,7 +50,7 @@ from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
 from flock_follower.odometry.reader import read_odometry
-from flock_follower.parameters.files import files_in, PARAMETER_FILES, shared, unheeded
+from flock_follower.parameters.sections import files_in, PARAMETER_FILES, shared, unheeded
 from flock_follower.parameters.spec import Spec
 
 Message = TypeVar('Message')
@@ -415,23 +413,3 @@ def unwritable_logs(environment: Mapping[str, str]) -> str:
     except OSError as error:
         return f'{folder}: {error.strerror}'
     return ''
-
-
-def never_block_output() -> None:
-    """
-    Make writes to stdout and stderr fail instead of waiting for a reader.
-
-    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise stop the process at its
-    next log line. Lines are lost then. Files are left as they are.
-    """
-    for descriptor in (1, 2):
-        with contextlib.suppress(OSError):
-            mode = os.fstat(descriptor).st_mode
-            if stat.S_ISSOCK(mode):
-                os.set_blocking(descriptor, False)
-            elif stat.S_ISFIFO(mode) or os.isatty(descriptor):
-                # Opened anew: else the flag would also hold for other programs on this terminal.
-                own = os.open(f'/proc/self/fd/{descriptor}',
-                              os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
-                os.dup2(own, descriptor)
-                os.close(own)

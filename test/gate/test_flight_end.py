@@ -22,8 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.flight_end import (
+from flock_follower.gate.flight_end import (
     BATTERY_TIME,
     BATTERY_TIMEOUT,
     COMMAND_TIMEOUT,
@@ -36,6 +35,7 @@ from flock_follower.mavlink.flight_end import (
     LANDING_DELAY,
     RETRY_PERIOD,
 )
+from flock_follower.gate.vehicle_status import VehicleStatus
 
 OURS = VehicleStatus(True, 'OFFBOARD', True)
 HELD = VehicleStatus(True, 'AUTO.LOITER', False)

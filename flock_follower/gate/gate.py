@@ -27,19 +27,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import Array
-from flock_follower.mavlink import disturbance, envelope, setpoint_rules, velocity_check
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.disturbance import DisturbanceObserver, HeightWatch
-from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
-from flock_follower.mavlink.permission import Permission, Phase
-from flock_follower.mavlink.relative_flight import RelativeFlight
-from flock_follower.mavlink.setpoint_rules import (
-    AcceptedCommand,
-    Held,
-    Setpoint,
-)
-from flock_follower.mavlink.velocity_check import (
+from flock_follower.command_messages import Command
+from flock_follower.gate import disturbance, envelope, setpoint_rules, velocity_check
+from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
+from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
+from flock_follower.gate.permission import Permission, Phase
+from flock_follower.gate.relative_flight import RelativeFlight
+from flock_follower.gate.setpoint_rules import AcceptedCommand, Held, Setpoint
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     displaced,
     finite_vector,
@@ -55,7 +51,8 @@ from flock_follower.mavlink.velocity_check import (
     VelocityComparison,
     YAWS_DISAGREE,
 )
-from flock_follower.messages import Command, OdometryState, SANE
+from flock_follower.geometry import Array
+from flock_follower.messages import OdometryState, SANE
 from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
 
 #: A command may rest on an image of at most this age, s; planners coast before.

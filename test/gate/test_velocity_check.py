@@ -19,8 +19,8 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.velocity_check import (
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     difference,
     displaced,

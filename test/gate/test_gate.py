@@ -19,10 +19,10 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.gate import Gate
-from flock_follower.messages import Command
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import GateLimits
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.vehicle_status import VehicleStatus
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()

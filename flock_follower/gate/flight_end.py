@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import math
 from typing import Final
 
-from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.ranges import Checked, parameter, Range
 
 #: s without a command after which its publisher has stopped: three ticks of the planner, so that

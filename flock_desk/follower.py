@@ -36,18 +36,17 @@ import math
 from types import MappingProxyType
 from typing import Any, Final
 
+from flock_follower.command_messages import Command, from_trajectory, trajectory
 from flock_follower.flock.exchange import Sharing
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.setpoint_rules import NONE, Setpoint
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT, ODOM
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
-from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
-    Command,
     from_acceleration,
     from_odometry,
-    from_trajectory,
     Make,
     NANOSECONDS,
     ODOMETRY,
@@ -57,7 +56,6 @@ from flock_follower.messages import (
     STATE,
     to_nanoseconds,
     TRAJECTORY,
-    trajectory,
     with_acceleration,
 )
 from flock_follower.perception.neighbor_motion import Estimate

@@ -33,8 +33,8 @@ from typing import Final
 
 import numpy as np
 
+from flock_follower.gate.relative_flight import LONGEST_STEP
 from flock_follower.geometry import Array
-from flock_follower.mavlink.relative_flight import LONGEST_STEP
 from flock_follower.messages import SANE
 from flock_follower.planner.limits import limit_norm
 from flock_follower.ranges import THRUST_OFFSET_MAX

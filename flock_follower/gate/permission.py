@@ -38,8 +38,8 @@ import enum
 import math
 from typing import Final, NamedTuple
 
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.planner import modes
+from flock_follower import bridge_state
+from flock_follower.gate.vehicle_status import VehicleStatus
 
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground'
@@ -69,11 +69,11 @@ STICK: Final[Cause] = Cause('the pilot moved a stick', True)
 class Phase(enum.Enum):
     """A phase; the value is announced."""
 
-    INACTIVE = modes.INACTIVE
-    READY = modes.READY
-    ACTIVE = modes.ACTIVE
-    GIVING_BACK = f'{modes.READY}: giving back'
-    TAKEN_OVER = modes.TAKEN_OVER
+    INACTIVE = bridge_state.INACTIVE
+    READY = bridge_state.READY
+    ACTIVE = bridge_state.ACTIVE
+    GIVING_BACK = f'{bridge_state.READY}: giving back'
+    TAKEN_OVER = bridge_state.TAKEN_OVER
 
 
 @dataclass(frozen=True)

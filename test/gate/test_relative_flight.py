@@ -22,21 +22,15 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import approach_speed, GateLimits, Location
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.relative_flight import LONGEST_STEP, Reckoning, Relative
+from flock_follower.gate.setpoint_rules import COMMAND, decide, Held, LEVEL, NONE
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import known_motion, Motion, ODOM
 from flock_follower.geometry import quaternion_from_rpy
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import approach_speed, GateLimits, Location
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.relative_flight import LONGEST_STEP, Reckoning, Relative
-from flock_follower.mavlink.setpoint_rules import (
-    COMMAND,
-    decide,
-    encode_setpoint,
-    Held,
-    LEVEL,
-    NONE,
-)
-from flock_follower.mavlink.velocity_check import known_motion, Motion, ODOM
-from flock_follower.messages import Command
+from flock_follower.mavlink.setpoint_encoding import encode_setpoint
 
 LIMITS = GateLimits(relative_flight=True)
 LOST = Motion((0.3, 0.0, 0.0), 9.0), Motion(), ODOM

@@ -22,9 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from flock_follower.mavlink import takeover
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.permission import (
+from flock_follower.gate.permission import (
     FELL_SILENT,
     LONGEST_SILENCE,
     NOT_REQUESTED,
@@ -32,6 +30,8 @@ from flock_follower.mavlink.permission import (
     Phase,
     STICK,
 )
+from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.mavlink import takeover
 
 DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'fly.md'
 OURS = VehicleStatus(True, 'OFFBOARD', True)

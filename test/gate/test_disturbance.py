@@ -23,7 +23,7 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.disturbance import (
+from flock_follower.gate.disturbance import (
     CONTRADICTION_TIME,
     DisturbanceObserver,
     HeightWatch,

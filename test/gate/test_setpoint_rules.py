@@ -22,26 +22,20 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import GateLimits, Location
-from flock_follower.mavlink.permission import MODE_TIMEOUT
-from flock_follower.mavlink.relative_flight import Relative
-from flock_follower.mavlink.setpoint_rules import (
-    BRAKE,
-    COMMAND,
-    decide,
-    encode_setpoint,
-    Held,
-    LEVEL,
-    NONE,
-)
-from flock_follower.mavlink.velocity_check import (
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.permission import MODE_TIMEOUT
+from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, Held, LEVEL, NONE
+from flock_follower.gate.velocity_check import (
     AUTOPILOT,
     FUTURE_TOLERANCE,
     known_motion,
     Motion,
     ODOM,
 )
-from flock_follower.messages import Command, FASTEST_OWN
+from flock_follower.mavlink.setpoint_encoding import encode_setpoint
+from flock_follower.messages import FASTEST_OWN
 from flock_follower.ranges import A_MAX, THRUST_OFFSET_MAX, V_MAX
 
 LIMITS = GateLimits()

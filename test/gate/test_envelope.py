@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import (
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import (
     approach_speed,
     exceeded,
     GateLimits,
@@ -32,11 +32,11 @@ from flock_follower.mavlink.envelope import (
     outside,
     vertical_range,
 )
-from flock_follower.mavlink.gate import Gate
-from flock_follower.mavlink.permission import Permission
-from flock_follower.mavlink.relative_flight import Relative
-from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, Held
-from flock_follower.messages import Command
+from flock_follower.gate.gate import Gate
+from flock_follower.gate.permission import Permission
+from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, Held
+from flock_follower.gate.vehicle_status import VehicleStatus
 
 FLOWN = VehicleStatus(True, 'OFFBOARD', True)
 STEP, CYCLE = 0.01, 5  # 20 Hz

@@ -26,26 +26,23 @@ planner requests; the radius of the envelope; the rest of the command. The setpo
 plus the offset of the disturbance (``disturbance``), which does not move the vehicle: ``v_max``
 and the envelope bound the command alone, ``a_max`` bounds the sum. Vectors are ENU; ``decide``
 takes everything that it depends on as an argument.
-
-``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint: acceleration and yaw in
-MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter both obey.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
-from flock_follower.mavlink import envelope
-from flock_follower.mavlink.envelope import GateLimits, Location
-from flock_follower.mavlink.permission import MODE_TIMEOUT, MODE_UNKNOWN
-from flock_follower.mavlink.relative_flight import Relative
-from flock_follower.mavlink.velocity_check import (
+from flock_follower.command_messages import Command
+from flock_follower.gate import envelope
+from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.level_limit import limit_level
+from flock_follower.gate.permission import MODE_TIMEOUT, MODE_UNKNOWN
+from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.velocity_check import (
     finite_vector,
     fresh,
     KnownMotion,
@@ -53,53 +50,18 @@ from flock_follower.mavlink.velocity_check import (
     USUAL_AGE,
     Velocity,
 )
-from flock_follower.messages import Command, OLDEST_MARKER, RELATIVE_MAX, SANE
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX, SANE
 from flock_follower.planner.limits import (
     brake,
     INSIDE,
     limit_command,
-    limit_level,
     limit_norm,
     LimitedCommand,
     SENT_INSIDE,
 )
 from flock_follower.planner.projection import product
 from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
-
-#: Acceleration only, 0xC3F: for as long as no yaw is known.
-ACCELERATION: Final[int] = (
-    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE)
-#: Acceleration and yaw, 0x83F.
-ACCELERATION_YAW: Final[int] = ACCELERATION & ~mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-
-
-def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None, time_boot_ms: int = 0,
-                    system: int = 1, component: int = 1) -> Any:
-    """
-    Return SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED of an ENU acceleration and yaw.
-
-    :param acceleration: (3,), m/s^2, ENU.
-    :param yaw: rad, anticlockwise from east; None leaves it to the autopilot.
-    :param time_boot_ms: time stamp, ms; ``system`` and ``component`` address the receiver.
-    :raises ValueError: for a value that is not finite.
-    """
-    north, east, down = enu_to_ned(acceleration).tolist()
-    heading = 0.0 if yaw is None else yaw_enu_to_ned(yaw)
-    if not all(map(math.isfinite, (north, east, down, heading))):
-        raise ValueError(f'setpoint: acceleration = {np.asarray(acceleration).tolist()}, '
-                         f'yaw = {yaw}: must be finite')
-    return mavlink.MAVLink_set_position_target_local_ned_message(
-        time_boot_ms, system, component, mavlink.MAV_FRAME_LOCAL_NED,
-        ACCELERATION if yaw is None else ACCELERATION_YAW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-        north, east, down, heading, 0.0)
-
 
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Our names of topics, the names that drivers give them, and how to connect the two."""
+"""Our names of nodes and topics, the names that drivers give them, and how to connect the two."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from typing import Final
 
 from flock_follower.messages import ODOMETRY, RANGE, STATE, TRAJECTORY
 
+#: The nodes that a flight needs.
+OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
 IMAGE: Final = 'sensor_msgs/msg/Image'
 COMPRESSED: Final = 'sensor_msgs/msg/CompressedImage'
 INFO: Final = 'sensor_msgs/msg/CameraInfo'

@@ -38,8 +38,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_follower.gate.envelope import GateLimits
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.messages import FASTEST_OWN, FUTURE_TOLERANCE, POSITION_JUMP
 from flock_follower.planner.limits import limit_norm
 from flock_follower.ranges import first_reason

@@ -1,0 +1,43 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The limits of an acceleration whose vertical part comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+from flock_follower.geometry import Array
+from flock_follower.planner.limits import INSIDE, limit_command, SENT_INSIDE
+from flock_follower.planner.projection import Discs, lexicographic, Side
+
+
+def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: float, v_max: float,
+                period: float) -> Array:
+    """
+    Return the acceleration (3,) within the limits whose vertical part comes first.
+
+    The vertical part is ``up``, m/s^2, or as near to it as both limits allow. The horizontal part
+    is the nearest one to that of ``a`` in the discs that this level cuts out of the limits and,
+    in their order, within bounds of the plane.
+    """
+    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
+    strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
+    side = Discs(0j, strongest, complex(centre[2], math.hypot(*centre[:2])), reach)
+    up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)
+    level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*centre[:2]),
+                  math.sqrt(max(reach ** 2 - (up - centre[2]) ** 2, 0.0)))
+    point = lexicographic(complex(*a[:2].tolist()), sides, level)
+    return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration

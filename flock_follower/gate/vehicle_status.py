@@ -1,0 +1,28 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the gate knows of the vehicle: whether it is armed, and whether it obeys setpoints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class VehicleStatus(NamedTuple):
+    """The vehicle's state by HEARTBEAT, or by a CURRENT_MODE after it."""
+
+    armed: bool
+    mode: str
+    offboard: bool
+    """Whether the mode obeys our setpoints: OFFBOARD, GUIDED."""

@@ -1,0 +1,223 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The neighbours and the markers they carry, read from YAML.
+
+A file holds the dictionary of the markers and a list of neighbours::
+
+    dictionary: DICT_4X4_50
+    neighbors:
+      - name: leader             # child_frame_id of its estimates
+        marker_id: 0
+        side_length: 0.16        # m, outer edge to outer edge of the black border
+        position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
+        rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
+
+A neighbour that carries several has, instead of the last four keys, a list of them::
+
+      - name: leader
+        markers:
+          - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
+          - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
+
+Each neighbour may have keys for the planner::
+
+        role: follower           # leader (the default), follower, or avoid: kept clear of only
+        radius: 0.3              # m, of its hull: distances are kept between hulls; 0
+
+``tag_position: [x, y, z]``, m, on its body, is the antenna that ranges are measured to;
+without it ranges are measured to the body's origin.
+
+The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
+
+This module knows the dictionaries of markers by name and size alone: it needs no OpenCV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from flock_follower.files import read_text
+from flock_follower.geometry import quaternion_from_rpy, Transform
+from flock_follower.ranges import Range, suggestion
+
+#: Number of markers of OpenCV's dictionaries: ids run from 0 to one less.
+DICTIONARY_SIZES: Final[Mapping[str, int]] = {
+    **{f'DICT_{bits}X{bits}_{size}': size
+       for bits in (4, 5, 6, 7) for size in (50, 100, 250, 1000)},
+    'DICT_ARUCO_ORIGINAL': 1024,
+    **{name: size for family, size in (
+        ('APRILTAG_16h5', 30), ('APRILTAG_25h9', 35), ('APRILTAG_36h10', 2320),
+        ('APRILTAG_36h11', 587), ('ARUCO_MIP_36h12', 250))
+       for name in (f'DICT_{family}', f'DICT_{family.upper()}')}}
+#: A marker's side, m: shorter than the thickness of its print or larger than the drone is a slip.
+SIDE_LENGTHS = Range(0.01, 2.0, 'm')
+#: Each coordinate of a marker on the body.
+POSITIONS = Range(-5.0, 5.0, 'm')
+ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
+#: Of a hull; the planner has the same.
+RADII = Range(0.0, 5.0, 'm')
+ROLES = ('leader', 'follower', 'avoid')
+_MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A marker: its id, its side, m, and where it sits on its neighbour's body (FLU)."""
+
+    marker_id: int
+    side_length: float
+    T_body_marker: Transform
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedNeighbor:
+    """One neighbour, and the markers mounted rigidly on it, at least one."""
+
+    name: str
+    markers: tuple[Marker, ...]
+    role: str = 'leader'
+    """One of ``ROLES``."""
+    radius: float = 0.0
+    """Radius of its hull, m."""
+    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
+
+
+@dataclass(frozen=True, eq=False)
+class NeighborConfig:
+    """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
+
+    dictionary: str
+    neighbors: tuple[MarkedNeighbor, ...]
+
+    def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
+        """Return the neighbours with their markers, by marker id."""
+        return {marker.marker_id: (neighbor, marker)
+                for neighbor in self.neighbors for marker in neighbor.markers}
+
+
+def size_by_name(name: str) -> int:
+    """
+    Return how many markers a dictionary has.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    if name not in DICTIONARY_SIZES:
+        raise ValueError(f'dictionary = {name!r}: must be one of '
+                         f'{", ".join(sorted(DICTIONARY_SIZES))}')
+    return DICTIONARY_SIZES[name]
+
+
+def load(path: str | Path,
+         dictionary_size: Callable[[str], int] = size_by_name) -> NeighborConfig:
+    """
+    Read a neighbours file.
+
+    :param dictionary_size: returns how many markers a dictionary has; ValueError if unknown.
+    :raises ValueError: naming the file, the key, its value and the valid range.
+    :raises OSError: if the file cannot be read.
+    """
+    text = read_text(path)
+    try:
+        return parse(yaml.safe_load(text), dictionary_size)
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def parse(document: Any,
+          dictionary_size: Callable[[str], int] = size_by_name) -> NeighborConfig:
+    """
+    Return the configuration of a parsed YAML document.
+
+    :param dictionary_size: see :func:`load`.
+    :raises ValueError: naming the key, its value and the valid range.
+    """
+    _check_keys('the document', document, {'dictionary', 'neighbors'})
+    dictionary = str(document['dictionary'])
+    ids = Range(0, dictionary_size(dictionary) - 1, whole=True)
+    neighbors = tuple(_parse_neighbor(where, entry, ids)
+                      for where, entry in _entries('neighbors', document['neighbors']))
+    taken: set[object] = set()
+    for i, neighbor in enumerate(neighbors):
+        for key, value in (('name', neighbor.name),
+                           *(('marker_id', marker.marker_id) for marker in neighbor.markers)):
+            if value in taken:
+                raise ValueError(f'neighbors[{i}].{key} = {value!r}: must be unique')
+            taken.add(value)
+    return NeighborConfig(dictionary, neighbors)
+
+
+def _parse_neighbor(where: str, entry: Any, ids: Range) -> MarkedNeighbor:
+    several = isinstance(entry, Mapping) and 'markers' in entry
+    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
+                {'role', 'radius', 'tag_position'})
+    name, role, radius = entry['name'], entry.get('role', 'leader'), entry.get('radius', 0.0)
+    if not isinstance(name, str) or name.split() != [name]:
+        raise ValueError(f'{where}.name = {name!r}: must be a word')
+    if role not in ROLES:
+        raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
+    RADII.check(f'{where}.radius', radius)
+    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0] * 3), POSITIONS)
+    if several:
+        places = _entries(f'{where}.markers', entry['markers'])
+        for place, marker in places:
+            _check_keys(place, marker, _MARKER_KEYS)
+    else:
+        places = [(where, entry)]
+    markers = tuple(_parse_marker(place, marker, ids) for place, marker in places)
+    return MarkedNeighbor(name, markers, role, float(radius), (x, y, z))
+
+
+def _parse_marker(where: str, entry: Any, ids: Range) -> Marker:
+    ids.check(f'{where}.marker_id', entry['marker_id'])
+    SIDE_LENGTHS.check(f'{where}.side_length', entry['side_length'])
+    position = _triple(f'{where}.position', entry['position'], POSITIONS)
+    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], ANGLES)
+    return Marker(entry['marker_id'], float(entry['side_length']), Transform.from_quaternion(
+        position, quaternion_from_rpy(roll, pitch, yaw)))
+
+
+def _entries(where: str, values: Any) -> list[tuple[str, Any]]:
+    """Return the entries of a list, each with its place in the file."""
+    if not isinstance(values, list) or not values:
+        raise ValueError(f'{where} = {values!r}: must be a list of at least one entry')
+    return [(f'{where}[{i}]', value) for i, value in enumerate(values)]
+
+
+def _check_keys(where: str, entry: Any, keys: set[str],
+                optional: Collection[str] = frozenset()) -> None:
+    if not isinstance(entry, Mapping):
+        raise ValueError(f'{where} = {entry!r}: must map {", ".join(sorted(keys))}')
+    unknown = sorted(map(str, set(entry) - keys - {*optional}))
+    if unknown:
+        raise ValueError(f'{where} has an unknown key {unknown[0]}: ' + suggestion(
+            unknown[0], {*keys, *optional}, 'must be one of'))
+    for key in sorted(keys - set(entry)):
+        raise ValueError(f'{where} lacks {key}')
+
+
+def _triple(where: str, values: Any, valid: Range) -> list[float]:
+    if not isinstance(values, list) or len(values) != 3 or not all(map(valid.holds, values)):
+        raise ValueError(f'{where} = {values!r}: must be three values, each {valid}')
+    return [float(value) for value in values]
