@@ -60,7 +60,7 @@ from flock_follower.planner.limits import (
 )
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.scene import Scene
 from flock_follower.planner.sight import View
 
@@ -253,10 +253,20 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
             near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
+        if not here and not n.received and _covered(n, scene):
+            continue
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
             near += _neighbor_bounds(n, memory, scene, velocity, here, params)
     return ordered(near, fences(memory.lost, me.position, velocity, params),
                    _sight_bounds(memory, scene, velocity, view, params))
+
+
+def _covered(n: Neighbor, scene: Scene) -> bool:
+    """Return whether a lost neighbor is behind one in sight, which is nearer to both."""
+    apart = math.dist(n.position, scene.me.position)
+    return any(not each.received and each.name != n.name and max(
+        math.dist(each.position, scene.me.position), math.dist(each.position, n.position)) < apart
+        for each in scene.neighbors.flock)
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array, here: bool,
@@ -269,10 +279,12 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     places = [_expected(n, memory, me, params)]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
+    # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
+    headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()
     for place in places:
         found += in_sight(place, me.position, velocity, seen,
-                          joined and place is places[-1], params, radii_sum)
+                          joined and place is places[-1], params, radii_sum, headway)
     if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
@@ -291,7 +303,7 @@ def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
     offset = it.position - me.position
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
-        bounds += marker_bounds(offset, velocity, it, n.yaw, n.member.faces, params)
+        bounds += marker_bounds(offset, velocity, it, n.yaw, n.member, params)
     return bounds
 
 
