@@ -69,7 +69,9 @@ CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backi
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
-YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
+RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
+UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
+YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than these ...
 YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
@@ -169,13 +171,15 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     """
     Return the largest retreat from a neighbor out of sight, m.
 
-    The retreat is shorter by the distance beyond the band at the loss.
+    A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
+    The retreat is shorter by the distance beyond the band at the loss, too.
     """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     distance = lost.free - float(lost.towards @ lost.origin)
     beyond = max(distance - math.sqrt(params.law.d1), 0.0)
-    return max(params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond,
-               0.0)
+    longest = min(params.retreat_max,
+                  RETREAT_TIME * params.fastest if lost.name else UNKNOWN_PLACE)
+    return max(longest + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond, 0.0)
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
