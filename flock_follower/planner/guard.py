@@ -40,6 +40,7 @@ from flock_follower.planner.bounds import (
     marker_bounds,
     sight_bounds,
     stop,
+    STOP_SHARE,
 )
 from flock_follower.planner.inputs import (
     Expected,
@@ -61,7 +62,7 @@ from flock_follower.planner.limits import (
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
-from flock_follower.planner.scene import Scene
+from flock_follower.planner.scene import Scene, silent
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
@@ -75,6 +76,7 @@ YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than 
 YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
+FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
 CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is left ...
 OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
@@ -280,7 +282,8 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
-    places = [_expected(n, memory, me, params)]
+    places = [_hovering(n, params) if silent(n, me.stamp, params)
+              else _expected(n, memory, me, params)]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
     # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
@@ -292,8 +295,26 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
+    if silent(n, me.stamp, params):
+        found += [each._replace(normal=_aside(each.normal)) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
     return [each._replace(seen=False) for each in found] if n.received else found
+
+
+def _hovering(n: Neighbor, params: PlannerParams) -> Expected:
+    """Return the place where a follower that fell silent hovers, if its computer has failed."""
+    along = n.velocity / max(math.hypot(*n.velocity.tolist()), SHORTEST)
+    stops = FAILING_TIME * n.velocity + 0.5 * float(n.velocity @ n.velocity) / (
+        STOP_SHARE * params.strongest) * along
+    variance = float(n.position_covariance.trace())
+    return Expected(n.position + stops, np.zeros(3), np.zeros(3),
+                    SURE * math.sqrt(max(variance, 0.0) / 3.0), 0.0)
+
+
+def _aside(away: Array) -> Array:
+    """Return a unit vector between away from a place and across: to pass beside it."""
+    x, y, _ = away.tolist()
+    return math.sqrt(0.5) * np.array([x - y, y + x, 0.0])
 
 
 def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
