@@ -24,12 +24,12 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.params import FOLLOWER, LEADER, Member
+from flock_follower.planner.params import COLUMN_V_MAX, FOLLOWER, LEADER, Member
 
 BEGIN, FORWARD, BACK = 10, 60, 50  # ticks of 0.1 s: hover, flight ahead, flight back
 LATE = 2  # ticks by which an estimate is old
 LAG = 0.3  # s
-SAFE = 0.9  # m
+MARGIN = 1.38  # m: the near edge of the band and the margin m
 
 
 def least_distances(v_max: float, count: int) -> Array:
@@ -60,14 +60,22 @@ def least_distances(v_max: float, count: int) -> Array:
     return least
 
 
-def test_a_column_of_six_keeps_its_distances_if_the_leader_comes_back() -> None:
-    assert least_distances(2.0, 6).min() >= SAFE
+def test_a_column_of_six_keeps_its_margins_if_the_leader_comes_back() -> None:
+    assert least_distances(COLUMN_V_MAX, 6)[1:].min() >= MARGIN
+
+
+def test_a_faster_column_is_refused() -> None:
+    vehicles = {'ahead': Member(FOLLOWER)}
+    assert replace(PARAMS, v_max=COLUMN_V_MAX, vehicles=vehicles).v_max == COLUMN_V_MAX
+    with pytest.raises(ValueError, match='must be at most 1 m/s beside other followers: ahead'):
+        replace(PARAMS, v_max=1.01, vehicles=vehicles)
 
 
 def test_one_lost_behind_a_follower_in_sight_pushes_nobody_back() -> None:
     """A glimpse of the vehicle beyond: the one ahead is between."""
     vehicles = {'ahead': Member(FOLLOWER), 'leader': Member(LEADER)}
-    alone, both = (Follower(replace(PARAMS, v_max=2.0, vehicles=vehicles)) for _ in range(2))
+    params = replace(PARAMS, v_max=COLUMN_V_MAX, vehicles=vehicles)
+    alone, both = (Follower(params) for _ in range(2))
     for tick in range(20):
         glimpse = [seen(both.now, (4.5, 0.0, 2.0), name='leader')] if tick < 3 else []
         alone.tick(seen(alone.now, (2.4, 0.0, 2.0), name='ahead'))
