@@ -102,8 +102,8 @@ class GuardParams(Checked):
         return b * (root - self.tau), 1.0 / root
 
 
-#: Largest ``v_max`` beside other followers, m/s: in columns of six with 2 m/s members were lost, and
-#: one of them came within 0.12 m of the next; with 1 m/s none came within 1.29 m.
+#: Largest ``v_max`` beside other followers, m/s: in columns of six with 2 m/s members were lost,
+#: and two came within 0.12 m of each other; with 1 m/s none came within 1.2 m.
 COLUMN_V_MAX = 1.0
 YAW_MODES = ('leader', 'hold')
 CLIMB_SHARE = 0.6  # of v_max
