@@ -28,7 +28,7 @@ import numpy as np
 
 from flock_desk.scenarios.flock import Flock, Part
 from flock_follower.flocking import FlockingParams
-from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.params import COLUMN_V_MAX, PlannerParams
 from flock_follower.ranges import parameter, Range
 from flock_follower.settings import refuse
 
@@ -326,6 +326,9 @@ class Scenario(Part):
         super().__post_init__()
         if self.flock is not None and self.flock.ranges and not self.ranges.rate:
             raise ValueError('ranges: rate = 0: must be above 0 Hz if flock: ranges is true')
+        if self.company.followers > 1 and self.flight.v_max > COLUMN_V_MAX:
+            raise ValueError(f'flight: v_max = {self.flight.v_max:g}: must be at most '
+                             f'{COLUMN_V_MAX:g} m/s for several followers')
         if self.flock is not None and self.prints:
             raise ValueError('prints: only for one follower: there must be no flock')
 

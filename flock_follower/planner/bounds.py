@@ -32,6 +32,15 @@ As ds/dt = n . (a - a_L) + |w_t|^2 / r, with w_t the part of w across n, this re
 
 of the acceleration a. The unknown part of a_L uses up margin: see ``docs/guard.md``.
 
+Behind another follower a headway T_h grows the near edge with the own speed -n . v_F towards it:
+
+    g_near = r - sqrt(d0) - m - T_h (v_max - n . v_F)
+
+dg_near/dt = s + T_h (n . a + w_t . v_F / r) then has the own acceleration in it: with A the right
+side above, n . a >= (A - S'(g_near) T_h w_t . v_F / r) / (1 + S'(g_near) T_h). At the edge the
+velocity of the follower is that of the one ahead through (1 + tau z) / (1 + (tau + T_h) z), z the
+Laplace variable: no motion of a column grows from one follower to the next.
+
 The air below and above another vehicle is disturbed, so the horizontal distance has a bound of
 its own. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
 
@@ -45,7 +54,6 @@ above it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -69,7 +77,13 @@ from flock_follower.planner.limits import (
     SEPARATION,
     SIGHT,
 )
-from flock_follower.planner.params import GuardParams, PlannerParams, WIDEST_MARGIN
+from flock_follower.planner.params import (
+    FOLLOWER,
+    GuardParams,
+    Member,
+    PlannerParams,
+    WIDEST_MARGIN,
+)
 from flock_follower.planner.sight import MARGIN, vertical, View
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
@@ -82,6 +96,7 @@ STOP_SHARE = 0.6  # of a_max: deceleration of the stop before a place that was n
 TURNING_SHARE = 0.8  # of yaw_rate_max, to follow a neighbor that passes
 TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
 MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and the line of sight
+IN_LINE = math.radians(30.0)  # the same behind a follower: a column that is pushed back buckles
 MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
 MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
 LEVEL = np.array([1.0, 1.0, 0.0])
@@ -98,6 +113,10 @@ class Edges(NamedTuple):
     """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
     """... and its growth rate, m/s."""
+    headway: float = 0.0
+    """Time, s, for which there is room at the own speed towards it, and ..."""
+    fastest: float = 0.0
+    """... at this speed of its own towards the vehicle, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
@@ -108,7 +127,7 @@ class Edges(NamedTuple):
 
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams, neighbor_acceleration: ArrayLike = (0.0, 0.0, 0.0),
-                  seen: bool = True) -> list[Bound]:
+                  seen: bool = True, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
     """
     Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
 
@@ -118,6 +137,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
     :param neighbor_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
     :param seen: the neighbor is in sight.
+    :param velocity: own velocity (3,), m/s; of influence only with a headway.
     """
     p = np.asarray(offset, dtype=float)
     w = np.asarray(relative_velocity, dtype=float).tolist()
@@ -131,9 +151,15 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
     # The growing sphere of possible places approaches at its growth rate.
     closing = rate - edges.spreading
-    gap = distance - edges.near - edges.margin - edges.spread
+    own = np.asarray(velocity, dtype=float).tolist()
+    away = scalar_product(unit, own)
+    gap = distance - edges.near - edges.margin - edges.spread - edges.headway * max(
+        edges.fastest - away, 0.0)
     speed, slope = params.closing(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
+    if edges.headway > 0.0:
+        turned = (scalar_product(w, own) - rate * away) / distance
+        lowest = (lowest - slope * edges.headway * turned) / (1.0 + slope * edges.headway)
     bounds = [Bound(n, lowest, SEPARATION, distance, seen)]
     if math.isfinite(edges.far):
         speed, slope = params.closing(edges.far - edges.margin - distance)
@@ -143,7 +169,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             params: PlannerParams, radii: float = 0.0) -> list[Bound]:
+             params: PlannerParams, radii: float = 0.0, headway: float = 0.0) -> list[Bound]:
     """
     Return the bounds for one neighbor.
 
@@ -151,17 +177,19 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     :param seen: it is in sight; else its last height is unreliable.
     :param followed: it is followed; else the vehicle only keeps clear of it.
     :param radii: sum of its radius and the own one, m.
+    :param headway: see ``Edges``, s.
     """
     inner = Edges.of(params.law, params.guarding)
     band = Edges(inner.near + radii, inner.far + radii if followed else math.inf, inner.margin,
-                 it.spread, it.spreading)
+                 it.spread, it.spreading, headway, params.fastest)
     offset, rate = position - it.position, velocity - it.velocity
-    bounds = radial_bounds(offset, rate, band, params.guarding, it.acceleration) if seen else []
+    bounds = radial_bounds(offset, rate, band, params.guarding, it.acceleration,
+                           velocity=velocity) if seen else []
     x, y, z = offset.tolist()
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         level = band._replace(near=(DOWNWASH if seen else 1.0) * inner.near + radii, far=math.inf)
         bounds += radial_bounds(LEVEL * offset, LEVEL * rate, level, params.guarding,
-                                LEVEL * it.acceleration, seen)
+                                LEVEL * it.acceleration, seen, LEVEL * velocity)
     return bounds
 
 
@@ -242,24 +270,26 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view:
 
 
 def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
-                  faces: Sequence[float], params: PlannerParams) -> list[Bound]:
+                  member: Member, params: PlannerParams) -> list[Bound]:
     """
     Return the bounds on the viewing angle of a neighbour's marker.
 
-    It is the angle between the line of sight and the marker's normal: at most MARKER_ANGLE. The
-    vehicle moves round the neighbour; the arguments are those of ``sight_bounds``.
+    It is the angle between the line of sight and the marker's normal: at most MARKER_ANGLE, and
+    IN_LINE behind a follower. The vehicle moves round the neighbour; the arguments are those of
+    ``sight_bounds``.
 
-    :param yaw: the neighbour's, rad; :param faces: see ``Member``.
+    :param yaw: the neighbour's, rad.
     """
     x, y, _ = offset.tolist()
     distance = math.hypot(x, y)
     if distance < OVERHEAD:
         return []
     there = math.atan2(-y, -x)
-    off = min((wrap_angle(there - yaw - face) for face in faces), key=abs)
+    off = min((wrap_angle(there - yaw - face) for face in member.faces), key=abs)
     side = math.copysign(1.0, off)
     outward = side * np.array([y, -x, 0.0]) / distance
-    left = (MARKER_ANGLE - abs(off)) * distance
+    widest = IN_LINE if member.role == FOLLOWER else MARKER_ANGLE
+    left = (widest - abs(off)) * distance
     fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
     rate = float(outward @ (velocity - it.velocity))
     across = float(outward @ it.acceleration)

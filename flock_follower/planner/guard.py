@@ -40,6 +40,7 @@ from flock_follower.planner.bounds import (
     marker_bounds,
     sight_bounds,
     stop,
+    STOP_SHARE,
 )
 from flock_follower.planner.inputs import (
     Expected,
@@ -60,8 +61,8 @@ from flock_follower.planner.limits import (
 )
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import AVOID, PlannerParams
-from flock_follower.planner.scene import Scene
+from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
+from flock_follower.planner.scene import Scene, silent
 from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
@@ -69,10 +70,13 @@ CLOSE = 1.75  # m: nearer than this the climb gets the rest of v_max after backi
 DRAG_SHARE = 0.05  # of v_max: largest speed lost to drag that is offset
 SURE = 2.0  # standard deviations of a received position that count as possible places
 APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
-YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
+RETREAT_TIME = 2.0  # s of v_max: no retreat is longer, nor longer than retreat_max
+UNKNOWN_PLACE = 1.0  # m: the same if the place of the neighbor is unknown, as odometry jumped
+YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than these ...
 YIELD_MAX = 3.0  # m: ... but by no more than this
 SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
 BESIDE = 0.3  # ... unless it is on that side by this share of the distance
+FAILING_TIME = 0.5  # s that a follower whose computer failed flies on before it stops and hovers
 CLIMB_TIME = 2.5  # s: if an approaching neighbor uses up the retreat earlier, it is left ...
 OVERFLIGHT_CLIMB = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
@@ -169,13 +173,15 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     """
     Return the largest retreat from a neighbor out of sight, m.
 
-    The retreat is shorter by the distance beyond the band at the loss.
+    A leader is no faster than ``v_max``: the slower the vehicle may be, the shorter it retreats.
+    The retreat is shorter by the distance beyond the band at the loss, too.
     """
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     distance = lost.free - float(lost.towards @ lost.origin)
     beyond = max(distance - math.sqrt(params.law.d1), 0.0)
-    return max(params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond,
-               0.0)
+    longest = min(params.retreat_max,
+                  RETREAT_TIME * params.fastest if lost.name else UNKNOWN_PLACE)
+    return max(longest + coming * min(YIELD_TIME * lost.approach, YIELD_MAX) - beyond, 0.0)
 
 
 def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
@@ -253,10 +259,20 @@ def _bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
             near += clear_of_sphere(n, memory.flock.get(name), me, velocity, params)
     for name, n in memory.flock.items():
         here = name in memory.neighbors
+        if not here and not n.received and _covered(n, scene):
+            continue
         if here or not (name in memory.ranged or (scene.blinded and not n.received)):
             near += _neighbor_bounds(n, memory, scene, velocity, here, params)
     return ordered(near, fences(memory.lost, me.position, velocity, params),
                    _sight_bounds(memory, scene, velocity, view, params))
+
+
+def _covered(n: Neighbor, scene: Scene) -> bool:
+    """Return whether a lost neighbor is behind one in sight, which is nearer to both."""
+    apart = math.dist(n.position, scene.me.position)
+    return any(not each.received and each.name != n.name and max(
+        math.dist(each.position, scene.me.position), math.dist(each.position, n.position)) < apart
+        for each in scene.neighbors.flock)
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array, here: bool,
@@ -266,18 +282,39 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
-    places = [_expected(n, memory, me, params)]
+    places = [_hovering(n, params) if silent(n, me.stamp, params)
+              else _expected(n, memory, me, params)]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
+    # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
+    headway = params.guarding.tau if n.member.role == FOLLOWER and not n.received else 0.0
     found = list[Bound]()
     for place in places:
         found += in_sight(place, me.position, velocity, seen,
-                          joined and place is places[-1], params, radii_sum)
+                          joined and place is places[-1], params, radii_sum, headway)
     if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
+    if silent(n, me.stamp, params):
+        found += [each._replace(normal=_aside(each.normal)) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
     return [each._replace(seen=False) for each in found] if n.received else found
+
+
+def _hovering(n: Neighbor, params: PlannerParams) -> Expected:
+    """Return the place where a follower that fell silent hovers, if its computer has failed."""
+    along = n.velocity / max(math.hypot(*n.velocity.tolist()), SHORTEST)
+    stops = FAILING_TIME * n.velocity + 0.5 * float(n.velocity @ n.velocity) / (
+        STOP_SHARE * params.strongest) * along
+    variance = float(n.position_covariance.trace())
+    return Expected(n.position + stops, np.zeros(3), np.zeros(3),
+                    SURE * math.sqrt(max(variance, 0.0) / 3.0), 0.0)
+
+
+def _aside(away: Array) -> Array:
+    """Return a unit vector between away from a place and across: to pass beside it."""
+    x, y, _ = away.tolist()
+    return math.sqrt(0.5) * np.array([x - y, y + x, 0.0])
 
 
 def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
@@ -291,7 +328,7 @@ def _sight_bounds(memory: Memory, scene: Scene, velocity: Array, view: View,
     offset = it.position - me.position
     bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
-        bounds += marker_bounds(offset, velocity, it, n.yaw, n.member.faces, params)
+        bounds += marker_bounds(offset, velocity, it, n.yaw, n.member, params)
     return bounds
 
 

@@ -244,8 +244,11 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
             step = min(INSISTENCE * (least - product(normal, goal)), SANE) / abs(normal) ** 2
             reached = Discs(*within, *within).best(goal + step * normal)
             bounds[k] = normal, min(least, product(normal, reached))
-    point = lexicographic(goal, bounds, Discs(
-        0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within))
+    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)), *within)
+    firm = [bounds[k] for k in range(len(bounds)) if sides[k][2] != COHESION]
+    if len(firm) < len(bounds) and any(missed):
+        _yield_cohesion(goal, bounds, firm, sides, discs)
+    point = lexicographic(goal, bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # The bounds that the command did not keep, and those that are active at the result.
     acting = [k for k, (normal, least) in enumerate(bounds)
@@ -254,6 +257,24 @@ def constrained(command: ArrayLike, velocity: ArrayLike, required: Sequence[Boun
         bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
     binding = sorted({sides[k][2] for k in acting}, key=REASONS.index)
     return LimitedCommand(limited.acceleration, ', '.join(binding), axis)
+
+
+def _yield_cohesion(goal: complex, bounds: list[tuple[complex, float]],
+                    firm: Sequence[tuple[complex, float]],
+                    sides: Sequence[tuple[complex, float, str]], discs: Discs) -> None:
+    """
+    Reduce the bounds of cohesion to what is left towards the neighbor beside the firm bounds.
+
+    Against an opposite firm bound only a motion across would still bring it a little nearer, and
+    that would be as hard as the vehicle can.
+    """
+    start = lexicographic(goal, firm, discs)
+    for k, (normal, least) in enumerate(bounds):
+        if sides[k][2] == COHESION and product(normal, start) < least:
+            room = min((max(product(other, start) - bound, 0.0) / -product(other, normal)
+                        for other, bound in firm if product(other, normal) < 0.0),
+                       default=math.inf)
+            bounds[k] = normal, min(least, product(normal, start) + room * abs(normal) ** 2)
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:

@@ -89,9 +89,11 @@ def gathered(memory: Memory, me: OwnState, flock: Sequence[Neighbor], params: Pl
     follow = [n for n in flock if n.member.role != AVOID]
     leaders = [n for n in follow if n.member.role == LEADER]
     ends = [n for n in follow if n.name in joined]
-    seen = [[n for n in some if not n.received] for some in (leaders, ends)]
+    # A leader without an edge has another vehicle before it, which must not leave the view.
+    ahead = [n for n in leaders if n.name in joined]
+    seen = [[n for n in some if not n.received] for some in (ahead, ends, leaders)]
     # Never turn away from a neighbor in sight to one that is only received.
-    faced = _nearest(me, memory.faced, next(filter(None, [*seen, leaders, ends]), []))
+    faced = _nearest(me, memory.faced, next(filter(None, [*seen, ahead, leaders, ends]), []))
     # Several followers without a leader would follow their own motion if they followed each other.
     level = _nearest(me, memory.faced, leaders) or (faced if len(ends) < 2 else None)
     return Neighborhood(flock, shares, joined, faced, level)

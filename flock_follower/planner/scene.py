@@ -43,7 +43,7 @@ from flock_follower.planner.limits import REASONS
 from flock_follower.planner.memory import by_name, Loss, Memory, observed
 from flock_follower.planner.modes import State
 from flock_follower.planner.neighborhood import gathered, Neighborhood, NOBODY, sought
-from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.params import AVOID, FOLLOWER, PlannerParams
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
 
@@ -123,9 +123,16 @@ def _flock(memory: Memory, now: float, state: State, leader: Neighbor | None,
     # The vehicle always keeps clear of vehicles to avoid; without TRACK no other estimate ages.
     flock = {name: n for name, n in memory.flock.items() if now - n.stamp <= params.coast_timeout
              or (state is not State.TRACK and n.member.role != AVOID)
-             or (leader is not None and leader.name == name)}
+             or (leader is not None and leader.name == name)
+             or (silent(n, now, params) and now - n.stamp <= params.resume_timeout)}
     return by_name(flock | {n.name: n for n in memory.neighbors.values()
                             if state is State.TRACK or n.member.role == AVOID})
+
+
+def silent(n: Neighbor, now: float, params: PlannerParams) -> bool:
+    """Return whether a follower that was received is received no more: it may have failed."""
+    return (n.received and n.member.role == FOLLOWER
+            and now - n.stamp > params.heard_timeout)
 
 
 def awaited(n: Neighbor, memory: Memory, now: float, params: PlannerParams) -> Neighbor:

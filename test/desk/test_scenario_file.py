@@ -98,6 +98,8 @@ FLOCK = 'summary: a test\nflock: {followers: 4, cameras: [front]}'
     (('summary: a test', FLOCK.replace('}', ', fails: {follower: 5, at: 9}}')),
      'flock.fails = follower 5: must be an integer in [1, followers], where followers = 4'),
     (('summary: a test', FLOCK.replace('}', ', ranges: true}')), 'ranges: rate = 0: must be'),
+    (('summary: a test', f'{FLOCK}\nflight: {{v_max: 2}}'),
+     'flight: v_max = 2: must be at most 1 m/s'),
     (('summary: a test', 'summary: a test\nvariants: [windy]'),
      "variants = ['windy']: must be a mapping of names to keys"),
 ])

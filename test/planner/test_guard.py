@@ -146,6 +146,13 @@ def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() 
     assert command[0] == pytest.approx(-1.0, abs=1e-6)
 
 
+def test_cohesion_against_separation_does_not_push_across() -> None:
+    behind, ahead = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.01, 0.0])
+    around = [Bound(behind, 0.3, SEPARATION, 1.8), Bound(ahead, 0.2, COHESION, 2.6)]
+    command = guard(np.zeros(3), np.zeros(3), ordered(around), A_MAX, 9.0, T).acceleration
+    assert command == pytest.approx([-0.3, 0.0, 0.0], abs=1e-6)
+
+
 @given(st.floats(0.0, 10.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
 def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: float) -> None:
     speed = GuardParams(tau=tau, b=b).closing(gap)[0]

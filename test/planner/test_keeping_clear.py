@@ -33,6 +33,7 @@ from flock_follower.planner.guard import (
     ordered,
     overflight,
     retreat,
+    RETREAT_TIME,
     retreating,
 )
 from flock_follower.planner.inputs import Expected, Neighbor
@@ -90,13 +91,15 @@ def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
 def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: float) -> None:
     lost = LOST._replace(approach=approach)
     assert retreat(lost, PARAMS) == pytest.approx(PARAMS.retreat_max + farther)
+    slow = replace(PARAMS, v_max=0.5)
+    assert retreat(lost, slow) == pytest.approx(RETREAT_TIME * 0.5 + farther)
 
 
 COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 
 
 def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> None:
-    explicit = replace(PARAMS, altitude_max=20.0)
+    explicit = replace(PARAMS, altitude_max=20.0, retreat_max=1.0)
     back = -1.0 * AHEAD
     at_height = COMING._replace(height=0.0)
     assert overflight(at_height, back, 0.5, explicit) == 1.5

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import wrap_angle
-from flock_follower.planner.guard import retreat
+from flock_follower.planner.guard import retreat, RETREAT_TIME
 from flock_follower.planner.inputs import expected, FRESH
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.modes import State
@@ -52,7 +52,7 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_warns() -> None:
         heights.append(follower.position[2])
     assert decision.state is State.HOLD
     # What it moved while the leader was still predicted comes on top.
-    most = PARAMS.retreat_max + 2.0 * 0.4  # it was coming at 0.4 m/s
+    most = RETREAT_TIME * PARAMS.v_max + 2.0 * 0.4  # it was coming at 0.4 m/s
     assert most - 0.2 < math.dist(begin, follower.position) < most + 0.2
     assert abs(follower.position[1]) > 0.5  # beside the path of the leader
     assert np.linalg.norm(follower.velocity) < 0.02

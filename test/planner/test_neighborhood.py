@@ -110,6 +110,12 @@ def test_the_faced_neighbor_changes_for_one_clearly_nearer(before: str, expected
         assert faced is not None and faced.name == found
 
 
+def test_in_a_column_it_faces_the_follower_ahead_and_not_the_leader_beyond() -> None:
+    flock = [at('ahead', 1.8, 0.0, 0.0, role=FOLLOWER), at('leader', 3.0, 1.0, 0.0)]
+    faced = gathered(Memory(), own(), flock, PARAMS, 0.1).faced
+    assert faced is not None and faced.name == 'ahead'
+
+
 def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
     def after(memory: Memory, *flock: Neighbor) -> Memory:
         found = gathered(memory, own(), flock, PARAMS, 0.1)

@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+import math
+
 from flown import Follower, own, PARAMS, seen
 import numpy as np
 import pytest
@@ -126,3 +129,18 @@ def test_it_does_not_look_for(in_sight: str, received: str, then_seen: str,
     follower, decisions = fly(3.0, then_seen, then_received, follower)
     assert not follower.memory.looking
     assert not any('looks for' in warning for d in decisions for warning in d.warnings)
+
+
+def test_pushed_back_it_passes_beside_a_follower_that_fell_silent() -> None:
+    """The computer of the one behind failed 4 s before the leader comes back."""
+    follower = Follower(replace(PARAMS, v_max=1.0), 0.2)
+    behind, leader = np.array([-1.8, 0.0, 2.0]), np.array([2.0, 0.0, 2.0])
+    nearest = math.inf
+    for tick in range(140):
+        coming = -0.5 if tick >= 50 else 0.0
+        leader = leader + 0.1 * coming * np.array([1.0, 0.0, 0.0])
+        told = [seen(follower.now, behind, name='behind', received=True)] if tick < 10 else []
+        follower.tick(seen(follower.now, leader, (coming, 0.0, 0.0)), *told)
+        nearest = min(nearest, math.dist(follower.position, behind))
+        assert math.dist(follower.position, leader) > 0.9
+    assert nearest > 0.9 and follower.position[0] < -3.0

@@ -27,6 +27,7 @@ import pytest
 
 from flock_follower.geometry import Array, GRAVITY
 from flock_follower.planner.bounds import (
+    IN_LINE,
     in_sight,
     MARKER_ANGLE,
     marker_bounds,
@@ -36,7 +37,7 @@ from flock_follower.planner.guard import ordered
 from flock_follower.planner.inputs import Expected, Neighbor
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.modes import State
-from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
 from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion, WIDEST
 
 PARAMS = PlannerParams(v_max=5.0)
@@ -143,11 +144,12 @@ def test_left_and_right_of_an_image_that_is_not_symmetric() -> None:
 
 
 @pytest.mark.parametrize('side', [1.0, -1.0])
-def test_it_moves_round_to_the_face_of_the_marker(side: float) -> None:
+@pytest.mark.parametrize(('role', 'widest'), [(LEADER, MARKER_ANGLE), (FOLLOWER, IN_LINE)])
+def test_it_moves_round_to_the_face_of_the_marker(side: float, role: str, widest: float) -> None:
     it = expected(np.array([2.0, 0.0, 0.0]))  # the marker is at its back
-    (free,) = marker_bounds(it.position, np.zeros(3), it, side * 0.9 * MARKER_ANGLE, [math.pi],
+    (free,) = marker_bounds(it.position, np.zeros(3), it, side * 0.9 * widest, Member(role),
                             PARAMS)
-    (bound,) = marker_bounds(it.position, np.zeros(3), it, side * 1.1 * MARKER_ANGLE, [math.pi],
+    (bound,) = marker_bounds(it.position, np.zeros(3), it, side * 1.1 * widest, Member(role),
                              PARAMS)
     assert free.least < 0.0 < bound.least
     np.testing.assert_allclose(bound.normal, [0.0, -side, 0.0], atol=1e-12)
