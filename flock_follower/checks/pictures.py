@@ -115,8 +115,17 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
     others = sorted({number for picture in pictures for number in picture.markers})
     unseen = f'not in sight in {len(pictures)} images'
+    misprints = [fault for picture in pictures for fault in picture.misprints]
+    refused = [picture for picture in pictures if picture.misprints]
+    outlines = sum(bool(picture.outlines) for picture in pictures)
+    misprint, remedy = misprints[-1][1:] if misprints else ('', '')
     return first(
         'marker', f'{ours}, {NOISY_MARKER_WIDTH:.0f} px, most of the time',
+        (len(refused) > share * len(pictures), ERROR,
+         f'{misprint}, in {len(refused)} of {len(pictures)} images', remedy),
+        (share == 0.0 and outlines, ERROR,
+         f'found in {outlines} of {len(pictures)} images, and no pose suits it', 'glue the print '
+         'on a white margin of one cell; is it flat, the lens calibrated?'),
         (share == 0.0 and bool(others), WARNING,
          f'{unseen}, but {", ".join(map(str, others))}',
          'set marker_id in neighbors_file, or show the right print'),

@@ -58,6 +58,7 @@ from flock_follower.perception.overlay import annotate
 from flock_follower.perception.parameter_table import RELATIVE_POSE as SPECS
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
+from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
@@ -110,6 +111,7 @@ class RelativePose(FlockNode):
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
         self._duplicates: dict[str, tuple[float, Estimate]] = {}
+        self._misprints: dict[str, tuple[float, Fault]] = {}
 
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
@@ -226,6 +228,7 @@ class RelativePose(FlockNode):
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
+        self._misprints.update({name: (now, f) for name, f in sighting.misprints.items()})
         if seen.pixels is not None and image.model is not None and self._shown(camera.name):
             drawn = annotate(seen.pixels, image.model, sighting, self._tracker.config)
             height, width, _ = drawn.shape
@@ -252,6 +255,9 @@ class RelativePose(FlockNode):
         unseen = [f'{n.name} (marker {", ".join(str(m.marker_id) for m in n.markers)} of '
                   f'{self._tracker.config.dictionary})' for n in self._tracker.config.neighbors
                   if now - self._seen[n.name] > UNSEEN_TIMEOUT]
+        for name, (found, fault) in self._misprints.items():
+            if now - found < UNSEEN_TIMEOUT < now - self._seen[name]:
+                return ERROR, f'{name} is not used: {fault.seen}; {fault.remedy}'
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return (WARN, f'not in sight: {", ".join(unseen)}{instead}') if unseen else None

@@ -44,6 +44,8 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.perception.prints import Fault as PrintFault
+from flock_follower.perception.prints import WRONG_BORDER
 from flock_follower.topic_names import OURS, TYPES
 
 LIVE, BAG, BOTH = (True,), (False,), (True, False)
@@ -271,6 +273,13 @@ FAULTS: list[Fault] = [
     Fault('a print with another id', BOTH, WARNING, 'marker',
           'not in sight in 12 images, but 7', 'set marker_id in neighbors_file',
           pictures(markers={7: 40.0})),
+    Fault('a print with a border of two cells', BOTH, ERROR, 'marker',
+          'a black border of 2 cells, in 12 of 12 images', 'print it with a border of one cell',
+          pictures(markers={}, misprints=[PrintFault(
+              WRONG_BORDER, 'marker 0 has a black border of 2 cells',
+              'print it with a border of one cell')])),
+    Fault('a marker that no pose suits', BOTH, ERROR, 'marker', 'found in 12 of 12 images',
+          'white margin', pictures(markers={}, outlines=[0])),
     Fault('no marker in sight', BOTH, WARNING, 'marker', 'not in sight in 12 images',
           'hold the leader before the camera',
           pictures(markers={})),
