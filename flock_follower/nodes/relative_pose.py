@@ -52,6 +52,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WAR
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras import cameras, CameraValues
+from flock_follower.perception.camera import CameraModel, marked_rectified
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
@@ -75,15 +76,16 @@ class _Camera:
         self.dropping_since: float | None = None
         self._last_rejection = ''
         self._node = node
-        node.subscribe(CompressedImage if transport == 'compressed' else Image,
-                       values.images(transport), partial(node.take_image, self), best_effort(),
-                       largest=None)
+        images = node.subscribe(
+            CompressedImage if transport == 'compressed' else Image, values.images(transport),
+            partial(node.take_image, self), best_effort(), largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
                        best_effort())
+        self._images = images.topic_name
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
-        node.diagnostics.checks.append(self._processing_problem)
+        node.diagnostics.checks += [self._processing_problem, self._rectified_problem]
 
     def reject(self, reason: str, detail: str = '') -> None:
         """Count that an image, or something in it, was dropped."""
@@ -96,6 +98,14 @@ class _Camera:
             return None
         return ERROR, (f'no image{self.of} processed for {now - self.dropping_since:.0f} s: '
                        f'{self._last_rejection}')
+
+
+    def _rectified_problem(self, now: float) -> Problem | None:
+        model = self._node.camera_model(self.name)
+        if model is None or not model.distortion.any() or not marked_rectified(self._images):
+            return None  # a rectified camera has no distortion
+        return ERROR, (f'{self._images} is marked as rectified, its camera_info has distortion: '
+                       'start relative_pose and planner with rectified:=true')
 
 
 class RelativePose(FlockNode):
@@ -140,6 +150,10 @@ class RelativePose(FlockNode):
             self.diagnostics.values[key] = size
             self.get_logger().info(f'{key}: {size}')
             self._process_pending()
+
+    def camera_model(self, name: str) -> CameraModel | None:
+        """Return the model of a camera, None before its calibration."""
+        return self._perceiver.model(name)
 
     def _awaited(self) -> bool:
         """Return whether an image, or a range, waits for odometry."""
