@@ -139,7 +139,7 @@ def _needed(seen: Observations, name: str) -> Finding:
     what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
     published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
     connect = offer(RAW_IMAGES if what == 'images' else name, published, [
-        other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)])
+        other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)], seen.live)
     nodes = ', '.join(sorted({end.node for end in topic.publishers}))
     return first(
         what, msgtype.replace('/msg/', '/'),

@@ -374,7 +374,7 @@ FAULTS: list[Fault] = [
           'record again',
           change(incomplete='the disk is full')),
     Fault('images under the name of their driver', BOTH, ERROR, 'images', '/image_raw',
-          f'{CAMERA} holds sensor_msgs/msg/Image: --remap image_raw:={CAMERA}',
+          f'--remap image_raw:={CAMERA}',
           together(moved('image_raw', CAMERA), change(pictures=[], shifts=[]))),
     Fault('no calibration', BOTH, ERROR, 'camera_info', '/camera_info',
           f'--remap camera_info:={CAMERA_INFO}', NO_CALIBRATION),
