@@ -180,6 +180,8 @@ class Observations:
     gaps: list[tuple[float, float, bool]] = field(default_factory=list)
     """Steps in the times of a bag: s after its start, s of the step, whether it interrupts images
     or odometry."""
+    set_back: float = 0.0
+    """By how much the clock was set back while a bag was recorded, s: its messages are mixed."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
 

@@ -58,7 +58,12 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     elif seen.incomplete:
         yield Finding(WARNING, 'bag', f'incomplete: {seen.incomplete}', 'finished',
                       'the part that exists can be used; record again for the rest')
-    if seen.gaps:
+    if seen.set_back:
+        yield Finding(
+            ERROR, 'bag clock', f'the clock was set back by {seen.set_back:.1f} s while the bag '
+            'was recorded: its messages are mixed', 'one clock',
+            'record again, and synchronise the clock before')
+    elif seen.gaps:
         yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
         yield _needed(seen, name)

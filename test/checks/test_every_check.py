@@ -234,6 +234,8 @@ FAULTS: list[Fault] = [
       for what, index in (('frozen', lambda n: 0), ('paired', lambda n: n // 2 * 2))),
     Fault('a bag whose clock was set', (False,), ERROR, 'bag clock', 'jump by +3600.0 s after 2.0',
           'ros2 bag convert', change(gaps=[(0.0, 7e9, False), (2.0, 3600.0, True)])),
+    Fault('a bag whose clock was set back', (False,), ERROR, 'bag clock', 'set back by 30.0 s',
+          'record again', change(set_back=30.0)),
     Fault('a bag that begins with a message without a time', (False,), WARNING, 'bag clock',
           'jump by +7000000000.0 s after 0.0 s', 'synchronise',
           change(gaps=[(0.0, 7e9, False)])),
