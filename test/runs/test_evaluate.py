@@ -334,7 +334,7 @@ def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
 @pytest.mark.usefixtures('undrawn')
 def test_topics_of_other_names_are_taken(
         result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names = {'/image_raw/compressed': '/cam/infra1/image_rect_raw/compressed',
+    names = {'/image_raw/compressed': '/cam/infra1/image_mono/compressed',
              '/camera_info': '/cam/infra1/camera_info', '/odom': '/ov_msckf/odomimu'}
     other = excerpt(tmp_path / 'other', change=lambda message: message._replace(
         topic=names.get(message.topic, message.topic)))
