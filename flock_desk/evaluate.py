@@ -53,7 +53,7 @@ from flock_desk.runs.plots import evaluation_chapters
 from flock_desk.runs.processes import computed
 from flock_desk.runs.report import announce, report
 from flock_desk.runs.summary import evaluation_figures
-from flock_follower.checks.findings import ERROR, ready, WARNING
+from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import parameters_flown, read_parameters
@@ -143,6 +143,9 @@ def evaluated(bag: Path, folder: Path, options: argparse.Namespace) -> BagOutcom
     # Errors first; that the bag is incomplete is a warning of its own.
     findings = [finding for level in (ERROR, WARNING) for finding in evaluation.findings
                 if finding.level == level and finding.what != 'bag']
+    if summary['recall'] == 0.0:  # of no check: another cause than those that it knows
+        findings.append(Finding(ERROR, 'recall', 'no image gave an estimate of a neighbor',
+                                'estimates', 'see the marker row of check, and rejections'))
     lines = [finding.line for finding in findings]
     incomplete = evaluation.bag.incomplete
     warnings = [f'{bag} is incomplete: {incomplete}'] if incomplete else []

@@ -133,6 +133,10 @@ class Listener:
 LONGEST_SILENCE = 10 * NANOSECONDS
 
 
+#: Step by which an image is waited for longer if seconds from the start are too coarse, ns.
+_ROUNDING = 100
+
+
 #: One camera that looks ahead, and whose images are not rectified.
 AHEAD: Final = MappingProxyType({'': ((0.0, 0.0, 0.0), False)})
 
@@ -350,6 +354,8 @@ class Follower:
             self._now = max(self._now, next_time)
             if next_time == times[0]:
                 self._process_due()
+                if self._waited() == next_time:  # seconds are rounded: long after the start
+                    self._now += _ROUNDING
             elif next_time == times[1]:
                 self._silence = None
                 self._tick()

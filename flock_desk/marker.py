@@ -49,6 +49,8 @@ from flock_follower.whole_file import whole_file
 PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}
 #: Sides of a panel, m: the first is seen from 1 to 8 m, the second from 0.3 to 2 m (640x480,
 #: 611 px).
+APRILTAG_NOTE = ("note: the images of AprilTag's own project are these turned by 180 deg; print "
+                 'this file, or hang those upside down')
 DEFAULT_SIDE = 0.16  # m, side of the marker of config/neighbors.yaml
 SIZES = (0.3, 0.06)
 # White around the black border is a cell wide, and no less than this share of the side: OpenCV 4.6
@@ -131,6 +133,8 @@ def _write(options: argparse.Namespace) -> int:
     page = pages[0]
     print(f'{options.output}: page {page.name}, {page.width:g} x {page.height:g} mm',
           file=sys.stderr)
+    if 'APRILTAG' in options.dictionary:
+        print(APRILTAG_NOTE, file=sys.stderr)
     print(neighbors_file(options.dictionary, prints))
     return 0
 

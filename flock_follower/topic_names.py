@@ -35,10 +35,19 @@ TYPES: Final[Mapping[str, str]] = {
     'neighbors': ODOMETRY, 'neighbors/frames': 'std_msgs/msg/Header',
     'command/trajectory': TRAJECTORY, 'planner/state': STATE, 'mavlink_bridge/state': STATE,
     'ranges': RANGE, 'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
-#: Parts of the names of images that show no brightness.
-_NEVER: Final = ('depth', 'disparity', 'confidence')
+#: Parts of the names of images that show no brightness, are drawn by us, or are compressed in
+#: other ways than JPEG and PNG.
+_NEVER: Final = ('depth', 'disparity', 'confidence', 'debug_image', 'zstd', 'ffmpeg', 'theora')
+#: Types of poses that nodes derive odometry from if they come as odometry, the best first.
+POSES: Final = ('geometry_msgs/msg/PoseWithCovarianceStamped', 'geometry_msgs/msg/PoseStamped',
+                'geometry_msgs/msg/TransformStamped', 'tf2_msgs/msg/TFMessage')
+#: Parts of the names of poses that are wanted, or of another body.
+_NO_POSE: Final = ('goal', 'setpoint', 'initialpose', 'target', 'static', 'truth')
+#: The arguments of the launch file by our names of topics.
+_ARGUMENTS: Final = {RAW_IMAGES: 'image', COMPRESSED_IMAGES: 'image', 'camera_info': 'camera_info',
+                     'odom': 'odom'}
 #: Parts of the names of unlikely topics, and of likely ones.
-_UNLIKELY: Final = ('debug', 'theora', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
+_UNLIKELY: Final = ('debug', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
                     'imu_propagate', 'right', 'infra2', 'fisheye2')
 _LIKELY: Final = ('infra1', 'mono', 'left', 'fisheye1', 'gray', 'image_rect', 'odomimu', 'vio',
                   'odom')
@@ -91,22 +100,40 @@ def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
         names[RAW_IMAGES], names[COMPRESSED_IMAGES] = names[COMPRESSED_IMAGES], names[RAW_IMAGES]
 
 
-def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> str:
+def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = (),
+          live: bool = False) -> str:
     """
     Return how to connect a topic that is missing to the likeliest one that is there, or ''.
 
     :param name: ours; ``image_raw`` also stands for the compressed ones.
     :param topics: the type of each topic that is there, by its full name.
     :param taken: topics that have another name of ours already.
+    :param live: whether nodes are to be connected, not a bag.
     """
     msgtypes = (IMAGE, COMPRESSED) if name == RAW_IMAGES else (TYPES[name],)
     found = sorted(
         (full for full, msgtype in topics.items() if msgtype in msgtypes
-         and full not in set(taken) and not any(word in full for word in _NEVER)),
+         and full not in set(taken) and not any(word in full.lower() for word in _NEVER)),
         key=lambda full: (sum(word in full for word in _UNLIKELY),
                           not any(word in full for word in _LIKELY), len(full)))
     if not found:
-        return ''
+        return _offer_pose(topics) if name == 'odom' else ''
     others = f' (or {", ".join(found[1:3])})' if found[1:] else ''
     ours = COMPRESSED_IMAGES if topics[found[0]] == COMPRESSED else name
-    return f'{found[0]} holds {topics[found[0]]}: --remap {ours}:={found[0]}{others}'
+    remap = f'--remap {ours}:={found[0]}{others}'
+    if live and ours in _ARGUMENTS:
+        base = found[0].removesuffix('/compressed')
+        transport = ' image_transport:=compressed' if ours == COMPRESSED_IMAGES else ''
+        remap = f'launch with {_ARGUMENTS[ours]}:={base}{transport}{others}; here {remap}'
+    return f'{found[0]} holds {topics[found[0]]}: {remap}'
+
+
+def _offer_pose(topics: Mapping[str, str]) -> str:
+    """Return how to use the likeliest pose as odometry, or ''."""
+    found = sorted((POSES.index(msgtype), len(full), full) for full, msgtype in topics.items()
+                   if msgtype in POSES and not any(word in full for word in _NO_POSE))
+    if not found:
+        return ''
+    _, _, full = found[0]
+    return (f'{full} holds {topics[full]}: have its source send {ODOMETRY}, or send the poses as '
+            'odometry (examples/pose_as_odometry.py, docs/sensors.md)')

@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+import runpy
 import subprocess
 import sys
 
@@ -68,6 +69,16 @@ def test_a_node_of_ones_own_follows_what_is_replayed(tmp_path: Path) -> None:
         printed = [node.stdout.readline() for _ in range(20)]
         node.kill()
     assert sum('TRACK' in line for line in printed) >= 10, printed
+
+
+def test_a_pose_becomes_odometry_without_a_velocity() -> None:
+    from geometry_msgs.msg import Point, PoseStamped
+    pose = PoseStamped()
+    pose.header.frame_id, pose.header.stamp.sec = 'map', 7
+    pose.pose.position = Point(x=1.0, y=2.0, z=3.0)
+    odometry = runpy.run_path(str(EXAMPLES / 'pose_as_odometry.py'))['as_odometry'](pose)
+    assert (odometry.header, odometry.pose.pose) == (pose.header, pose.pose)
+    assert odometry.child_frame_id == 'base_link'
 
 
 def test_the_workflow_judges_a_bag(tmp_path: Path) -> None:

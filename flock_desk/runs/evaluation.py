@@ -40,6 +40,7 @@ from flock_desk.runs.frame_errors import FrameErrors, Table
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.schedule import Gaps
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
@@ -84,6 +85,7 @@ STATES = tuple(state.value for state in State)
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', True)
 INVALID_ODOMETRY: Final = 'invalid odom'
 IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
+CAMERA_INFO: Final = TYPES['camera_info']
 NEEDED: Final = (RAW_IMAGES, 'camera_info', 'odom')
 TRUTHS: Final = ('truth/odom', 'truth/neighbors')
 #: Where a message with a header goes on after encapsulation and stamp.
@@ -154,20 +156,12 @@ class Evaluation(Listener):
     """
 
     def __init__(self, bag: Bag, values: dict[str, dict[str, Any]], writer: BagWriter) -> None:
-        perception, bridge = values['relative_pose'], values['mavlink_bridge']
-        self.bag, self.writer = bag, writer
-        self.duration = bag.duration_ns / NANOSECONDS
+        perception = values['relative_pose']
+        self.bag, self.writer, self._values = bag, writer, values
         self.params = planner_params(values['planner'])
-        self.perceiver = Perceiver(tracker(perception), max_wait=perception['max_wait'])
-        # Other inputs of the planner, such as require_bridge, are as when the bridge flies it.
-        self.follower = Follower(
-            PlannerLoop(), self.params, Gate(
-                gate_limits(bridge), bridge['velocity_source']),
-            self, empty, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
-            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
-            cameras={camera.name: (camera.rpy, camera.rectified)
-                     for camera in cameras(values['planner'])},
-            cpu_time=time.process_time)
+        self._gaps, self._skipped_ns = Gaps(), 0
+        self._calibrations: dict[str, bytes] = {}
+        self.follower, self.perceiver = self._new_follower()
         self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
         self.own: OwnMotion | None = None
         """Filled for the rules of ``check``."""
@@ -185,7 +179,46 @@ class Evaluation(Listener):
         self.rejections, self.setpoint_kinds, self.brake_reasons = (
             Counter[str](), Counter[str](), Counter[str]())
         self.reasons: list[tuple[float, str]] = []
-        self._calibrations: dict[str, bytes] = {}
+
+    def _new_follower(self) -> tuple[Follower, Perceiver]:
+        """Return a follower without a past, and its perception."""
+        perception, bridge = self._values['relative_pose'], self._values['mavlink_bridge']
+        perceiver = Perceiver(tracker(perception), max_wait=perception['max_wait'])
+        # Other inputs of the planner, such as require_bridge, are as when the bridge flies it.
+        return Follower(
+            PlannerLoop(), self.params, Gate(gate_limits(bridge), bridge['velocity_source']),
+            self, empty, perceiver=perceiver, stream_rate=bridge['stream_rate'],
+            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
+            cameras={camera.name: (camera.rpy, camera.rectified)
+                     for camera in cameras(self._values['planner'])},
+            cpu_time=time.process_time), perceiver
+
+    @property
+    def duration(self) -> float:
+        """Return the length of the bag without its gaps, s."""
+        return (self.bag.duration_ns - self._skipped_ns) / NANOSECONDS
+
+    def begin(self, time: int) -> None:
+        """Begin at a time, ns: the vehicle flies, and the planner is engaged."""
+        self.follower.engage(time, True)
+        self.follower.permit(time, -math.inf)
+        self.follower.vehicle(time, FLYING)
+        calibrations, self._calibrations = self._calibrations, {}
+        for camera, data in calibrations.items():
+            self.take('camera_info', time, CAMERA_INFO, data, camera)
+
+    def pass_gap(self, time: int) -> bool:
+        """
+        Return whether times step before a message recorded at a time, ns: then begin anew.
+
+        What was computed before the step has no meaning after it. The figures leave it out.
+        """
+        if not self._gaps.take(time):
+            return False
+        self.follower.finish()
+        self._skipped_ns = self._gaps.skipped_ns
+        self.follower, self.perceiver = self._new_follower()
+        return True
 
     def take(self, name: str, time: int, msgtype: str, data: bytes, camera: str = '',
              message: Any = None, pixels: GrayImage | None = None) -> None:
@@ -196,7 +229,7 @@ class Evaluation(Listener):
         :param camera: the name of the camera, if there are several.
         :param message: its fields, if they were read; ``pixels`` (H, W), if it was decoded.
         """
-        if name == 'camera_info' and not self._is_new(camera, data[_AFTER_STAMP:]):
+        if name == 'camera_info' and not self._is_new(camera, data):
             return
         try:
             if message is None:
@@ -226,10 +259,10 @@ class Evaluation(Listener):
         elif name == RAW_IMAGES:
             self.follower.image(time, message if pixels is None else pixels, stamp, camera)
 
-    def _is_new(self, camera: str, calibration: bytes) -> bool:
+    def _is_new(self, camera: str, data: bytes) -> bool:
         """Return whether a calibration differs from the last one of its camera; most do not."""
-        before, self._calibrations[camera] = self._calibrations.get(camera), calibration
-        return calibration != before
+        before, self._calibrations[camera] = self._calibrations.get(camera, b''), data
+        return data[_AFTER_STAMP:] != before[_AFTER_STAMP:]
 
     @cached_property
     def tables(self) -> dict[str, Table]:
@@ -259,21 +292,22 @@ class Evaluation(Listener):
 
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
-        self.errors.odometry(state)
+        self.errors.odometry(self._moved(state))
         if self.own is not None and state.stamp < self.bag.start_ns + LONGEST * NANOSECONDS:
             self.own.states.append(state)
 
     def image(self, outcome: ImageOutcome) -> None:
         """Take the outcome of an image."""
         seen, camera = outcome.sighting, outcome.camera
+        stamp = outcome.stamp - self._skipped_ns
         self.errors.models[camera] = self.perceiver.model(camera)
         self.frames += 1
         if seen is None:
-            self.errors.frame(outcome.stamp, {}, {}, camera)
+            self.errors.frame(stamp, {}, {}, camera)
         else:
             self.cpu['decode'].append(outcome.decoding)
             self.cpu[seen.stage].append(outcome.perception)
-            self.errors.frame(outcome.stamp, seen.estimates, seen.stages, camera)
+            self.errors.frame(stamp, seen.estimates, seen.stages, camera)
 
     def tick(self, tick: Tick) -> None:
         """Take the outcome of a tick of the planner."""
@@ -305,7 +339,15 @@ class Evaluation(Listener):
                 self.own.lost, self.own.last_error = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
-        return (nanoseconds - self.bag.start_ns) / NANOSECONDS
+        return (nanoseconds - self._skipped_ns - self.bag.start_ns) / NANOSECONDS
+
+    def _moved(self, state: OdometryState) -> OdometryState:
+        """Return a state with its stamp as if the bag had no gaps."""
+        return state._replace(stamp=state.stamp - self._skipped_ns)
+
+    def truth(self, state: OdometryState, own: bool) -> None:
+        """Take the true state of the follower, or of a neighbor."""
+        self.errors.truth(self._moved(state), own=own)
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
@@ -346,7 +388,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
           system: RecordedSystem | None) -> None:
-    follower, message, pixels, began = evaluation.follower, None, None, False
+    message, pixels, began = None, None, False
     line = LiveLine(sys.stderr)
     line.due(time.monotonic())  # a short bag needs no line
     shown = False
@@ -358,19 +400,17 @@ def _play(bag: Bag, used: Mapping[str, tuple[str, str]], evaluation: Evaluation,
         if system is not None:
             message, pixels = system.take(topic, msgtype, stamp, data)
         name, camera = used.get(topic, ('', ''))
+        began &= not evaluation.pass_gap(stamp)
         if name in TRUTHS:
-            evaluation.errors.truth(
-                from_odometry(read_odometry(data)), own=name == 'truth/odom')
+            evaluation.truth(from_odometry(read_odometry(data)), own=name == 'truth/odom')
         elif name:
             if not began:
                 began = True
-                follower.engage(stamp, True)
-                follower.permit(stamp, -math.inf)
-                follower.vehicle(stamp, FLYING)
+                evaluation.begin(stamp)
             evaluation.take(name, stamp, msgtype, data, camera, message, pixels)
     if shown:
         line.end()
-    follower.finish()
+    evaluation.follower.finish()
 
 
 def _norm(vector: Array | None) -> float:

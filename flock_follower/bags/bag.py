@@ -126,6 +126,23 @@ class Bag(AbstractContextManager['Bag']):
         return int(self.end_ns - self.start_ns)
 
     @property
+    def set_back_ns(self) -> int:
+        """
+        Return by how much the clock was set back while a file was recorded, ns; about 0 if not.
+
+        Messages come in the order of their times: those before and after such a step are mixed.
+        """
+        if isinstance(self._reader, SequentialReader):
+            return self._reader.disorder
+        back = 0
+        for file in _storages(self._reader) or [getattr(self._reader, 'storage', None)]:
+            newest = 0
+            for chunk in sorted(getattr(file, 'chunks', []), key=lambda c: c.chunk_start_offset):
+                newest = max(newest, chunk.message_start_time)
+                back = max(back, newest - chunk.message_start_time)
+        return back
+
+    @property
     def message_count(self) -> int:
         """Return the number of readable messages."""
         return sum(topic.count for topic in self.topics.values())

@@ -72,7 +72,7 @@ class SequentialReader:
         self.start_time, self.end_time = 2**63, 0
         self._files = files
         self._connections: dict[_Channel, Connection] = {}
-        self._disorder = 0  # ns by which a message may be older than one before it in its file
+        self.disorder = 0  # ns by which a message may be older than one before it in its file
 
     @property
     def connections(self) -> list[Connection]:
@@ -95,7 +95,7 @@ class SequentialReader:
                                      'metadata.yaml must say')
                 counts[channel] += 1
                 newest = max(newest, stamp)
-                self._disorder = max(self._disorder, newest - stamp)
+                self.disorder = max(self.disorder, newest - stamp)
                 self.start_time = min(self.start_time, stamp)
                 self.end_time = max(self.end_time, stamp + 1)
         if not counts:
@@ -118,7 +118,7 @@ class SequentialReader:
                 connection = self._connections[channel]
                 if connection.id in wanted and (start or 0) <= stamp < stop:
                     heapq.heappush(held, (stamp, number, connection, data))
-                while held and held[0][0] <= newest - self._disorder:
+                while held and held[0][0] <= newest - self.disorder:
                     yield _stamped(heapq.heappop(held))
             while held:
                 yield _stamped(heapq.heappop(held))

@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 import math
 from typing import Any, Final
 
 import numpy as np
 
-from flock_follower.checks.image_motion import shift, small
+from flock_follower.checks.image_motion import OwnPath, shift, small
 from flock_follower.checks.observations import (
     NodeStatus,
     Observations,
@@ -30,7 +31,12 @@ from flock_follower.checks.observations import (
     TopicSeen,
 )
 from flock_follower.checks.pictures import camera_model
-from flock_follower.geometry import Array
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    R_FLU_OPTICAL,
+)
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds, to_nanoseconds
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.reader import OdometrySource, SourceParams
@@ -38,9 +44,10 @@ from flock_follower.parameters.sections import PARAMETER_FILES
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_image, GrayImage
-from flock_follower.perception.markers import Detections
+from flock_follower.perception.markers import Detections, joined
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
+from flock_follower.perception.prints import turned_print, with_wide_borders, wrong_border
 from flock_follower.perception.search import everywhere
 from flock_follower.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 
@@ -144,7 +151,12 @@ class Collector:
         self._small, self._next_pair = None, arrival + self._pair_period
 
     def finish(self, config: NeighborConfig) -> None:
-        """Read the odometry if that was not done, and search the images for markers."""
+        """
+        Read the odometry if that was not done, and search the images for markers.
+
+        ``sightings`` get a row for each marker of ours whose edges show its position: stamp, s;
+        id; position (3), m, of the marker in the camera (optical).
+        """
         seen, markers = self.observations, config.by_marker()
         if seen.own is None:
             seen.own = read_own_motion(seen, self._odometry)
@@ -154,19 +166,49 @@ class Collector:
             camera = camera_model(seen)
         except ValueError:
             camera = None  # reported with the calibration
+        thoroughly = partial(everywhere, markers=[marker for _, marker in markers.values()])
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary)
-            if not markers.keys() & set(found.ids.tolist()):  # thoroughly, which takes longer
-                found = everywhere(pixels, config.dictionary,
-                                   [marker for _, marker in markers.values()])
-            picture.markers = {
-                int(number): float(np.linalg.norm(corners - np.roll(corners, 1, axis=0),
-                                                  axis=1).mean())
-                for number, corners in zip(found.ids, found.corners)}
+            for search in (thoroughly, with_wide_borders):  # which take longer
+                if not markers.keys() & set(found.ids.tolist()):
+                    found = joined(found, search(pixels, config.dictionary))
+            fits = camera is not None and pixels.shape == (camera.height, camera.width)
+            seen.sightings += self._measure(
+                picture, pixels, camera if fits else None, found, config)
             seen.pictures.append(picture)
-            if camera is not None and pixels.shape == (camera.height, camera.width):
-                seen.sightings += sightings(picture.stamp, pixels, camera, found, config)
         self._kept.clear()
+
+    def _measure(self, picture: Picture, pixels: GrayImage, camera: CameraModel | None,
+                 found: Detections, config: NeighborConfig) -> list[list[float]]:
+        """
+        Enter the markers found in a picture; return their rows of ``sightings``.
+
+        :param camera: None if unknown: then every outline counts as a marker.
+        """
+        rows, by_marker = [], config.by_marker()
+        up = upwards(self.observations, picture.stamp) if len(found.ids) else None
+        for number, corners in zip(found.ids.tolist(), found.corners):
+            side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
+            if number not in by_marker:
+                picture.markers[number] = side
+                continue
+            neighbor, marker = by_marker[number]
+            fault = wrong_border(pixels, corners, config.dictionary, marker)
+            if fault is None and camera is not None:
+                measured = locate(pixels, camera, target(neighbor, config.dictionary),
+                                  neighbor.markers.index(marker), corners, PosePrior(None, up))
+                if measured is None:
+                    picture.outlines.append(number)
+                    continue
+                fault = turned_print(measured.T_camera_body, up, marker)
+                if measured.spacing is not None:
+                    position = (measured.T_camera_body @ marker.T_body_marker).translation
+                    rows.append([picture.stamp, float(number), *position.tolist()])
+            if fault is None:
+                picture.markers[number] = side
+            else:
+                picture.misprints.append(fault)
+        return rows
 
 
 def read_own_motion(seen: Observations, messages: list[tuple[int, Any]]) -> OwnMotion:
@@ -183,21 +225,13 @@ def read_own_motion(seen: Observations, messages: list[tuple[int, Any]]) -> OwnM
     return motion
 
 
-def sightings(stamp: float, image: GrayImage, camera: CameraModel, found: Detections,
-              config: NeighborConfig) -> list[list[float]]:
-    """
-    Return a row for each marker of ours whose edges show its position.
-
-    Stamp, s; id; position (3), m, of the marker in the camera (optical).
-    """
-    rows, by_marker = [], config.by_marker()
-    for number, corners in zip(found.ids.tolist(), found.corners):
-        if number not in by_marker:
-            continue
-        neighbor, marker = by_marker[number]
-        measured = locate(image, camera, target(neighbor, config.dictionary),
-                          neighbor.markers.index(marker), corners, PosePrior())
-        if measured is not None and measured.spacing is not None:
-            position = (measured.T_camera_body @ marker.T_body_marker).translation
-            rows.append([stamp, float(number), *position.tolist()])
-    return rows
+def upwards(seen: Observations, stamp: float) -> Array | None:
+    """Return the upward direction (3,) in the camera's axes at a stamp, s; None if unknown."""
+    states = seen.own.states if seen.own else []
+    if len(states) < 2:
+        return None
+    quaternions, known = OwnPath(states).attitude(np.array([stamp]))
+    rpy = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
+    R_base_optical = quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL
+    up: Array = (quaternion_to_matrix(quaternions[0]) @ R_base_optical)[2]
+    return up if known[0] else None

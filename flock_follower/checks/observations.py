@@ -31,6 +31,7 @@ from flock_follower.checks.reach import Reach
 from flock_follower.geometry import Transform
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.reader import OdometrySource
+from flock_follower.perception.prints import Fault
 from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import COMPRESSED_IMAGES, full_name, RAW_IMAGES
 
@@ -63,8 +64,9 @@ class Picture:
     An image that was searched for markers.
 
     ``brightness`` and ``contrast`` are mean and deviation of its grey levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px; ``fault`` is the reason if it cannot
-    be decoded.
+    ids of the markers found to the length of their sides, px: of a neighbour's only those that
+    gave a measurement. ``outlines`` are the ids of the others, ``misprints`` why they were
+    refused. ``fault`` is the reason if the image cannot be decoded.
     """
 
     stamp: float
@@ -75,6 +77,8 @@ class Picture:
     brightness: float = 0.0
     contrast: float = 0.0
     markers: dict[int, float] = field(default_factory=dict)
+    outlines: list[int] = field(default_factory=list)
+    misprints: list[Fault] = field(default_factory=list)
     fault: str = ''
 
 
@@ -141,7 +145,7 @@ class Observations:
 
     ``names`` maps our names of topics to their full names. ``calibration`` is the newest
     CameraInfo. ``shifts`` are rows of image motion, see ``image_motion.fit_axes``, ``sightings``
-    rows of markers, see ``collector.sightings``. ``parameters`` are those of each of our nodes, by
+    rows of markers, see ``Collector.finish``. ``parameters`` are those of each of our nodes, by
     its plain name.
     """
 
@@ -176,6 +180,8 @@ class Observations:
     gaps: list[tuple[float, float, bool]] = field(default_factory=list)
     """Steps in the times of a bag: s after its start, s of the step, whether it interrupts images
     or odometry."""
+    set_back: float = 0.0
+    """By how much the clock was set back while a bag was recorded, s: its messages are mixed."""
     unreadable: dict[str, str] = field(default_factory=dict)
     """Topics of a bag that cannot be read, and why."""
 

@@ -23,16 +23,13 @@ import numpy as np
 
 from flock_follower.checks.findings import ERROR, Finding, first, OK, WARNING
 from flock_follower.checks.observations import Observations, Picture
-from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.camera import CameraModel, marked_rectified, off_center
 from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
 NOISY_MARKER_WIDTH = 18.0
 #: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
-#: Largest distance of the optical axis from the middle, share of the image: K for images of
-#: twice or half the size is off by 0.5 and 0.25.
-OFF_CENTRE: Final = 0.15
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
 
@@ -77,11 +74,11 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Finding:
     others = sorted({f'{picture.width}x{picture.height}' for picture in pictures} - {size})
     measured = f'{size} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     shares = camera.matrix[:2, 2] / (camera.width, camera.height)
-    straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
+    straight = marked_rectified(seen.names[seen.image_name])
     return first(
         what, wanted,
         (others, ERROR, f'for {size}, images are {"".join(others[:1])}', calibrate),
-        (np.abs(shares - 0.5).max() > OFF_CENTRE and not seen.calibration.roi.width, ERROR,
+        (off_center(shares) and not seen.calibration.roi.width, ERROR,
          f'{measured}, optical axis at {shares[0]:.0%}, {shares[1]:.0%} of the image: K is for '
          'another resolution', calibrate),
         (straight and np.any(camera.distortion), ERROR,
@@ -115,8 +112,17 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     measured = f'{side:.0f} px wide, in {share:.0%} of {len(pictures)} images'
     others = sorted({number for picture in pictures for number in picture.markers})
     unseen = f'not in sight in {len(pictures)} images'
+    misprints = [fault for picture in pictures for fault in picture.misprints]
+    refused = [picture for picture in pictures if picture.misprints]
+    outlines = sum(bool(picture.outlines) for picture in pictures)
+    misprint, remedy = misprints[-1][1:] if misprints else ('', '')
     return first(
         'marker', f'{ours}, {NOISY_MARKER_WIDTH:.0f} px, most of the time',
+        (len(refused) > share * len(pictures), ERROR,
+         f'{misprint}, in {len(refused)} of {len(pictures)} images', remedy),
+        (share == 0.0 and outlines, ERROR,
+         f'found in {outlines} of {len(pictures)} images, and no pose suits it', 'glue the print '
+         'on a white margin of one cell; is it flat, the lens calibrated?'),
         (share == 0.0 and bool(others), WARNING,
          f'{unseen}, but {", ".join(map(str, others))}',
          'set marker_id in neighbors_file, or show the right print'),

@@ -37,6 +37,7 @@ from flock_follower.odometry.reader import OdometrySource, read_odometry, Source
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import load
+from flock_follower.ranges import MAX_GAP
 from flock_follower.topic_names import (
     COMPRESSED_IMAGES,
     images_by_type,
@@ -102,6 +103,8 @@ class RecordedSystem:
         self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
         self._gaps = Gaps()
         self._start_ns = bag.start_ns
+        if bag.set_back_ns > MAX_GAP * NANOSECONDS:
+            self.seen.set_back = bag.set_back_ns / NANOSECONDS
         names[DIAGNOSTICS] = DIAGNOSTICS
         self.topics = {names[name]: name for name, msgtype in READ.items()
                        if names[name] in self.seen.topics

@@ -43,6 +43,8 @@ OTHER_CLOCK: Final = 10.0
 #: s: median of stamps in the future from which on there is a warning, and an error: the clocks
 #: differ. The nodes accept single stamps up to ``messages.FUTURE_TOLERANCE`` ahead.
 CLOCK_AHEAD: Final = (0.003, 0.03)
+#: Share of messages with the stamp of the one before, from which on there is an error.
+REPEATED: Final = 0.1
 #: A topic has stopped if its last message came so long, s, and so many of its longest gaps,
 #: before the newest message of any topic.
 STOPPED: Final = (1.0, 3.0)
@@ -56,7 +58,12 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     elif seen.incomplete:
         yield Finding(WARNING, 'bag', f'incomplete: {seen.incomplete}', 'finished',
                       'the part that exists can be used; record again for the rest')
-    if seen.gaps:
+    if seen.set_back:
+        yield Finding(
+            ERROR, 'bag clock', f'the clock was set back by {seen.set_back:.1f} s while the bag '
+            'was recorded: its messages are mixed', 'one clock',
+            'record again, and synchronise the clock before')
+    elif seen.gaps:
         yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
         yield _needed(seen, name)
@@ -137,7 +144,7 @@ def _needed(seen: Observations, name: str) -> Finding:
     what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
     published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
     connect = offer(RAW_IMAGES if what == 'images' else name, published, [
-        other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)])
+        other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)], seen.live)
     nodes = ', '.join(sorted({end.node for end in topic.publishers}))
     return first(
         what, msgtype.replace('/msg/', '/'),
@@ -192,12 +199,17 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
     ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
     synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
     measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
+    repeated = int(np.count_nonzero(np.diff(np.array(topic.stamps)[stamped]) == 0.0))
     yield first(
         f'{name} latency', f'below {latencies[0]:g} s after its stamp',
         (jumps.size, ERROR,
          f'stamps jump by {jump:+.1f} s against the time they came, after {since:.1f} s',
          'a clock was set meanwhile: synchronise all clocks before the flight (chrony, PTP), and '
          'have the driver stamp by the clock of ROS'),
+        (repeated > REPEATED * len(topic.stamps), ERROR,
+         f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
+         'have the driver stamp each message when it is measured; of a camera that publishes each '
+         'image twice, or of two cameras in one topic, take one'),
         (abs(middle) > OTHER_CLOCK, ERROR,
          f'stamped {abs(middle):.0f} s {"before" if middle > 0.0 else "after"} it came: no stamp, '
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '

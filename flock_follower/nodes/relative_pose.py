@@ -52,12 +52,14 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WAR
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras import cameras, CameraValues
+from flock_follower.perception.camera import CameraModel, marked_rectified
 from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.parameter_table import RELATIVE_POSE as SPECS
 from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
+from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
@@ -74,15 +76,16 @@ class _Camera:
         self.dropping_since: float | None = None
         self._last_rejection = ''
         self._node = node
-        node.subscribe(CompressedImage if transport == 'compressed' else Image,
-                       values.images(transport), partial(node.take_image, self), best_effort(),
-                       largest=None)
+        images = node.subscribe(
+            CompressedImage if transport == 'compressed' else Image, values.images(transport),
+            partial(node.take_image, self), best_effort(), largest=None)
         node.subscribe(CameraInfo, values.camera_info, partial(node.take_camera_info, self),
                        best_effort())
+        self._images = images.topic_name
         self.debug_images = node.create_publisher(
             Image, f'~/debug_image/{values.name}' if values.name else '~/debug_image',
             best_effort())
-        node.diagnostics.checks.append(self._processing_problem)
+        node.diagnostics.checks += [self._processing_problem, self._rectified_problem]
 
     def reject(self, reason: str, detail: str = '') -> None:
         """Count that an image, or something in it, was dropped."""
@@ -95,6 +98,14 @@ class _Camera:
             return None
         return ERROR, (f'no image{self.of} processed for {now - self.dropping_since:.0f} s: '
                        f'{self._last_rejection}')
+
+
+    def _rectified_problem(self, now: float) -> Problem | None:
+        model = self._node.camera_model(self.name)
+        if model is None or not model.distortion.any() or not marked_rectified(self._images):
+            return None  # a rectified camera has no distortion
+        return ERROR, (f'{self._images} is marked as rectified, its camera_info has distortion: '
+                       'start relative_pose and planner with rectified:=true')
 
 
 class RelativePose(FlockNode):
@@ -110,6 +121,7 @@ class RelativePose(FlockNode):
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
         self._duplicates: dict[str, tuple[float, Estimate]] = {}
+        self._misprints: dict[str, tuple[float, Fault]] = {}
 
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
@@ -138,6 +150,10 @@ class RelativePose(FlockNode):
             self.diagnostics.values[key] = size
             self.get_logger().info(f'{key}: {size}')
             self._process_pending()
+
+    def camera_model(self, name: str) -> CameraModel | None:
+        """Return the model of a camera, None before its calibration."""
+        return self._perceiver.model(name)
 
     def _awaited(self) -> bool:
         """Return whether an image, or a range, waits for odometry."""
@@ -226,6 +242,7 @@ class RelativePose(FlockNode):
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
+        self._misprints.update({name: (now, f) for name, f in sighting.misprints.items()})
         if seen.pixels is not None and image.model is not None and self._shown(camera.name):
             drawn = annotate(seen.pixels, image.model, sighting, self._tracker.config)
             height, width, _ = drawn.shape
@@ -252,6 +269,9 @@ class RelativePose(FlockNode):
         unseen = [f'{n.name} (marker {", ".join(str(m.marker_id) for m in n.markers)} of '
                   f'{self._tracker.config.dictionary})' for n in self._tracker.config.neighbors
                   if now - self._seen[n.name] > UNSEEN_TIMEOUT]
+        for name, (found, fault) in self._misprints.items():
+            if now - found < UNSEEN_TIMEOUT < now - self._seen[name]:
+                return ERROR, f'{name} is not used: {fault.seen}; {fault.remedy}'
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return (WARN, f'not in sight: {", ".join(unseen)}{instead}') if unseen else None

@@ -24,6 +24,8 @@ With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (
 - plumb_bob, D = (k1, k2, p1, p2, k3), and rational_polynomial, D = (k1, ..., k3, k4, k5, k6):
   g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
   x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2), y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y;
+  four more coefficients s1, ..., s4 add s1 r^2 + s2 r^4 to x', s3 r^2 + s4 r^4 to y' (a thin
+  prism), and two more tilt the sensor about x by tx, about y by ty, rad;
 - equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
   (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
 
@@ -34,6 +36,7 @@ otherwise.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -42,14 +45,28 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
-#: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``).
+#: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``);
+#: rational_polynomial may have 12 or 14.
 DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 #: Focal lengths as a share of the image's longer side, beyond what any lens has (the widest
 #: fisheye 0.2): outside, K is in other units, or noise.
 FOCAL_LENGTH_RANGE = (0.02, 1000.0)
+#: Largest distance of the optical axis from the middle, share of the image: K for images of
+#: twice or half the size is off by 0.5 and 0.25.
+OFF_CENTER = 0.15
 _SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalised coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
+
+
+def off_center(shares: Array) -> bool:
+    """Return whether the optical axis at shares (2,) of width and height is far off the middle."""
+    return bool(np.abs(shares - 0.5).max() > OFF_CENTER)
+
+
+def marked_rectified(topic: str) -> bool:
+    """Return whether a topic's name says that its images are rectified, of any transport."""
+    return bool({'rect', 'rectified'}.intersection(re.split('[/_]', topic.lower())))
 
 
 class CameraModel:
@@ -87,6 +104,9 @@ class CameraModel:
         # x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y').
         self._aside: Array | None = np.array(
             [[3.0 * p2, p1], [p2, 3.0 * p1], [2.0 * p1, 2.0 * p2]]) if p1 or p2 else None
+        # Of rational_polynomial: the thin prism, (4,), and the tilt of the sensor, (3, 3).
+        self._prism = self.distortion[8:12] if self.distortion[8:12].any() else None
+        self._tilt = _tilt(*self.distortion[12:14]) if self.distortion[12:14].any() else None
         radii = np.linspace(0.0, _RADIUS_LIMIT, 2001)
         falling = np.flatnonzero(~(np.diff(radii * self._scale(radii**2)[0]) > 0.0))
         self.radius = float(radii[falling[0]]) if falling.size else _RADIUS_LIMIT
@@ -128,6 +148,14 @@ class CameraModel:
             raise ValueError(
                 f'roi = {width}x{height}+{x_offset}+{y_offset}, binning {binning_x}x{binning_y}: '
                 f'must lie inside {self.width}x{self.height}')
+        binning, size = np.array([binning_x, binning_y]), np.array([self.width, self.height])
+        shares = self.matrix[:2, 2] / size
+        if (max(binning_x, binning_y) > 1 and (width, height) == (self.width, self.height)
+                and off_center(shares) and not off_center(shares * binning)):
+            raise ValueError(
+                f'binning {binning_x}x{binning_y}, optical axis at {shares[0]:.0%}, '
+                f'{shares[1]:.0%} of the image: K is binned already; camera_info must have K, '
+                'width and height of the full image, or those of the binned one and binning 0')
         # A binned pixel's centre lies half a binned pixel from its edge: shift, scale, shift.
         matrix = self.matrix.copy()
         matrix[:2, 2] += 0.5 - np.array([x_offset, y_offset])
@@ -172,14 +200,19 @@ class CameraModel:
             products[:, :2] = squares
             np.multiply(xy[:, 0], xy[:, 1], out=products[:, 2])
             distorted += products.dot(self._aside)
+        if self._prism is not None:
+            s1, s2, s3, s4 = self._prism
+            distorted += r2[:, None] * np.column_stack([s1 + s2 * r2, s3 + s4 * r2])
+        if self._tilt is not None:
+            tilted = distorted @ self._tilt[:, :2].T + self._tilt[:, 2]
+            distorted = tilted[:, :2] / tilted[:, 2:]
         pixels: Array = distorted.dot(self._transposed)
         pixels += self._middle
         return pixels
 
     def linear_map(self, x: float, y: float) -> Array:
         """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
-        over_x, over_xy, over_y = self._slopes(x, y)
-        mapped: Array = self.matrix[:2, :2].dot(np.array([[over_x, over_xy], [over_xy, over_y]]))
+        mapped: Array = self.matrix[:2, :2].dot(np.array(self._slopes(x, y)).reshape(2, 2))
         return mapped
 
     def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
@@ -190,9 +223,8 @@ class CameraModel:
         """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         xy, depth = self._normalized(p)
-        over_x, over_xy, over_y = self._slopes(xy[:, 0], xy[:, 1])
         by_point = np.empty((len(p), 2, 3))
-        by_xy = np.moveaxis(np.array([[over_x, over_xy], [over_xy, over_y]]), 2, 0)
+        by_xy = np.array(self._slopes(xy[:, 0], xy[:, 1])).T.reshape(-1, 2, 2)
         by_point[:, :, :2] = self.matrix[:2, :2] @ by_xy
         by_point[:, :, 2] = -(by_point[:, :, :2] * xy[:, None]).sum(axis=2)
         by_point /= depth[:, :, None]
@@ -214,11 +246,11 @@ class CameraModel:
             error = (pixels - self.distort(xy)) @ inverse
             if not np.any(np.abs(error) > 1e-13):
                 break
-            a, b, d = self._slopes(xy[:, 0], xy[:, 1])
-            determinant = a * d - b * b
+            a, b, c, d = self._slopes(xy[:, 0], xy[:, 1])
+            determinant = a * d - b * c
             determinant = np.where(determinant > 1e-12, determinant, np.inf)
             xy += np.stack([d * error[:, 0] - b * error[:, 1],
-                            a * error[:, 1] - b * error[:, 0]], axis=1) / determinant[:, None]
+                            a * error[:, 1] - c * error[:, 0]], axis=1) / determinant[:, None]
         xy[~(np.max(np.abs(error), axis=1, initial=0.0) < 1e-10)] = np.nan
         return xy
 
@@ -240,7 +272,7 @@ class CameraModel:
         k1, k2, _, _, k3, *rational = self.distortion.tolist()
         g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)) if k3 else 1.0 + r2 * (k1 + r2 * k2)
         if rational:
-            k4, k5, k6 = rational
+            k4, k5, k6 = rational[:3]
             g = g / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         return g
 
@@ -262,18 +294,53 @@ class CameraModel:
         g = self._radial(r2)
         dg = k1 + r2 * (2 * k2 + r2 * (3 * k3))
         if rational:
-            k4, k5, k6 = rational
+            k4, k5, k6 = rational[:3]
             m = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
             dg = (dg - g * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / m
         return g, dg
 
-    def _slopes(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Return d x' / dx, d x' / dy = d y' / dx, and d y' / dy at (x, y)."""
+    def _slopes(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+        """Return d x' / dx, d x' / dy, d y' / dx and d y' / dy at (x, y)."""
         p1, p2 = self._tangential
         g, dg = self._scale(x * x + y * y)
-        return (g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x,
-                2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y),
-                g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x)
+        across = 2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y)
+        slopes = (g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x, across, across,
+                  g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x)
+        if self._prism is None and self._tilt is None:
+            return slopes
+        return self._rare_slopes(x, y, g, slopes)
+
+    def _rare_slopes(self, x: Any, y: Any, g: Any, slopes: tuple[Any, Any, Any, Any]
+                     ) -> tuple[Any, Any, Any, Any]:
+        """Return the slopes with a thin prism and a tilted sensor."""
+        (p1, p2), r2 = self._tangential, x * x + y * y
+        s1, s2, s3, s4 = (0.0,) * 4 if self._prism is None else self._prism
+        a, b, c, d = slopes
+        by_x, by_y = 2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)
+        a, b, c, d = a + by_x * x, b + by_x * y, c + by_y * x, d + by_y * y
+        if self._tilt is None:
+            return a, b, c, d
+        u = x * g + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + s2 * r2)
+        v = y * g + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + s4 * r2)
+        (m, n, o), (q, r, s), (t, w, z) = self._tilt.tolist()
+        depth = t * u + w * v + z
+        across, down = (m * u + n * v + o) / depth, (q * u + r * v + s) / depth
+        m, n, q, r = ((m - t * across) / depth, (n - w * across) / depth,
+                      (q - t * down) / depth, (r - w * down) / depth)
+        return m * a + n * c, m * b + n * d, q * a + r * c, q * b + r * d
+
+
+def _tilt(tx: float, ty: float) -> Array:
+    """Return the homography (3, 3) onto a sensor tilted about x and then y, rad, as OpenCV's."""
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tx), np.sin(tx)],
+                        [0.0, -np.sin(tx), np.cos(tx)]])
+    about_y = np.array([[np.cos(ty), 0.0, -np.sin(ty)], [0.0, 1.0, 0.0],
+                        [np.sin(ty), 0.0, np.cos(ty)]])
+    turned = about_y @ about_x
+    onto = np.array([[turned[2, 2], 0.0, -turned[0, 2]], [0.0, turned[2, 2], -turned[1, 2]],
+                     [0.0, 0.0, 1.0]])
+    homography: Array = onto @ turned
+    return homography
 
 
 def _reshaped(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
@@ -304,6 +371,6 @@ def _checked_distortion(distortion: ArrayLike, model: str) -> Array:
     # Simulators leave D empty; OpenCV writes plumb_bob without k3.
     if d.size == 0 or (model == 'plumb_bob' and d.size == 4):
         d = np.append(d, np.zeros(count - d.size))
-    if d.size != count:
+    if d.size != count and not (model == 'rational_polynomial' and d.size in (12, 14)):
         raise ValueError(f'D has {d.size} elements: {model} takes {count}')
     return d

@@ -112,11 +112,15 @@ GrayImage = NDArray[np.uint8]
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     'mono8': (1, None),
     '8UC1': (1, None),
+    '8UC3': (3, cv2.COLOR_BGR2GRAY),
+    '8UC4': (4, cv2.COLOR_BGRA2GRAY),
+    'nv12': (1, None),  # rows of brightness, then those of color
+    'nv21': (1, None),
+    'nv24': (1, None),
     'bgr8': (3, cv2.COLOR_BGR2GRAY),
     'rgb8': (3, cv2.COLOR_RGB2GRAY),
     'bgra8': (4, cv2.COLOR_BGRA2GRAY),
     'rgba8': (4, cv2.COLOR_RGBA2GRAY),
-    'mono16': (2, None),  # narrowed to 8 bits by decode()
     'yuv422': (2, cv2.COLOR_YUV2GRAY_UYVY),
     'uyvy': (2, cv2.COLOR_YUV2GRAY_UYVY),
     'yuv422_yuy2': (2, cv2.COLOR_YUV2GRAY_YUY2),
@@ -126,6 +130,12 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     'bayer_gbrg8': (1, cv2.COLOR_BayerGR2GRAY),
     'bayer_grbg8': (1, cv2.COLOR_BayerGB2GRAY),
 }
+#: Encodings of 16 bits by those of 8 bits to which decode() narrows them.
+_WIDE: dict[str, str] = {
+    'mono16': 'mono8', 'bgr16': 'bgr8', 'rgb16': 'rgb8', 'bgra16': 'bgra8', 'rgba16': 'rgba8',
+    **{f'bayer_{pattern}16': f'bayer_{pattern}8' for pattern in ('rggb', 'bggr', 'gbrg', 'grbg')}}
+_ENCODINGS |= {wide: (2 * _ENCODINGS[narrow][0], _ENCODINGS[narrow][1])
+               for wide, narrow in _WIDE.items()}
 
 
 def compute_in_one_thread() -> None:
@@ -173,8 +183,9 @@ def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool
                          f'step {step} takes at least {needed}')
     stride = step if height > 1 else width * size  # the step of a single row has no meaning
     rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (stride, 1))
-    if encoding == 'mono16':
-        return _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
+    if encoding in _WIDE:
+        rows = _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
+        size //= 2
     if conversion is None:
         return rows
     pixels = np.ascontiguousarray(rows if size == 1 else rows.reshape(height, width, size))
@@ -191,15 +202,14 @@ def decode_compressed(data: Any) -> GrayImage:
     payload = np.frombuffer(data, dtype=np.uint8)
     file_size(payload.tobytes())
     # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(payload, flags)
     except cv2.error:
         image = None
     if image is None:
         raise ValueError(f'compressed image of {payload.size} bytes: cannot be decoded')
-    gray: GrayImage = image
-    return gray
+    return image if image.dtype == np.uint8 else _narrowed(image)
 
 
 def _narrowed(pixels: Any) -> GrayImage:

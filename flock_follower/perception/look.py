@@ -39,6 +39,7 @@ from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
 from flock_follower.perception.pose import refine
+from flock_follower.perception.prints import Fault
 from flock_follower.perception.time_offset import MountedCamera
 
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
@@ -167,7 +168,8 @@ class Sighting:
     not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
     for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
     by names made of the neighbours', are the states of candidates measured in this image that
-    carry a neighbour's marker and are not its primary track.
+    carry a neighbour's marker and are not its primary track. ``misprints``: why the marker of a
+    neighbour, by its name, was found and refused.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -176,6 +178,7 @@ class Sighting:
     rejections: list[tuple[str, str]] = field(default_factory=list)
     other_ids: list[int] = field(default_factory=list)
     duplicates: dict[str, Estimate] = field(default_factory=dict)
+    misprints: dict[str, Fault] = field(default_factory=dict)
 
     @property
     def stages(self) -> dict[str, str]:

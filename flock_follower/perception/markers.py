@@ -52,6 +52,12 @@ class Detections(NamedTuple):
     corners: Array
 
 
+def joined(*found: Detections) -> Detections:
+    """Return all the markers of several searches."""
+    return Detections(np.concatenate([each.ids for each in found]),
+                      np.concatenate([each.corners for each in found]))
+
+
 NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
 
@@ -132,13 +138,14 @@ def dictionary_words(dictionary: str) -> NDArray[np.bool_]:
                      for marker_id in range(dictionary_size(dictionary))])
 
 
-def detect(image: GrayImage, dictionary: str) -> Detections:
+def detect(image: GrayImage, dictionary: str, border: int = 1) -> Detections:
     """
     Return the markers of one dictionary in a grey image (H, W) uint8, contiguous.
 
+    :param border: cells of the black border; prints with one more are found, too.
     :raises ValueError: for an unknown dictionary.
     """
-    book, cv_params = _dictionary(dictionary), _cv_params()
+    book, cv_params = _dictionary(dictionary), _cv_params(border)
     if _MODERN:
         found = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
     else:
@@ -159,8 +166,8 @@ def outwards(corners: Array, by: float) -> Array:
     return moved
 
 
-@lru_cache(maxsize=1)
-def _cv_params() -> Any:
+@lru_cache(maxsize=4)
+def _cv_params(border: int) -> Any:
     cv_params = (_cv_aruco.DetectorParameters() if _MODERN
                  else _cv_aruco.DetectorParameters_create())
     # One threshold instead of three takes a third of the time.
@@ -169,6 +176,7 @@ def _cv_params() -> Any:
     # Read a cell by its middle, finely sampled: blur and noise blend its rim with the next cell's.
     cv_params.perspectiveRemovePixelPerCell = 8
     cv_params.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    cv_params.markerBorderBits = border
     cv_params.cornerRefinementMethod = _cv_aruco.CORNER_REFINE_NONE
     return cv_params
 

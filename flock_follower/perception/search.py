@@ -95,19 +95,20 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
 
 
 def everywhere(image: GrayImage, dictionary: str,
-               markers: Sequence[Marker] | None = None) -> Detections:
+               markers: Sequence[Marker] | None = None, border: int = 1) -> Detections:
     """
     Return the markers in an image.
 
     :param markers: those to look for thoroughly; None: all of the dictionary, quickly.
+    :param border: of a quick search, see ``markers.detect``.
     """
     height, width = image.shape
-    return _search(image, (0, 0, width, height), 0.5 if width >= LARGE else 1.0, dictionary,
-                   markers)
+    scale = 0.5 if width >= LARGE else 1.0
+    return _search(image, (0, 0, width, height), scale, dictionary, markers, border)
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,
-            markers: Sequence[Marker] | None) -> Detections:
+            markers: Sequence[Marker] | None, border: int = 1) -> Detections:
     x0, y0, x1, y1 = region
     part = image[y0:y1, x0:x1]
     if scale != 1.0:
@@ -115,7 +116,8 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
         part = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1.0
                           else cv2.INTER_LINEAR)
     part = np.ascontiguousarray(part)
-    found = detect(part, dictionary) if markers is None else _read(part, dictionary, markers)
+    found = (detect(part, dictionary, border) if markers is None
+             else _read(part, dictionary, markers))
     # Pixel centres are whole numbers: half a pixel off before scaling, and after.
     scales = np.array([part.shape[1] / (x1 - x0), part.shape[0] / (y1 - y0)])
     corners: Array = (found.corners + 0.5) / scales - 0.5 + np.array([x0, y0])

@@ -45,7 +45,7 @@ from flock_follower.geometry import (
 from flock_follower.messages import duplicate_name
 from flock_follower.neighbors_file import NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
-from flock_follower.perception import search
+from flock_follower.perception import prints, search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
@@ -294,6 +294,8 @@ class Tracker:
                 self._locate(search.everywhere(image, dictionary, markers if thorough else None),
                              'full', image, look)
                 camera.thorough = not thorough
+        if any(self._filters[name].newest is None for name in look.missing):
+            self._locate(prints.with_wide_borders(image, dictionary), 'full', image, look)
         look.sighting.stage, camera.searched = 'full', look.stamp
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look) -> None:
@@ -307,9 +309,17 @@ class Tracker:
             name = neighbor.name
             if name not in look.expected or look.shown(corners, name, marker):
                 continue
-            measurement = locate(image, look.model, self._targets[name],
-                                 neighbor.markers.index(marker), corners, look.expected[name])
-            if measurement is None:
+            expected = look.expected[name]
+            fault = prints.wrong_border(image, corners, self.config.dictionary, marker)
+            measurement = None if fault else locate(
+                image, look.model, self._targets[name], neighbor.markers.index(marker), corners,
+                expected)
+            if measurement is not None:
+                fault = prints.turned_print(measurement.T_camera_body, expected.up, marker)
+            if fault is not None:
+                look.sighting.rejections.append((fault.reason, f'{fault.seen}: {fault.remedy}'))
+                look.sighting.misprints[name] = fault
+            elif measurement is None:
                 look.sighting.rejections.append(
                     ('no pose suits the marker', f'{name}, {marker_id}'))
             else:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import copy
 import fcntl
+from functools import partial
 import math
 import os
 from pathlib import Path
@@ -44,6 +45,8 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.perception.prints import Fault as PrintFault
+from flock_follower.perception.prints import WRONG_BORDER
 from flock_follower.topic_names import OURS, TYPES
 
 LIVE, BAG, BOTH = (True,), (False,), (True, False)
@@ -145,6 +148,14 @@ def stamped(name: str, seconds: float) -> Change:
         stamps=[stamp + seconds for stamp in seen.topic(name).stamps])
 
 
+def stamped_as(index: Callable[[int], int]) -> Change:
+    """Return a change of the stamps of images to those of other images, by their numbers."""
+    def make(seen: Observed) -> None:
+        stamps = seen.topic('image_raw').stamps
+        seen.topic('image_raw').stamps = [stamps[index(n)] for n in range(len(stamps))]
+    return make
+
+
 def mounted(*degrees: float) -> Change:
     """Return a change of the camera's roll, pitch, yaw on the body, deg."""
     R = quaternion_to_matrix(quaternion_from_rpy(*map(math.radians, degrees)))
@@ -218,8 +229,13 @@ FAULTS: list[Fault] = [
             set_clock(topic, share, step))
       for what, name, topic in (('camera', 'images', 'image_raw'), ('VIO', 'odom', 'odom'))
       for share, step in ((0.01, 3600.0), (0.5, -3600.0), (0.99, -11.0))),
+    *(Fault(f'{what} stamps', BOTH, ERROR, 'images latency',
+            'have the stamp of the message before', 'when it is measured', stamped_as(index))
+      for what, index in (('frozen', lambda n: 0), ('paired', lambda n: n // 2 * 2))),
     Fault('a bag whose clock was set', (False,), ERROR, 'bag clock', 'jump by +3600.0 s after 2.0',
           'ros2 bag convert', change(gaps=[(0.0, 7e9, False), (2.0, 3600.0, True)])),
+    Fault('a bag whose clock was set back', (False,), ERROR, 'bag clock', 'set back by 30.0 s',
+          'record again', change(set_back=30.0)),
     Fault('a bag that begins with a message without a time', (False,), WARNING, 'bag clock',
           'jump by +7000000000.0 s after 0.0 s', 'synchronise',
           change(gaps=[(0.0, 7e9, False)])),
@@ -271,6 +287,13 @@ FAULTS: list[Fault] = [
     Fault('a print with another id', BOTH, WARNING, 'marker',
           'not in sight in 12 images, but 7', 'set marker_id in neighbors_file',
           pictures(markers={7: 40.0})),
+    Fault('a print with a border of two cells', BOTH, ERROR, 'marker',
+          'a black border of 2 cells, in 12 of 12 images', 'print it with a border of one cell',
+          pictures(markers={}, misprints=[PrintFault(
+              WRONG_BORDER, 'marker 0 has a black border of 2 cells',
+              'print it with a border of one cell')])),
+    Fault('a marker that no pose suits', BOTH, ERROR, 'marker', 'found in 12 of 12 images',
+          'white margin', pictures(markers={}, outlines=[0])),
     Fault('no marker in sight', BOTH, WARNING, 'marker', 'not in sight in 12 images',
           'hold the leader before the camera',
           pictures(markers={})),
@@ -353,7 +376,7 @@ FAULTS: list[Fault] = [
           'record again',
           change(incomplete='the disk is full')),
     Fault('images under the name of their driver', BOTH, ERROR, 'images', '/image_raw',
-          f'{CAMERA} holds sensor_msgs/msg/Image: --remap image_raw:={CAMERA}',
+          f'--remap image_raw:={CAMERA}',
           together(moved('image_raw', CAMERA), change(pictures=[], shifts=[]))),
     Fault('no calibration', BOTH, ERROR, 'camera_info', '/camera_info',
           f'--remap camera_info:={CAMERA_INFO}', NO_CALIBRATION),
@@ -427,11 +450,13 @@ FAULTS: list[Fault] = [
           'no answer about COM_OF_LOSS_T', '', bridge('parameters unread', 'COM_OF_LOSS_T')),
     Fault('an older bridge', LIVE, UNMEASURED, 'ready for offboard', 'not reported', '',
           lambda seen: seen.statuses['mavlink_bridge'].values.pop('offboard would be refused')),
-    Fault('rectified images, and rectified false', BOTH, ERROR, 'calibration',
-          'but the topic is marked as rectified', 'rectified:=true',
-          together(moved('image_raw', '/image_rect'),
-                   lambda seen: seen.names.update(image_raw='/image_rect'),
-                   change(lambda seen: seen.calibration, d=[0.1, 0.0, 0.0, 0.0, 0.0]))),
+    *(Fault(f'rectified false with {topic}', BOTH, ERROR, 'calibration',
+            'but the topic is marked as rectified', 'rectified:=true',
+            together(moved('image_raw', topic),
+                     partial(lambda topic, seen: seen.names.update(image_raw=topic), topic),
+                     change(lambda seen: seen.calibration, d=[0.1, 0.0, 0.0, 0.0, 0.0])))
+      for topic in ('/image_rect', '/camera/image_rect/compressed', '/camera/image_rect_color',
+                    '/zed/left/rect/image/compressed')),
     Fault('a node missing, and one whose name is a part of its name', LIVE, ERROR, 'nodes',
           'not running: relative_pose', 'ros2 launch',
           lambda seen: vars(seen).update(nodes=['/pose', *(

@@ -28,6 +28,7 @@ from flock_follower.topic_names import (
     names_there,
     offer,
     parse_remaps,
+    POSES,
 )
 
 D435I = {
@@ -52,6 +53,31 @@ def test_compressed_images_are_offered_under_their_name_and_depth_never() -> Non
     assert offer('image_raw', {'/cam/image/compressed': COMPRESSED}).endswith(
         ': --remap image_raw/compressed:=/cam/image/compressed')
     assert offer('image_raw', {'/camera/depth/image': IMAGE}) == ''
+
+
+@pytest.mark.parametrize('better', ['/cam/image/compressed', '/cam/some_long_name/compressed'])
+@pytest.mark.parametrize('worse', [
+    '/cam/image/zstd', '/cam/image/compressedDepth', '/relative_pose/debug_image'])
+def test_images_that_cannot_be_used_are_not_offered(better: str, worse: str) -> None:
+    kind = IMAGE if worse.endswith('debug_image') else COMPRESSED
+    assert offer('image_raw', {worse: kind}) == ''
+    assert worse not in offer('image_raw', {worse: kind, better: COMPRESSED})
+
+
+def test_running_nodes_are_connected_by_arguments_of_the_launch() -> None:
+    assert ': launch with image:=/cam/image;' in offer(
+        'image_raw', {'/cam/image': IMAGE}, live=True)
+    assert ': launch with image:=/cam/image image_transport:=compressed;' in offer(
+        'image_raw', {'/cam/image/compressed': COMPRESSED}, live=True)
+    assert ': launch with odom:=/vio/odom;' in offer('odom', {'/vio/odom': ODOMETRY}, live=True)
+
+
+@pytest.mark.parametrize('msgtype', POSES)
+def test_a_pose_is_named_if_there_is_no_odometry(msgtype: str) -> None:
+    poses = {'/goal_pose': POSES[0], '/vio/pose': msgtype, '/scan': 'sensor_msgs/msg/LaserScan'}
+    assert offer('odom', poses).startswith(f'/vio/pose holds {msgtype}')
+    assert '/vio/odom' in offer('odom', {**poses, '/vio/odom': ODOMETRY})
+    assert offer('odom', {'/goal_pose': POSES[0]}) == ''
 
 
 def test_remaps_are_ours_first_as_in_ros() -> None:

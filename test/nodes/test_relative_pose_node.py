@@ -247,6 +247,14 @@ def test_what_is_corrupt_is_dropped_counted_and_explained(
     assert r.found and r.problems() == ''
 
 
+def test_distorted_images_of_a_rectified_topic_are_named(rig: Callable[..., Rig]) -> None:
+    images = {'camera.left.image': 'left/image_rect', 'image_transport': 'compressed'}
+    assert 'rectified:=true' in rig(**TWO, **images).problems()
+    assert 'rectified:=true' not in rig(
+        **TWO, **images, **{'camera.left.rectified': True}).problems()
+    assert 'rectified:=true' not in rig(**TWO).problems()
+
+
 def test_the_debug_image_is_drawn_only_while_someone_looks(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()

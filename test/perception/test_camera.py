@@ -83,6 +83,28 @@ def test_pixels_no_ray_reaches_are_nan_and_spoil_no_others() -> None:
     assert np.isnan(xy[2]).all()
 
 
+@pytest.mark.parametrize('count', [12, 14])
+def test_thin_prism_and_tilted_sensor_agree_with_opencv(count: int) -> None:
+    plain, points = make_camera('rational_polynomial'), points_ahead()
+    more = [0.02, -0.01, 0.015, 0.02, 0.05, -0.03][:count - 8]
+    camera = CameraModel(plain.matrix, [*plain.distortion, *more], plain.model, 640, 480)
+    expected, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.matrix,
+                                    camera.distortion)
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(camera.undistort(camera.project(points)),
+                               points[:, :2] / points[:, 2:], atol=1e-9)
+    differences = np.stack([(camera.project(points + n) - camera.project(points - n)) / 2e-6
+                            for n in 1e-6 * np.eye(3)], axis=2)
+    np.testing.assert_allclose(camera.linearize(points)[1], differences, rtol=1e-5, atol=1e-3)
+
+
+def test_a_matrix_that_is_binned_already_is_refused() -> None:
+    half = make_camera(width=640, height=480).scaled(0, 0, 640, 480, 2, 2).matrix
+    full = CameraModel(half, [], 'plumb_bob', 640, 480)
+    with pytest.raises(ValueError, match='binned already'):
+        full.scaled(0, 0, 640, 480, 2, 2)
+
+
 def test_rectified_image_uses_p_without_distortion() -> None:
     P = np.array([[500.0, 0.0, 300.0, -40.0], [0.0, 500.0, 200.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     camera = CameraModel.from_calibration(

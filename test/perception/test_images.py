@@ -120,6 +120,30 @@ def test_impossible_images_are_refused_by_name(arguments: tuple, message: str) -
         decode(*arguments)
 
 
+@pytest.mark.parametrize('encoding', ['rgb16', 'bgra16', 'bayer_grbg16'])
+def test_colors_of_16_bits_become_their_brightness(encoding: str) -> None:
+    channels = {'rgb16': 3, 'bgra16': 4}.get(encoding, 1)
+    pixels = np.full((12, 10, channels), 3 << 8, dtype='>u2')
+    pixels[0, 0] = 2**10 - 1  # 10 bits in use
+    gray = decode_array(encoding, pixels, True)
+    assert gray.shape == (12, 10)
+    np.testing.assert_allclose(gray[4:, 4:], 192, atol=1)
+
+
+@pytest.mark.parametrize('encoding', ['nv12', 'nv21'])
+def test_planes_of_color_after_the_brightness_are_left_out(encoding: str) -> None:
+    data = GRAY.tobytes() + bytes(60)
+    np.testing.assert_array_equal(decode(encoding, 12, 10, 10, False, data), GRAY)
+
+
+@pytest.mark.parametrize('bits', [10, 16])
+def test_png_of_16_bits_keeps_the_highest_bits_in_use(bits: int) -> None:
+    values = GRAY.astype(np.uint16) << (bits - 8)
+    values[0, 0] = 2**bits - 1
+    gray = decode_compressed(cv2.imencode('.png', values)[1].tobytes())
+    np.testing.assert_array_equal(gray[1:], GRAY[1:])
+
+
 @pytest.mark.parametrize('extension', ['.png', '.jpg'])
 def test_compressed_images_are_decoded(extension: str) -> None:
     smooth = cv2.GaussianBlur(np.kron(GRAY, np.ones((8, 8), dtype=np.uint8)), (0, 0), 4.0)
@@ -130,7 +154,8 @@ def test_compressed_images_are_decoded(extension: str) -> None:
 
 
 ENCODINGS = ['mono8', '8UC1', 'bgr8', 'rgb8', 'bgra8', 'rgba8', 'mono16', 'yuv422', 'uyvy',
-             'yuv422_yuy2', 'yuyv', 'bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8']
+             '8UC3', 'nv12', 'rgb16', 'bayer_rggb16', 'yuv422_yuy2',
+             'yuyv', 'bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8']
 SIZES = st.integers(-2, 40) | st.sampled_from([2**16, 2**31, 2**32 - 1, 2**63, 2**70])
 
 

@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flock_desk.marker import Box, draw, layout, main, Page, PAGES
+from flock_desk.marker import APRILTAG_NOTE, Box, draw, layout, main, Page, PAGES
 from flock_follower.files import resource
 from flock_follower.geometry import Array
 from flock_follower.perception import markers as neighbors
@@ -223,3 +223,10 @@ def test_without_options_it_is_the_marker_of_the_page(
     for arguments in ([], ['--output', 'marker.pdf']):
         assert main(arguments) == 0
         assert (capsys.readouterr().out, (tmp_path / 'marker.pdf').read_bytes()) == expected
+
+
+def test_apriltags_are_printed_with_the_way_up_of_others(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for dictionary, noted in (('DICT_APRILTAG_36h11', True), ('DICT_4X4_50', False)):
+        assert main(['--dictionary', dictionary, '--output', str(tmp_path / 'marker.pdf')]) == 0
+        assert (APRILTAG_NOTE in capsys.readouterr().err) is noted

@@ -1,0 +1,127 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Whether a marker in an image is the print that the file describes: its border, and which way up.
+
+Both look like the configured marker to a fit. A print with a border of two cells (Kalibr's) is
+fitted at a wrong distance. A print that is turned by a quarter or half turn gives a body that
+leans by as much, and a position that is wrong by its distance from the marker.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array, rotation_vector_to_matrix, rpy_from_matrix, Transform
+from flock_follower.neighbors_file import Marker
+from flock_follower.perception.images import GrayImage, grey_levels
+from flock_follower.perception.markers import Detections, joined, marker_code
+from flock_follower.perception.search import everywhere
+
+#: Cells of the black border that are told apart; the first is that of our prints.
+BORDERS = (1, 2, 3)
+#: Each border, and how far inside its outline, cells, a detector may find one: if black is wide, a
+#: threshold taken from the surroundings leaves only its rim dark.
+_OUTLINES = tuple((border, 0.5 * half) for border in BORDERS for half in range(2 * border))
+#: Samples along a cell, either way: where edges are tells borders apart.
+_SAMPLES = 3
+#: Least correlation of an image with a print of another border.
+_MIN_LIKENESS = 0.7
+#: Correlation with ours from which on no other border is tried.
+_OURS = 0.95
+#: The other border must leave unexplained (1 - correlation) this share at most of what ours does.
+_MAX_LEFT = 0.8
+#: A neighbour that leans by more, rad, carries a turned print, or is about to crash.
+MAX_LEAN = math.radians(60.0)
+WRONG_BORDER, TURNED = 'print with another border', 'print turned'
+#: Reasons why a marker is refused although it was found.
+REASONS = (WRONG_BORDER, TURNED)
+
+
+def border_cells(image: GrayImage, corners: Array, dictionary: str, marker_id: int) -> int:
+    """Return the width of a marker's black border, cells; ``corners`` (4, 2), px, outline it."""
+    code = marker_code(dictionary, marker_id)[1:-1, 1:-1]
+    likeness = []
+    for border, inside in _OUTLINES:
+        printed = np.kron(np.pad(code, border), np.ones((_SAMPLES, _SAMPLES))).ravel()
+        cells = len(code) + 2 * border
+        near, far = inside, cells - inside
+        square = np.array([[near, near], [far, near], [far, far], [near, far]], dtype=np.float32)
+        rows, columns = (np.mgrid[:_SAMPLES * cells, :_SAMPLES * cells] + 0.5) / _SAMPLES
+        middles = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        to_image = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
+        seen = grey_levels(image, cv2.perspectiveTransform(middles[None], to_image)[0])
+        likeness.append(float(np.corrcoef(seen, printed)[0, 1]) if seen.std() > 0.0 else 0.0)
+        if likeness[0] > _OURS:
+            break
+    best = int(np.argmax(likeness))
+    clear = likeness[best] > _MIN_LIKENESS and (
+        1.0 - likeness[best] < _MAX_LEFT * (1.0 - likeness[0]))
+    return _OUTLINES[best][0] if clear else BORDERS[0]
+
+
+class Fault(NamedTuple):
+    """Why a marker is refused although it was found: one of REASONS, what is seen, the remedy."""
+
+    reason: str
+    seen: str
+    remedy: str
+
+
+def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Marker
+                 ) -> Fault | None:
+    """Return the fault of a detected marker's border, or None."""
+    cells = border_cells(image, corners, dictionary, marker.marker_id)
+    return None if cells == BORDERS[0] else Fault(
+        WRONG_BORDER, f'marker {marker.marker_id} has a black border of {cells} cells',
+        f'print it with a border of one cell: marker --dictionary {dictionary}')
+
+
+def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
+    """Return the markers with a border of two or three cells, and some with one."""
+    return joined(*(everywhere(image, dictionary, border=border) for border in BORDERS[1:]))
+
+
+def lean(R_camera_body: Array, up: Array) -> float:
+    """Return by how much a body leans, rad; ``up`` (3,) as in ``PosePrior``."""
+    return math.acos(min(max(float(R_camera_body[:, 2] @ up), -1.0), 1.0))
+
+
+def mounted_turned(marker: Marker, quarters: int) -> Array:
+    """Return the rotation of a marker on its body, (3, 3), turned left by quarters of a turn."""
+    turned: Array = marker.T_body_marker.rotation @ rotation_vector_to_matrix(
+        [0.0, 0.0, 0.5 * math.pi * quarters])
+    return turned
+
+
+def turned_print(pose: Transform, up: Array | None, marker: Marker) -> Fault | None:
+    """Return the fault of a marker whose carrier does not fly upright, or None."""
+    angle = 0.0 if up is None else lean(pose.rotation, up)
+    if up is None or angle <= MAX_LEAN:
+        return None
+    R_camera_marker = pose.rotation @ marker.T_body_marker.rotation
+    leans = [lean(R_camera_marker @ mounted_turned(marker, k).T, up) for k in range(4)]
+    best = int(np.argmin(leans))
+    seen = f'the carrier of marker {marker.marker_id} leans by {math.degrees(angle):.0f} deg'
+    if leans[best] > MAX_LEAN:
+        return Fault(TURNED, seen,
+                     'correct rpy in neighbors_file, camera_rpy, or the axes of odom')
+    rpy = ', '.join(f'{value:.4f}' for value in rpy_from_matrix(mounted_turned(marker, best)))
+    return Fault(TURNED, seen, f'turn the print by {min(best, 4 - best) * 90} deg, or set its rpy '
+                 f'to [{rpy}]')
