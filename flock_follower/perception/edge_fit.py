@@ -65,8 +65,7 @@ _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_VARIANCE = 1e-9  # px^2: to divide by
 #: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
-_ONES = np.ones(2)
-_DIFFERENCE = np.array([1.0, -1.0])
+_ONES, _DIFFERENCE = np.ones(2), np.array([1.0, -1.0])
 
 
 def _correlation() -> Any:
@@ -98,17 +97,21 @@ class Found(NamedTuple):
     known: tuple[Any, Any]
 
 
-def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
+          bloom: Array) -> Found | None:
     """
     Return where brightness rises most steeply along each line's normal.
 
     None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
-    across edges of either axis.
+    across edges of either axis; ``bloom`` (2,), px, as far as it is known.
     """
-    model = lines.model
+    model, pixels, swollen = lines.model, lines.pixels, None
     step = np.array(spacing, dtype=np.float32)[model.axis]
     along = lines.normals * step[:, None]
-    profiles = _sample(image, lines.pixels, along, max(spacing))
+    if max(map(abs, bloom.tolist())) > SWOLLEN:
+        swollen = model.bloom.dot(bloom)
+        pixels = pixels + swollen[:, None] * lines.normals
+    profiles = _sample(image, pixels, along, max(spacing))
     if profiles is None:
         return None
     slope = profiles.dot(_CORRELATION)
@@ -126,6 +129,8 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found
             or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
         return None
     offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
+    if swollen is not None:
+        offsets += swollen
     first, second = ((found & one).nonzero()[0] for one in model.across)
     return Found(offsets, found, (-top / bend) * (step * step), (first, second))
 
@@ -215,6 +220,13 @@ def _matched(lines: Lines, blur: list[float]) -> tuple[float, float]:
     return first, second
 
 
+def _reaching(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
+    """Return the spacing, px, with which edges are within reach although bloom shifts them."""
+    first, second = (each + shift / _HALF if shift > SWOLLEN else each
+                     for each, shift in zip(spacing, np.abs(bloom).tolist()))
+    return first, second
+
+
 def _searching(lines: Lines) -> tuple[float, float]:
     """Return the spacing, px, at which edges half a cell away are still within reach."""
     first, second = (max(cell / (2 * _HALF), SPACING[0]) for cell in lines.narrowest)
@@ -226,6 +238,7 @@ MIN_INLIERS, MAX_RMS = 0.5, 0.4
 #: An edge is in place if the fit explains it to within this, px, or three times the RMS.
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
+SWOLLEN = 0.7  # px: edges that bloom shifts by more are looked for where it shifts them
 _FLOOR = 0.03  # px: least standard deviation of an edge's place
 #: The error of a step grows with its square, and falls with the marker's size: if the square is
 #: more than this times the narrowest cell, px, edges are looked for again;
@@ -238,7 +251,7 @@ _SETTLED = 2.0  # the last step may be so many times as long: no edges are looke
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
 _BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
-_UNKNOWN = np.full(2, _FLOOR**2)
+_UNKNOWN, _NO_BLOOM = np.full(2, _FLOOR**2), np.zeros(2)
 _PRIOR = np.diag([0.0] * 6 + [_SIGMA_BLOOM**-2] * 2)
 
 
@@ -279,12 +292,12 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
     :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
         by four times as much.
     """
-    pose, last = start, None
+    pose, last, bloom = start, None, _NO_BLOOM
     lines = project(camera, model, start)
     if lines is not None and spacing is None:
         spacing = _searching(lines)
     for count in range(_PASSES):
-        found = None if lines is None or spacing is None else _find(image, lines, spacing)
+        found = None if lines is None or spacing is None else _find(image, lines, spacing, bloom)
         if lines is None or spacing is None or found is None:
             return None
         found, widths = _apart(lines, found)
@@ -293,7 +306,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if step is None or not turn < LONGEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
-        lines = lines.moved(step.step, step.explained)
+        lines, bloom = lines.moved(step.step, step.explained), step.step[6:]
         blur = [math.sqrt(max(width**2 - (_KERNEL_SIGMA * each)**2, 0.0))
                 for width, each in zip(widths, spacing)]
         suited = _matched(lines, blur)
@@ -305,7 +318,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if settled or count == _PASSES - 1:
             if not settled and farthest * farthest > _SETTLED**2 * near:
                 return None
-            return _fitted(pose, lines, found, step, suited)
+            return _fitted(pose, lines, found, step, _reaching(suited, bloom))
         spacing = suited
         # A fit to a part of the edges must not exclude the others.
         last = step if clear else None

@@ -68,6 +68,9 @@ GATE = 16.27
 WILD = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
+#: An attitude is wrong if so many measurements in a row contradict it, for so long, s: so that at
+#: a low rate of images a track turns round as soon as at a high one.
+LEAST_TURNED, TURNED_FOR = 3, 0.19
 #: Nearer than this, m, a distance has no direction.
 NEAREST = 0.01
 #: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
@@ -123,7 +126,7 @@ class NeighborFilter:
         self.newest: Estimate | None = None
         """The state at the newest measurement; None if there is no track."""
         self._predicted: Estimate | None = None  # from that, to the time last requested
-        self._turned = 0  # measurements in a row whose attitude was not used
+        self._turned: list[float] = []  # stamps of those in a row whose attitude was not used
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
         self._line = _CENTRE  # on which the last distance was measured
@@ -232,8 +235,8 @@ class NeighborFilter:
             solved, gain = cv2.solve(spread, across)
         if not solved:
             return UpdateOutcome.OUTLIER
-        self._turned = 0 if plausible else self._turned + 1
-        if self._turned >= self.params.max_rejections:
+        self._turned = [] if plausible else [*self._turned, stamp]
+        if self._contradicted(stamp):
             return self._start(stamp, T_odom_body, reference, covariance, expected)
         self._learn(stamp - now.stamp, innovation, nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
@@ -244,6 +247,12 @@ class NeighborFilter:
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
+
+    def _contradicted(self, stamp: float) -> bool:
+        """Return whether measurements have contradicted the attitude for long enough."""
+        count = len(self._turned)
+        return count >= self.params.max_rejections or (
+            count >= LEAST_TURNED and stamp - self._turned[0] >= TURNED_FOR)
 
     def _learn(self, dt: float, innovation: Array, covariance: Array) -> None:
         """Learn from an innovation (6,), or (3,) of the position only, dt, s, after another."""

@@ -183,7 +183,7 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         look.sighting.stage = 'track'
         for name in look.near:
-            self._measure(look, name, track(
+            self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
                 look.camera.spacings[name], look.camera.unchecked[name] == 0))
         for name, expected in self._candidates(look):
@@ -243,19 +243,21 @@ class Tracker:
         """Return the time of a neighbour's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
-    def _measure(self, look: Look, name: str, found: Measurement | None) -> None:
+    def _measure(self, image: GrayImage, look: Look, name: str,
+                 found: Measurement | None) -> None:
         """Take the measurement of a neighbour near its expected place, if it was found there."""
         if found is None:
             return
         if self._of_candidate(look, found):
             look.others.append(found)
             return
+        found = look.told(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
         unchecked = look.camera.unchecked
-        if unchecked[name]:
+        if found.margin is not None:
+            unchecked[name] = MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
+        elif unchecked[name]:
             unchecked[name] -= 1
-        elif found.margin is not None and found.margin > MARGIN:
-            unchecked[name] = MIRRORED_EVERY - 1
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""

@@ -217,6 +217,17 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
     assert np.linalg.norm(e[3:6]) < 0.3
 
 
+@pytest.mark.parametrize(('rate', 'images'), [(30.0, 6), (15.0, 4), (10.0, 3), (7.0, 3)])
+def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: int) -> None:
+    tracker, period = NeighborFilter(), 1.0 / rate
+    for k in range(20):
+        update(tracker, k * period, mirrored(measured(truth(k * period))))
+    outcomes = [update(tracker, k * period, measured(truth(k * period)))
+                for k in range(20, 20 + images)]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * (images - 1) + [UpdateOutcome.STARTED]
+    assert (images - 1) * period < 0.3
+
+
 @pytest.mark.parametrize(('t', 'outcome'), [
     (1.9, UpdateOutcome.LATE), (2.0, UpdateOutcome.LATE), (3.0, UpdateOutcome.USED),
     (4.5, UpdateOutcome.STARTED), (0.1, UpdateOutcome.STARTED)])  # a gap; a jump back in time
