@@ -34,7 +34,7 @@ import numpy as np
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
+from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN, SWOLLEN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
@@ -70,6 +70,11 @@ FOUND_INLIERS = 0.8
 #: If more than this share of the edges agrees, to within this RMS, px, none of them is smeared: if
 #: the code is not shown, either they are not of the marker, or something covers it.
 SHARP = 0.7, 0.15
+#: Share of the variances of errors alike from image to image, if edges are blurred by more than
+#: this share of a cell (1 sigma), shifted by more than SWOLLEN, or fewer than this share agree.
+ALIKE, BLURRED, PLAIN_INLIERS = 0.8, 0.2, 0.9
+#: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
+RUN_TOGETHER = 0.25
 #: So many samples of a smeared print count to decide between two attitudes. Most of what is left
 #: are errors of the model, which are alike for neighboring samples.
 SMEAR_DEGREES = 40.0
@@ -154,8 +159,12 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         if found is not None:  # from afar it may have settled early
             found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
             check_mirrored = True
-    if found is None:
-        return None if sharp else _smeared(image, camera, sought, expected)
+    blurred = found is not None and (
+        found.blur > RUN_TOGETHER and len(found.lines.model.codes) == 1)
+    smeared = _smeared(image, camera, sought, expected, check_mirrored) if blurred or (
+        found is None and not sharp) else None
+    if smeared is not None or found is None:
+        return smeared
     return _of_edges(image, camera, sought, found, expected, spacing, check_mirrored)
 
 
@@ -207,7 +216,7 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
     """Return a neighbour by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    return _of_smears(image, camera, sought, index, fits, expected) if fits else None
+    return _of_smears(image, camera, sought, index, fits, expected, True) if fits else None
 
 
 class _Shown(NamedTuple):
@@ -244,6 +253,11 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
     return _Shown(found if found is not None and _shown(image, found, True).all() else None)
 
 
+def _plain(found: EdgeFit) -> bool:
+    """Return whether edges have no errors that last: by a smear, over-exposure or a reflex."""
+    return found.blur < BLURRED and found.bloom < SWOLLEN and found.inliers > PLAIN_INLIERS
+
+
 def _sharp(found: EdgeFit) -> bool:
     share, rms = SHARP
     return found.inliers > share and found.rms < rms
@@ -259,22 +273,22 @@ def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
     return None
 
 
-def _smeared(image: GrayImage, camera: CameraModel, sought: Target,
-             expected: PosePrior) -> Measurement | None:
+def _smeared(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
+             check_mirrored: bool) -> Measurement | None:
     """Return a neighbour one of whose markers is smeared, near its expected place, or None."""
     assert expected.pose is not None
     for k in np.flatnonzero(facing(sought.model, expected.pose)).tolist():
         found = fit_smeared(image, camera, sought.smears[k], expected.pose)
         if found is not None:
-            return _of_smears(image, camera, sought, k, [found], expected)
+            return _of_smears(image, camera, sought, k, [found], expected, check_mirrored)
     return None
 
 
 def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-               fits: list[SmearFit], expected: PosePrior) -> Measurement:
+               fits: list[SmearFit], expected: PosePrior, check_mirrored: bool) -> Measurement:
     """Return the measurement of the likelier of both attitudes, of fits to one or both of them."""
     marker, model = sought.neighbor.markers[index], sought.smears[index]
-    if len(fits) == 1:
+    if len(fits) == 1 and check_mirrored:
         found = fits[0]
         start = mirrored(found.pose, found.pose.apply(marker.T_body_marker.translation[None])[0],
                          marker.T_body_marker.rotation[:, 2])
@@ -285,9 +299,10 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, index: int
     best = choose([Hypothesis(each.pose, SMEAR_DEGREES * (each.rms / least)**2, each)
                    for each in fits], expected)
     found = best.chosen.fit
-    return widened(Measurement(
+    measurement = Measurement(
         sought.neighbor.name, found.pose, marker.T_body_marker.translation,
-        found.covariance * WIDENING**2, found.rms, None), best)
+        found.covariance * WIDENING**2, found.rms, None, alike=ALIKE)
+    return widened(measurement, best) if check_mirrored else measurement
 
 
 def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
@@ -367,5 +382,6 @@ def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measure
         off = NARROW * math.exp(2.0 - cell) * found.center
         covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
-        sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing)
+        sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing,
+        alike=0.0 if _plain(found) else ALIKE)
     return measurement if best is None else widened(measurement, best)

@@ -85,7 +85,7 @@ class _Placed(NamedTuple):
     A measurement in the smooth frame of ``OdometryBuffer``, with the view at its exposure.
 
     The exposure was at ``exposed`` by the camera's clock, and at ``time`` by the filter's, s;
-    ``covariance`` (6, 6) is as ``NeighborFilter.update`` takes it.
+    ``covariance`` (6, 6) and ``alike`` are as ``NeighborFilter.update`` takes them.
     """
 
     view: View
@@ -93,6 +93,7 @@ class _Placed(NamedTuple):
     time: float
     T_smooth_body: Transform
     covariance: Array
+    alike: Array | None
 
 
 class Tracker:
@@ -203,7 +204,7 @@ class Tracker:
                 name = measurement.name
                 self._report(look, measurement, placed, self._hypotheses[name].take(
                     placed.time, placed.T_smooth_body, measurement.reference, placed.covariance,
-                    name in look.sighting.estimates))
+                    name in look.sighting.estimates, placed.alike))
         return look.sighting
 
     def _sought(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Sought | Missing:
@@ -347,8 +348,9 @@ class Tracker:
         turn[:3, :3] = place * view.T_smooth_camera.rotation
         turn[3:, 3:] = attitude * view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
+        alike = measurement.alike * covariance if measurement.alike else None
         covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
-        return _Placed(view, exposed, time, T_smooth_body, covariance)
+        return _Placed(view, exposed, time, T_smooth_body, covariance, alike)
 
     def _report(self, look: Look, measurement: Measurement, placed: _Placed, taken: Taken) -> None:
         """Add the outcome of a measurement to the sighting, and learn from it."""

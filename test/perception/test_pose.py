@@ -211,6 +211,16 @@ def test_the_wrong_branch_is_left_where_the_marker_is_smeared(
     assert known(found.margin) > 9.0
 
 
+@pytest.mark.parametrize(('cells', 'blurred'), [(0.1, False), (1.0, True)])
+def test_a_print_whose_edges_run_together_is_fitted_whole(cells: float, blurred: bool) -> None:
+    marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
+    motion = cells * SIDE / 6.0 * SMALL.matrix[0, 0] / 1.2
+    found = tracked(render(SMALL, {0: marker}, motion=(motion, 0.0)), SMALL, LEADER, body(marker))
+    assert (found.spacing is None) is blurred
+    assert (found.alike > 0.0) is blurred
+    assert np.linalg.norm(error(found, body(marker))[3:]) < 0.05
+
+
 def test_clear_edges_whose_code_is_hidden_are_not_taken_for_a_smear(
         monkeypatch: pytest.MonkeyPatch) -> None:
     marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
