@@ -158,7 +158,9 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
             image, camera, sought.model, start, None)
         if found is not None:  # from afar it may have settled early
             found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
-            check_mirrored = True
+    if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
+        again = fit(image, camera, found.lines.model, found.pose)
+        found = again if again is not None and again.inliers > found.inliers else found
     blurred = found is not None and (
         found.blur > RUN_TOGETHER and len(found.lines.model.codes) == 1)
     smeared = _smeared(image, camera, sought, expected, check_mirrored) if blurred or (
