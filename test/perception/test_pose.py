@@ -204,7 +204,7 @@ def test_the_wrong_branch_is_left_where_the_marker_is_smeared(
     stuck = known(fit_smeared(image, SMALL, LEADER.smears[0], wrong))
     turned = stuck.pose.rotation @ truth.rotation.T
     assert np.linalg.norm(matrix_to_rotation_vector(turned)) > 0.5  # a minimum of its own
-    found = tracked(image, SMALL, LEADER, wrong)
+    found = tracked(image, SMALL, LEADER, wrong, True)
     assert found.spacing is None
     assert np.linalg.norm(error(found, truth)[3:]) < 0.1
     assert chi2(found, truth) < 22.5
