@@ -39,6 +39,7 @@ from flock_follower.perception.edges import (
     Lines,
     moved,
     normal_covariance,
+    profiles_across,
     project,
     solve_normal,
 )
@@ -53,7 +54,6 @@ _REACH = 2 * _HALF  # likewise of a profile
 _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
 _STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
-_LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
 _MIN_SLOPE = 1.0  # grey levels per px: weaker edges are ignored
 #: Fainter edges, as a share of the median slope, are ignored. Those in a shadow have 0.2 of it;
 #: those of cells narrower than _NARROW, px, are faint because they run into one another.
@@ -65,8 +65,7 @@ _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_VARIANCE = 1e-9  # px^2: to divide by
 #: Indices one inside the range: a maximum at its rim is no peak, and has only one neighbour.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
-_ONES = np.ones(2)
-_DIFFERENCE = np.array([1.0, -1.0])
+_ONES, _DIFFERENCE = np.ones(2), np.array([1.0, -1.0])
 
 
 def _correlation() -> Any:
@@ -98,17 +97,21 @@ class Found(NamedTuple):
     known: tuple[Any, Any]
 
 
-def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float],
+          bloom: Array) -> Found | None:
     """
     Return where brightness rises most steeply along each line's normal.
 
     None if too few edges, or too faint ones, are there. ``spacing``, px, between samples
-    across edges of either axis.
+    across edges of either axis; ``bloom`` (2,), px, as far as it is known.
     """
-    model = lines.model
+    model, pixels, swollen = lines.model, lines.pixels, None
     step = np.array(spacing, dtype=np.float32)[model.axis]
     along = lines.normals * step[:, None]
-    profiles = _sample(image, lines.pixels, along, max(spacing))
+    if max(map(abs, bloom.tolist())) > SWOLLEN:
+        swollen = model.bloom.dot(bloom)
+        pixels = pixels + swollen[:, None] * lines.normals
+    profiles = profiles_across(image, pixels, along, _STEPS, max(spacing))
     if profiles is None:
         return None
     slope = profiles.dot(_CORRELATION)
@@ -126,51 +129,10 @@ def _find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found
             or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
         return None
     offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
+    if swollen is not None:
+        offsets += swollen
     first, second = ((found & one).nonzero()[0] for one in model.across)
     return Found(offsets, found, (-top / bend) * (step * step), (first, second))
-
-
-def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any:
-    """
-    Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
-
-    The image's edge repeats outside. None if hardly anything is inside. ``widest`` is the
-    longest step, px.
-    """
-    # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
-    height, width = image.shape
-    reach = _REACH * widest + 2.0
-    places = pixels.T.copy()
-    low_x, low_y = (_LEAST(places, axis=1) - reach).tolist()
-    high_x, high_y = (_MOST(places, axis=1) + reach).tolist()
-    left, top = max(int(low_x), 0), max(int(low_y), 0)
-    right, bottom = min(int(high_x) + 1, width), min(int(high_y) + 1, height)
-    if right - left < 2 or bottom - top < 2:
-        return None
-    stride = right - left
-    part = image[top:bottom, left:right].astype(np.float32).ravel()
-    count = len(pixels)
-    starts = np.empty((2, count, 2), dtype=np.float32)
-    starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
-    starts[:, :, 1] = along.T
-    at = starts.reshape(-1, 2).dot(_STEPS).reshape(2, count, -1)
-    x, y = at
-    if low_x < 0.0 or low_y < 0.0 or high_x > width or high_y > height:
-        np.clip(x, 0.0, np.float32(stride - 1.001), out=x)
-        np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
-    whole = np.floor(at)
-    at -= whole
-    column, index = whole.astype(np.intp)  # other integers would be turned into these
-    index *= stride
-    index += column
-    next_row = part[stride:]
-    above, below = part.take(index), next_row.take(index)
-    above += x * (part[1:].take(index) - above)
-    below += x * (next_row[1:].take(index) - below)
-    below -= above
-    below *= y
-    below += above
-    return below
 
 
 def _apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
@@ -215,6 +177,13 @@ def _matched(lines: Lines, blur: list[float]) -> tuple[float, float]:
     return first, second
 
 
+def _reaching(spacing: tuple[float, float], bloom: Array) -> tuple[float, float]:
+    """Return the spacing, px, with which edges are within reach although bloom shifts them."""
+    first, second = (each + shift / _HALF if shift > SWOLLEN else each
+                     for each, shift in zip(spacing, np.abs(bloom).tolist()))
+    return first, second
+
+
 def _searching(lines: Lines) -> tuple[float, float]:
     """Return the spacing, px, at which edges half a cell away are still within reach."""
     first, second = (max(cell / (2 * _HALF), SPACING[0]) for cell in lines.narrowest)
@@ -226,6 +195,7 @@ MIN_INLIERS, MAX_RMS = 0.5, 0.4
 #: An edge is in place if the fit explains it to within this, px, or three times the RMS.
 INLIER = 0.4
 _SIGMA_BLOOM = 0.35  # px, of either shift
+SWOLLEN = 0.7  # px: edges that bloom shifts by more are looked for where it shifts them
 _FLOOR = 0.03  # px: least standard deviation of an edge's place
 #: The error of a step grows with its square, and falls with the marker's size: if the square is
 #: more than this times the narrowest cell, px, edges are looked for again;
@@ -238,7 +208,7 @@ _SETTLED = 2.0  # the last step may be so many times as long: no edges are looke
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
 _BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
-_UNKNOWN = np.full(2, _FLOOR**2)
+_UNKNOWN, _NO_BLOOM = np.full(2, _FLOOR**2), np.zeros(2)
 _PRIOR = np.diag([0.0] * 6 + [_SIGMA_BLOOM**-2] * 2)
 
 
@@ -250,7 +220,9 @@ class EdgeFit(NamedTuple):
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
     vector r in R_true = exp(r) R. ``rms`` is that of the residuals, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
-    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found.
+    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found;
+    ``blur`` is that, a share of the narrowest cell, and ``bloom`` the shift, px, both of the axis
+    with more.
     """
 
     pose: Transform
@@ -261,6 +233,8 @@ class EdgeFit(NamedTuple):
     degrees: float
     inliers: float
     spacing: tuple[float, float]
+    blur: float
+    bloom: float
     lines: Lines
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
@@ -280,11 +254,12 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         by four times as much.
     """
     pose, last = start, None
+    bloom: Array = _NO_BLOOM
     lines = project(camera, model, start)
     if lines is not None and spacing is None:
         spacing = _searching(lines)
     for count in range(_PASSES):
-        found = None if lines is None or spacing is None else _find(image, lines, spacing)
+        found = None if lines is None or spacing is None else _find(image, lines, spacing, bloom)
         if lines is None or spacing is None or found is None:
             return None
         found, widths = _apart(lines, found)
@@ -293,7 +268,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if step is None or not turn < LONGEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
-        lines = lines.moved(step.step, step.explained)
+        lines, bloom = lines.moved(step.step, step.explained), step.step[6:]
         blur = [math.sqrt(max(width**2 - (_KERNEL_SIGMA * each)**2, 0.0))
                 for width, each in zip(widths, spacing)]
         suited = _matched(lines, blur)
@@ -305,7 +280,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if settled or count == _PASSES - 1:
             if not settled and farthest * farthest > _SETTLED**2 * near:
                 return None
-            return _fitted(pose, lines, found, step, suited)
+            return _fitted(pose, lines, found, step, suited, blur)
         spacing = suited
         # A fit to a part of the edges must not exclude the others.
         last = step if clear else None
@@ -315,7 +290,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
-            spacing: tuple[float, float]) -> EdgeFit | None:
+            spacing: tuple[float, float], blur: list[float]) -> EdgeFit | None:
     """Return the fit that ends with a step, None if it is poor or leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
@@ -329,7 +304,9 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
     weights = last.weights / last.variance[lines.model.axis]
     return EdgeFit(
         pose, lines.center, covariance[:6, :6], rms, float(weights.dot(last.squares)) / degrees,
-        degrees, inliers, spacing, lines, last.residual, weights)
+        degrees, inliers, _reaching(spacing, last.step[6:]),
+        max(width / cell for width, cell in zip(blur, lines.narrowest)),
+        float(np.abs(last.step[6:]).max()), lines, last.residual, weights)
 
 
 class _Step(NamedTuple):

@@ -33,6 +33,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import EdgeModel
 
 #: How much more uncertain, in variance, all unknowns together may be than each would be alone.
@@ -42,6 +43,7 @@ _CHOLESKY = cv2.DECOMP_CHOLESKY
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
 _DIVERGED = 1e4  # m: a fit that leads beyond, or to NaN, has diverged
+_LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
 _ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
@@ -176,3 +178,47 @@ def _scale(along: Array, examples: tuple[int, int], depth: float) -> tuple[float
     (ax, ay), (bx, by) = (along[k].tolist() for k in examples)
     area = abs(ax * by - ay * bx) / depth
     return area / max(math.hypot(ax, ay), 1e-9), area / max(math.hypot(bx, by), 1e-9)
+
+
+def profiles_across(image: GrayImage, pixels: Array, along: Array, steps: Any,
+                    widest: float) -> Any:
+    """
+    Return the brightness (n, s) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
+
+    The image's edge repeats outside. None if hardly anything is inside. ``steps`` (2, s) are ones,
+    and the numbers of steps; ``widest`` is the longest step, px.
+    """
+    # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
+    height, width = image.shape
+    reach = steps.shape[1] // 2 * widest + 2.0
+    places = pixels.T.copy()
+    low_x, low_y = (_LEAST(places, axis=1) - reach).tolist()
+    high_x, high_y = (_MOST(places, axis=1) + reach).tolist()
+    left, top = max(int(low_x), 0), max(int(low_y), 0)
+    right, bottom = min(int(high_x) + 1, width), min(int(high_y) + 1, height)
+    if right - left < 2 or bottom - top < 2:
+        return None
+    stride = right - left
+    part = image[top:bottom, left:right].astype(np.float32).ravel()
+    count = len(pixels)
+    starts = np.empty((2, count, 2), dtype=np.float32)
+    starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
+    starts[:, :, 1] = along.T
+    at = starts.reshape(-1, 2).dot(steps).reshape(2, count, -1)
+    x, y = at
+    if low_x < 0.0 or low_y < 0.0 or high_x > width or high_y > height:
+        np.clip(x, 0.0, np.float32(stride - 1.001), out=x)
+        np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
+    whole = np.floor(at)
+    at -= whole
+    column, index = whole.astype(np.intp)  # other integers would be turned into these
+    index *= stride
+    index += column
+    next_row = part[stride:]
+    above, below = part.take(index), next_row.take(index)
+    above += x * (part[1:].take(index) - above)
+    below += x * (next_row[1:].take(index) - below)
+    below -= above
+    below *= y
+    below += above
+    return below

@@ -162,7 +162,7 @@ class Hypotheses:
         return nearest if nearest.distance(time, place) < least else None
 
     def take(self, time: float, measured: Transform, reference: Array, covariance: Array,
-             another: bool = False) -> Taken:
+             another: bool = False, alike: Array | None = None) -> Taken:
         """
         Take in a body's pose; see ``NeighborFilter.update``.
 
@@ -176,7 +176,8 @@ class Hypotheses:
         candidate = self.candidate_at(time, measured.translation)
         arguments = time, measured, reference, covariance
         if candidate is None:
-            outcome = UpdateOutcome.OUTLIER if another else self._update_primary(*arguments)
+            outcome = UpdateOutcome.OUTLIER if another else self._update_primary(
+                *arguments, alike)
             if outcome is not UpdateOutcome.OUTLIER:
                 return Taken(outcome)
             candidate = self._add(time, measured.translation)
@@ -192,7 +193,7 @@ class Hypotheses:
         return Taken(UpdateOutcome.OUTLIER, candidate)
 
     def _update_primary(self, time: float, measured: Transform, reference: Array,
-                        covariance: Array) -> UpdateOutcome:
+                        covariance: Array, alike: Array | None) -> UpdateOutcome:
         """Update the primary track with a measurement, if it can be of it."""
         last, reach = self.primary.newest, self._reach(time)
         if last is not None and time > last.stamp and self.primary.place(time) is None and (
@@ -200,7 +201,7 @@ class Hypotheses:
             return UpdateOutcome.OUTLIER
         surprised = last is None or time - last.stamp <= GAP
         outcome = self.primary.update(time, measured, reference, covariance,
-                                      reach if surprised else 0.0)
+                                      reach if surprised else 0.0, alike)
         if outcome is UpdateOutcome.STARTED:
             self._motion, self._lost = _Motion(), None if last is None else last.position
         if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):

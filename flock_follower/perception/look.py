@@ -34,14 +34,19 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.neighbors_file import MarkedNeighbor, Marker
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
-from flock_follower.perception.measurement import Measurement, PosePrior
+from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
-from flock_follower.perception.pose import refine
+from flock_follower.perception.pose import locate, refine, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.time_offset import MountedCamera
 
+#: A fit to a smeared marker starts from the estimate. If there was nothing else for this long, s,
+#: the marker is detected, and replaces a fit whose attitude differs by more than this, rad.
+UNTOLD, CONTRARY = 0.1, 0.3
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
@@ -213,6 +218,27 @@ class Look:
     def missing(self) -> list[str]:
         """Return the neighbours to search for that are not measured yet."""
         return [name for name in self.anywhere if name not in self.measured]
+
+    def told(self, image: GrayImage, found: Measurement, sought: Target,
+             dictionary: str) -> Measurement:
+        """Return a measurement of a neighbour, or what its detected marker shows instead."""
+        name, told = found.name, self.camera.told
+        if found.spacing is None:
+            if self.stamp - told.get(name, -math.inf) <= UNTOLD:
+                return found
+            place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
+            ids, corners = search.near(
+                image, self.model, dictionary, sought.neighbor, place, False)
+            for index, marker in enumerate(sought.neighbor.markers):
+                middle = place.apply(marker.T_body_marker.translation)
+                for outline in corners[ids == marker.marker_id]:
+                    again = locate(image, self.model, sought, index, outline, prior)
+                    if again is not None and angle(again.T_camera_body, place) > CONTRARY and (
+                            math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
+                                      middle) < marker.side_length):
+                        return again._replace(stage='roi')  # the next image is searched, too
+        told[name] = self.stamp
+        return found
 
     def distance(self, measurement: Measurement) -> float:
         """Return how far a body is from where its neighbour is expected, or from the camera, m."""

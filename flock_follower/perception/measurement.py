@@ -112,7 +112,8 @@ class Measurement(NamedTuple):
     rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
     ``spacing``, px, of the brightness profiles, None without profiles.
     ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
-    equal, infinite if several markers decide it, None if it was not checked.
+    equal, infinite if several markers decide it, None if it was not checked. ``alike`` is the
+    share of the covariance that is of errors alike from image to image.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Measurement(NamedTuple):
     spacing: tuple[float, float] | None
     stage: str = 'track'
     margin: float | None = None
+    alike: float = 0.0
 
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:

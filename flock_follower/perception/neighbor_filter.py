@@ -36,6 +36,14 @@ import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
 from flock_follower.messages import MAX_JUMP
+from flock_follower.perception.innovation import (
+    AlikeErrors,
+    expected_innovation,
+    root_of,
+    squared_distance,
+    to_body,
+    widened,
+)
 from flock_follower.perception.learnt_noise import LEARNING_GAP, LearntMotion
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
@@ -68,6 +76,9 @@ GATE = 16.27
 WILD = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
+#: An attitude is wrong if so many measurements in a row contradict it, for so long, s: so that at
+#: a low rate of images a track turns round as soon as at a high one.
+LEAST_TURNED, TURNED_FOR = 3, 0.19
 #: Nearer than this, m, a distance has no direction.
 NEAREST = 0.01
 #: Of a state that is moved, the velocity is uncertain by the way divided by this, s.
@@ -123,8 +134,9 @@ class NeighborFilter:
         self.newest: Estimate | None = None
         """The state at the newest measurement; None if there is no track."""
         self._predicted: Estimate | None = None  # from that, to the time last requested
-        self._turned = 0  # measurements in a row whose attitude was not used
+        self._turned: list[float] = []  # stamps of those in a row whose attitude was not used
         self._surprises: dict[str, Array] = {}
+        self._alike = AlikeErrors()
         self._range_gate = RangeGate(most=self.params.max_rejections)
         self._line = _CENTRE  # on which the last distance was measured
         self._motion = LearntMotion()
@@ -193,13 +205,15 @@ class NeighborFilter:
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
-               covariance: Array, reach: float = math.inf) -> UpdateOutcome:
+               covariance: Array, reach: float = math.inf,
+               alike: Array | None = None) -> UpdateOutcome:
         """
         Take in a body's pose in odom, with covariance (6, 6) along odom's axes.
 
         The covariance is of the position of ``reference`` (3,), a point on the body, m, then of
         the rotation vector.
 
+        :param alike: the part of it, (6, 6), that is of errors alike from image to image, if any.
         :param reach: how far from the newest estimate the body can be by now, m.
         """
         self.change = None
@@ -209,41 +223,55 @@ class NeighborFilter:
                 return UpdateOutcome.LATE
             self.reset()
         expected = self.predict(stamp)
+        whole = root = None if alike is None else root_of(alike)
         if now is None or expected is None:
-            return self._start(stamp, T_odom_body, reference, covariance)
+            return self._start(stamp, T_odom_body, reference, covariance, whole)
 
         prior, plausible, jacobian, noise, innovation = self._compared(
             expected, T_odom_body, reference, covariance)
-        across = jacobian.dot(prior)
-        spread = across.dot(jacobian.T) + noise
+        if root is not None:
+            root = to_body(T_odom_body.rotation.dot(reference)).dot(root) if plausible else (
+                root[:3])
+        self._alike.pass_on(stamp - now.stamp, self._transition(stamp - now.stamp)[1])
+        shared = self._alike.together(root)
+        across, spread = expected_innovation(prior, jacobian, noise, shared)
 
         nominal = spread
-        doubt = _distance(innovation[:3], nominal[:3, :3]) / GATE
+        doubt = squared_distance(innovation[:3], nominal[:3, :3]) / GATE
         solved, gain = False, np.zeros(0)
         reached = doubt <= 1.0 or math.dist(T_odom_body.translation, now.position) <= reach
         if reached and doubt <= WILD:  # NaN is not
             if self._again('position', innovation[:3], doubt):
-                prior = _widened(prior, _MOVING, doubt)
-                across = jacobian.dot(prior)
-                spread = across.dot(jacobian.T) + noise
+                prior = widened(prior, _MOVING, doubt)
+                across, spread = expected_innovation(prior, jacobian, noise, shared)
             elif doubt > 1.0:
                 noise = noise + (doubt - 1.0) * spread
                 spread = doubt * spread
             solved, gain = cv2.solve(spread, across)
         if not solved:
             return UpdateOutcome.OUTLIER
-        self._turned = 0 if plausible else self._turned + 1
-        if self._turned >= self.params.max_rejections:
-            return self._start(stamp, T_odom_body, reference, covariance, expected)
+        self._turned = [] if plausible else [*self._turned, stamp]
+        if self._contradicted(stamp):
+            return self._start(stamp, T_odom_body, reference, covariance, whole, expected)
         self._learn(stamp - now.stamp, innovation, nominal)
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.T.dot(jacobian)
         corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
+        if shared is not None:
+            common = remain.dot(shared).dot(gain)
+            corrected -= common + common.T
+        self._alike.take(remain, gain.T, root)
         self._predicted, self._line = None, _CENTRE
         self.newest = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
+
+    def _contradicted(self, stamp: float) -> bool:
+        """Return whether measurements have contradicted the attitude for long enough."""
+        count = len(self._turned)
+        return count >= self.params.max_rejections or (
+            count >= LEAST_TURNED and stamp - self._turned[0] >= TURNED_FOR)
 
     def _learn(self, dt: float, innovation: Array, covariance: Array) -> None:
         """Learn from an innovation (6,), or (3,) of the position only, dt, s, after another."""
@@ -266,18 +294,18 @@ class NeighborFilter:
         prior = expected.covariance
         turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
         spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
-        doubt = _distance(turn, spread) / GATE
+        doubt = squared_distance(turn, spread) / GATE
         # A marker's mirrored pose has its position right and its attitude wrong.
         plausible = doubt <= 1.0 or (doubt <= WILD and float(turn.dot(turn)) < MIRRORED**2)
         if plausible:
             if self._again('attitude', turn, doubt):
-                prior = _widened(prior, _TURNING, doubt)
+                prior = widened(prior, _TURNING, doubt)
             elif doubt > 1.0:
                 covariance = covariance.copy()
                 covariance[3:, 3:] += (doubt - 1.0) * spread
             place = T_odom_body.translation - expected.position
-            to_body = _to_body(T_odom_body.rotation.dot(reference))
-            noise = to_body.dot(covariance).dot(to_body.T)
+            lever = to_body(T_odom_body.rotation.dot(reference))
+            noise = lever.dot(covariance).dot(lever.T)
             return prior, True, POSE, noise, np.concatenate([place, turn])
         # With the attitude expected, then, from the point to the body.
         lever = expected.rotation @ reference
@@ -317,7 +345,7 @@ class NeighborFilter:
         factors = self._range_gate.judge(innovation, spread)
         if factors is None:
             return UpdateOutcome.OUTLIER
-        prior = _widened(prior, _MOVING, factors[0])
+        prior = widened(prior, _MOVING, factors[0])
         across = prior[:, POSITION].dot(along)
         expected_spread = float(along.dot(across[POSITION]))
         whole = factors[1] * (expected_spread + noise)
@@ -326,6 +354,8 @@ class NeighborFilter:
             gain[part] = float(along.dot(across[part])) / whole * along
         remain = _IDENTITY.copy()
         remain[:, POSITION] -= np.outer(gain, along)
+        self._alike.pass_on(stamp - now.stamp, self._transition(stamp - now.stamp)[1])
+        self._alike.take(remain, gain, None)
         covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
             gain, gain)
         self.change, self._predicted, self._line = None, None, along
@@ -342,14 +372,15 @@ class NeighborFilter:
         return before is not None and float(innovation.dot(before)) > 0.0
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
-               moving: Estimate | None = None) -> UpdateOutcome:
+               root: Array | None, moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; if ``moving`` is given, keep its velocity."""
         quiet = [min(factor, 1.0) for factor in self._motion.factors]
         self.reset()
         if moving is not None:  # a high factor may come from the cause of the restart
             self._motion.factors = quiet
-        to_body = POSE.T @ _to_body(body.rotation @ reference)
-        full = to_body @ covariance @ to_body.T
+        start = POSE.T @ to_body(body.rotation @ reference)
+        full = start @ covariance @ start.T
+        self._alike.take(_IDENTITY, start, root)
         velocity: Array = np.zeros(3)
         acceleration: Array = np.zeros(3)
         full[VELOCITY, VELOCITY] = self.params.initial_speed**2 * np.eye(3)
@@ -363,28 +394,3 @@ class NeighborFilter:
         self.newest = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                acceleration, full)
         return UpdateOutcome.STARTED
-
-
-def _widened(covariance: Array, part: slice | Array, factor: float) -> Array:
-    """Return a covariance with the variances of a part multiplied."""
-    scale = np.ones(len(covariance))
-    scale[part] = math.sqrt(factor)
-    return covariance * np.outer(scale, scale)
-
-
-def _to_body(lever: Array) -> Array:
-    """
-    Return the matrix (6, 6) from the errors of a point and of the attitude to those of the body.
-
-    The point is off the body's origin by ``lever`` (3,) in odom: p = p_point - R l, so that
-    dp = dp_point + [R l]x dr.
-    """
-    matrix = np.eye(6)
-    matrix[:3, 3:] = skew(lever)
-    return matrix
-
-
-def _distance(innovation: Array, spread: Array) -> float:
-    """Return the squared Mahalanobis distance; infinity if the spread (n, n) is singular."""
-    solved, solution = cv2.solve(spread, innovation[:, None])
-    return float(innovation.dot(solution[:, 0])) if solved else math.inf

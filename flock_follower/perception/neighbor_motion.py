@@ -155,7 +155,8 @@ class FilterParams(Checked):
     ``initial_speed``, m/s, is the deviation before any motion has been seen.
     ``attitude_noise``, rad, is the noise of the own attitude from one image to the next; it moves
     a distant neighbour sideways.
-    ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
+    ``max_rejections`` measurements in a row outside the gate restart the filter, or in 0.2 s at
+    least three whose attitude is; as does a gap
     above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
     ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
     """

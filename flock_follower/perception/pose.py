@@ -34,7 +34,7 @@ import numpy as np
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN
+from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN, SWOLLEN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
@@ -51,6 +51,7 @@ from flock_follower.perception.measurement import (
 )
 from flock_follower.perception.print_model import edge_model, EdgeModel, shows_code
 from flock_follower.perception.smear_fit import (
+    descend,
     fit_smeared,
     seek,
     smear_model,
@@ -66,8 +67,17 @@ SIGMA_FLOOR = 0.05
 NARROW = 0.01
 #: Of a marker that is not tracked yet, more than this share of the edges must agree.
 FOUND_INLIERS = 0.8
-#: Number of independent samples of a smeared print, to decide between two attitudes.
-SMEAR_DEGREES = 200.0
+#: If more than this share of the edges agrees, to within this RMS, px, none of them is smeared: if
+#: the code is not shown, either they are not of the marker, or something covers it.
+SHARP = 0.7, 0.15
+#: Share of the variances of errors alike from image to image, if edges are blurred by more than
+#: this share of a cell (1 sigma), shifted by more than SWOLLEN, or fewer than this share agree.
+ALIKE, BLURRED, PLAIN_INLIERS = 0.8, 0.2, 0.9
+#: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
+RUN_TOGETHER = 0.25
+#: So many samples of a smeared print count to decide between two attitudes. Most of what is left
+#: are errors of the model, which are alike for neighboring samples.
+SMEAR_DEGREES = 40.0
 
 
 def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
@@ -139,14 +149,24 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     """
     if expected.pose is None:
         return None
-    found = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+    found, sharp = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+    if sharp:
+        return None
     if found is None:  # it may have moved farther than expected
         start = _shifted(image, camera, sought, expected.pose)
-        found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
+        found, sharp = (None, False) if start is None else _fit_shown(
+            image, camera, sought.model, start, None)
         if found is not None:  # from afar it may have settled early
             found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
-    if found is None:
-        return _smeared(image, camera, sought, expected.pose)
+    if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
+        again = fit(image, camera, found.lines.model, found.pose)
+        found = again if again is not None and again.inliers > found.inliers else found
+    blurred = found is not None and (
+        found.blur > RUN_TOGETHER and len(found.lines.model.codes) == 1)
+    smeared = _smeared(image, camera, sought, expected, check_mirrored) if blurred or (
+        found is None and not sharp) else None
+    if smeared is not None or found is None:
+        return smeared
     return _of_edges(image, camera, sought, found, expected, spacing, check_mirrored)
 
 
@@ -178,16 +198,16 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     T_marker_body = marker.T_body_marker.inverse()
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
-    fits = [one for start in starts
-            if (one := fit(image, camera, alone, start)) is not None
-            and one.inliers > FOUND_INLIERS and _shown(image, one).all()]
+    near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
+    fits = [one for one in near if one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
-        return _without_edges(image, camera, sought, index, starts, expected)
+        return None if any(map(_sharp, near)) else _without_edges(
+            image, camera, sought, index, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
     found: EdgeFit = best.chosen.fit
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
-        joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
+        joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing).fit
         if joint is not None and len(joint.lines.model.codes) > 1:
             found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), math.inf)
     return _measurement(sought, found, best)
@@ -198,35 +218,51 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
     """Return a neighbour by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    if not fits:
-        return None
-    least = min(f.rms for f in fits)
-    best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
-                  expected)
-    return widened(_of_smear(sought, index, best.chosen.fit), best)
+    return _of_smears(image, camera, sought, index, fits, expected, True) if fits else None
+
+
+class _Shown(NamedTuple):
+    """
+    A fit to those markers that show their codes, if any.
+
+    ``sharp``: whether the edges of a single marker are clear, so that none of it is smeared.
+    """
+
+    fit: EdgeFit | None
+    sharp: bool = False
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
-               spacing: tuple[float, float] | None) -> EdgeFit | None:
+               spacing: tuple[float, float] | None) -> _Shown:
     """Return a fit near ``start`` to those markers that show their codes."""
     turned = facing(model, start)
     if not turned.any():
-        return None
+        return _Shown(None)
     seen = model.only(turned)
     found = fit(image, camera, seen, start, spacing)
     shown = None if found is None else _shown(image, found, True)
     if shown is not None and shown.all():
-        return found
+        return _Shown(found)
     if len(seen.codes) == 1:
-        return None
+        return _Shown(None, found is not None and _sharp(found))
     if shown is None:  # one that is covered spoils them all
         alone = [fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start, spacing)
                  for k in range(len(seen.codes))]
         shown = np.array([f is not None and bool(_shown(image, f, True)[0]) for f in alone])
     if not shown.any():
-        return None
+        return _Shown(None)
     found = fit(image, camera, seen.only(shown), start, spacing)
-    return found if found is not None and _shown(image, found, True).all() else None
+    return _Shown(found if found is not None and _shown(image, found, True).all() else None)
+
+
+def _plain(found: EdgeFit) -> bool:
+    """Return whether edges have no errors that last: by a smear, over-exposure or a reflex."""
+    return found.blur < BLURRED and found.bloom < SWOLLEN and found.inliers > PLAIN_INLIERS
+
+
+def _sharp(found: EdgeFit) -> bool:
+    share, rms = SHARP
+    return found.inliers > share and found.rms < rms
 
 
 def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
@@ -239,22 +275,36 @@ def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
     return None
 
 
-def _smeared(image: GrayImage, camera: CameraModel, sought: Target,
-             start: Transform) -> Measurement | None:
-    """Return a neighbour one of whose markers is smeared, near ``start``, or None."""
-    turned = np.flatnonzero(facing(sought.model, start)).tolist()
-    for k in turned:
-        found = fit_smeared(image, camera, sought.smears[k], start)
+def _smeared(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
+             check_mirrored: bool) -> Measurement | None:
+    """Return a neighbour one of whose markers is smeared, near its expected place, or None."""
+    assert expected.pose is not None
+    for k in np.flatnonzero(facing(sought.model, expected.pose)).tolist():
+        found = fit_smeared(image, camera, sought.smears[k], expected.pose)
         if found is not None:
-            return _of_smear(sought, k, found)
+            return _of_smears(image, camera, sought, k, [found], expected, check_mirrored)
     return None
 
 
-def _of_smear(sought: Target, index: int, found: SmearFit) -> Measurement:
-    return Measurement(
-        sought.neighbor.name, found.pose,
-        sought.neighbor.markers[index].T_body_marker.translation,
-        found.covariance * WIDENING**2, found.rms, None)
+def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, index: int,
+               fits: list[SmearFit], expected: PosePrior, check_mirrored: bool) -> Measurement:
+    """Return the measurement of the likelier of both attitudes, of fits to one or both of them."""
+    marker, model = sought.neighbor.markers[index], sought.smears[index]
+    if len(fits) == 1 and check_mirrored:
+        found = fits[0]
+        start = mirrored(found.pose, found.pose.apply(marker.T_body_marker.translation[None])[0],
+                         marker.T_body_marker.rotation[:, 2])
+        other = None if start is None else descend(
+            image, camera, model, start, found.smear, found.lens)
+        fits = fits if other is None else [*fits, other]
+    least = min(each.rms for each in fits)
+    best = choose([Hypothesis(each.pose, SMEAR_DEGREES * (each.rms / least)**2, each)
+                   for each in fits], expected)
+    found = best.chosen.fit
+    measurement = Measurement(
+        sought.neighbor.name, found.pose, marker.T_body_marker.translation,
+        found.covariance * WIDENING**2, found.rms, None, alike=ALIKE)
+    return widened(measurement, best) if check_mirrored else measurement
 
 
 def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
@@ -273,19 +323,30 @@ def _scale(found: EdgeFit) -> float:
 
 def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     """Return the other pose that may suit the edges of a single marker, if there is one."""
-    normal = found.pose.rotation @ found.lines.model.facings[0]
-    sight = found.center / np.linalg.norm(found.center)
-    other = -normal + 2.0 * float(normal @ sight) * sight
-    axis = np.cross(normal, other)
-    sine = float(np.linalg.norm(axis))
-    if sine < SAME_ATTITUDE:
+    start = mirrored(found.pose, found.center, found.lines.model.facings[0])
+    if start is None:
         return []
-    turn = axis / sine * math.atan2(sine, float(normal @ other))
-    start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
     refitted = _refit(camera, found, start)
     if refitted is None or angle(refitted[0], found.pose) < SAME_ATTITUDE:
         return []
     return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
+
+
+def mirrored(pose: Transform, center: Array, facing_along: Array) -> Transform | None:
+    """
+    Return a pose mirrored about the line of sight; None if it is the same.
+
+    :param center: of the marker (3,), in the camera's optical frame, m, which stays in place.
+    :param facing_along: the marker's normal (3,) on the body.
+    """
+    normal, sight = pose.rotation @ facing_along, center / np.linalg.norm(center)
+    other = -normal + 2.0 * float(normal @ sight) * sight
+    axis = np.cross(normal, other)
+    sine = float(np.linalg.norm(axis))
+    if sine < SAME_ATTITUDE:
+        return None
+    turn = axis / sine * math.atan2(sine, float(normal @ other))
+    return moved(pose, center, np.concatenate([np.zeros(3), turn]))
 
 
 def _refit(camera: CameraModel, fitted: EdgeFit,
@@ -323,5 +384,6 @@ def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measure
         off = NARROW * math.exp(2.0 - cell) * found.center
         covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
-        sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing)
+        sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing,
+        alike=0.0 if _plain(found) else ALIKE)
     return measurement if best is None else widened(measurement, best)

@@ -138,12 +138,13 @@ def smear_print(printed: Any, places: Array, smear: Array) -> tuple[Array, Array
 
 _LENS = 0.75  # px: blur there is without motion
 _AROUND = 0.8  # cells that are white beyond the black border, at least
-_LONGEST = 2.0  # cells that motion smears by
+_LONGEST = 2.4  # cells that motion smears by
 _LIKENESS = 0.7  # least correlation from which to start,
 _RARER = 0.02  # by so much likelier it must be that it is out of focus
 _ALIKE = 0.95  # and of the fit
 _MIN_CONTRAST = 10.0  # grey levels
 _PASSES = 12
+_DAMPED = 3  # of them with steps of the smear halved
 _SMALL = 0.02  # rad, and ten times as many cells: a shorter step is the last, but for the first
 _LONGEST_TURN = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
 _LONGEST_STEP = 0.5  # and so does one by this share of the distance
@@ -151,8 +152,13 @@ _MIN_INSIDE = 0.8  # share of the samples that must be in the image
 _BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
 _FLOOR = 1.0  # grey levels: least standard deviation of a sample
 _ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
-#: Of the pose (6), the response (3) and the smear (2); a smear of 0 leaves the last open.
-_PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
+#: Of the pose (6), the response (6) and the smear (2); a smear of 0 leaves the last open.
+_PRIOR = np.diag([0.0] * 12 + [1.0, 1.0])
+#: By so much of the contrast (1 sigma) the response is bent further, and light falls unevenly.
+_UNEVEN = 0.1
+#: By more of the contrast light does not fall off across a marker: the most measured is 0.15.
+_STEEPEST = 0.4
+_REGULAR = np.diag([0.0] * 9 + [_UNEVEN**-2] * 3 + [0.0, 0.0])
 
 
 class SmearFit(NamedTuple):
@@ -161,12 +167,15 @@ class SmearFit(NamedTuple):
 
     ``pose`` is ``T_camera_body``; ``covariance`` (6, 6) is of the position of the marker's middle
     in the camera's optical frame, m, and of the rotation vector r in R_true = exp(r) R. ``rms``
-    is the difference between image and print, as a share of the contrast.
+    is the difference between image and print, as a share of the contrast. ``smear`` (2,), cells,
+    and ``lens``, an index of :data:`LENSES`, are the blur found.
     """
 
     pose: Transform
     covariance: Array
     rms: float
+    smear: Array
+    lens: int
 
 
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
@@ -177,7 +186,7 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
     ``start`` may be off by two cells and a half, and a little in all else.
     """
     begin = seek(image, camera, model, start)
-    return None if begin is None else _descend(image, camera, model, *begin)
+    return None if begin is None else descend(image, camera, model, *begin)
 
 
 def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
@@ -226,7 +235,7 @@ class _Descent(NamedTuple):
     """
     Residuals, (s,), grey levels, after a step, and the inputs of the step.
 
-    ``light``: difference between white and black.
+    ``light``: difference between white and black; ``response`` (s, 6) to whiteness.
     """
 
     residual: Array
@@ -234,14 +243,16 @@ class _Descent(NamedTuple):
     weights: Array
     information: Array
     light: float
+    response: Array
 
 
-def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Transform,
-             smear: Array, lens: int) -> SmearFit | None:
+def descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Transform,
+            smear: Array, lens: int) -> SmearFit | None:
     """Return the fit at the least weighted squares near a pose and a smear."""
     on_body = model.origin + model.places @ model.axes
     middle = model.origin + 0.5 * (model.cells - 1) * model.axes.sum(axis=0)
     cell = float(np.linalg.norm(model.axes[0]))
+    across = model.places / (model.cells - 1) - 0.5
     weights, variance, light, curve = np.ones(len(on_body)), _FLOOR**2, 0.0, 0.0
     for count in range(_PASSES):
         points, center = pose.apply(on_body), pose.apply(middle[None])[0]
@@ -256,13 +267,15 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
             blur = _LENS * center[2] / (camera.matrix[0, 0] * cell)
             lens = int(np.abs(LENSES[:FOCUSED] - blur).argmin())
         white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
-        # Gamma and over-exposure bend what would be straight.
-        response = np.stack([white, np.ones_like(white), white * (1.0 - white)], axis=1)
+        # Gamma and over-exposure bend what would be straight; light falls unevenly.
+        response = np.stack([white, np.ones_like(white), white * (1.0 - white),
+                             white * (1.0 - white) * (1.0 - 2.0 * white),
+                             *(white * across.T)], axis=1)
         if count == 0:
             first = solve_normal(response.T.dot(response), response.T.dot(brightness))
             if first is None:
                 return None
-            light, _, curve = first.tolist()
+            light, _, curve, *_ = first.tolist()
         slope = (light + curve * (1.0 - 2.0 * white))[:, None]
         along = _by_point(pose, model, points, slope * by_place)
         design = np.concatenate([along, cross(points - center, along), response,
@@ -271,29 +284,31 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         steep = _BLURRED**2 * (slope * slope * by_place * by_place).sum(axis=1)
         weights = weights / (variance + steep)
         weighted = design * weights[:, None]
-        information = weighted.T.dot(design) + _PRIOR
+        information = weighted.T.dot(design) + _PRIOR + _REGULAR / max(light, _MIN_CONTRAST)**2
         # Smears to either side of an axis look alike: a whole step from one leads to the other.
-        held = information + information * _PRIOR
+        held = information + information * _PRIOR if count < _DAMPED else information
         step = solve_normal(held, weighted.T.dot(brightness))
         if step is None:
             return None
-        light, _, curve = step[6:9].tolist()
+        light, _, curve = step[6:9].tolist()  # what remains of the response is small
         turn, offset = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
-        smear = smear + step[9:]
-        if (not max(turn, float(np.abs(step[9:]).max())) < _LONGEST_TURN or light <= 0.0
+        smear, smeared = smear + step[-2:], float(np.abs(step[-2:]).max())
+        if (not max(turn, smeared) < _LONGEST_TURN or light <= 0.0
                 or offset > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
             return None
         pose = moved(pose, center, step)
         residual = brightness - design.dot(step)
-        if count > 2 and offset < 10.0 * _SMALL * cell and turn < _SMALL:
+        if count > 2 and turn < _SMALL and max(offset / cell, smeared) < 10.0 * _SMALL:
             break
         squares = residual * residual
         variance = max(1.4826**2 * median(squares), _FLOOR**2)
         weights = np.maximum(1.0 - squares / (25.0 * (variance + steep)), 0.0)**2
     else:
         return None
-    return _checked(model, pose, smear, _Descent(
-        residual, response.dot(step[6:9]), weights, information, light))
+    if math.hypot(*step[10:12].tolist()) > _STEEPEST * light:
+        return None
+    return _checked(model, pose, smear, lens, _Descent(
+        residual, response.dot(step[6:-2]), weights, information, light, response))
 
 
 def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array) -> Array:
@@ -306,7 +321,8 @@ def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array
     return moved_by
 
 
-def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
+def _checked(model: SmearModel, pose: Transform, smear: Array, lens: int,
+             last: _Descent) -> SmearFit | None:
     """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
@@ -320,7 +336,7 @@ def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -
     if covariance is None:
         return None
     return SmearFit(pose, covariance[:6, :6],
-                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast)
+                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast, smear, lens)
 
 
 def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:
@@ -334,7 +350,9 @@ def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:
         inner * inner, count) / len(INSTANTS)  # of each sample, how much is of each cell
     own = model.codes[0]
     turned = (1.0 - 2.0 * own)[:, None] * share * last.light
-    # What turning cells adds to the squares left, the response taken as linear.
+    # What turning cells adds to the squares left, once the response is fitted anew.
+    basis = np.linalg.qr(last.response)[0]
+    turned = turned - turned.dot(basis).dot(basis.T)
     by_residual, together = turned.dot(last.residual), turned.dot(turned.T)
     if np.count_nonzero(together.diagonal() <= 2.0 * by_residual) > model.errors:
         return False

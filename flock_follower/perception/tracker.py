@@ -85,7 +85,7 @@ class _Placed(NamedTuple):
     A measurement in the smooth frame of ``OdometryBuffer``, with the view at its exposure.
 
     The exposure was at ``exposed`` by the camera's clock, and at ``time`` by the filter's, s;
-    ``covariance`` (6, 6) is as ``NeighborFilter.update`` takes it.
+    ``covariance`` (6, 6) and ``alike`` are as ``NeighborFilter.update`` takes them.
     """
 
     view: View
@@ -93,6 +93,7 @@ class _Placed(NamedTuple):
     time: float
     T_smooth_body: Transform
     covariance: Array
+    alike: Array | None
 
 
 class Tracker:
@@ -183,7 +184,7 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         look.sighting.stage = 'track'
         for name in look.near:
-            self._measure(look, name, track(
+            self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
                 look.camera.spacings[name], look.camera.unchecked[name] == 0))
         for name, expected in self._candidates(look):
@@ -203,7 +204,7 @@ class Tracker:
                 name = measurement.name
                 self._report(look, measurement, placed, self._hypotheses[name].take(
                     placed.time, placed.T_smooth_body, measurement.reference, placed.covariance,
-                    name in look.sighting.estimates))
+                    name in look.sighting.estimates, placed.alike))
         return look.sighting
 
     def _sought(self, stamp: float, model: CameraModel, camera: MountedCamera) -> Sought | Missing:
@@ -243,19 +244,21 @@ class Tracker:
         """Return the time of a neighbour's filter, s, of an exposure by the camera's clock, s."""
         return self._schedule.time(name, camera, exposed + camera.time_offset.applied)
 
-    def _measure(self, look: Look, name: str, found: Measurement | None) -> None:
+    def _measure(self, image: GrayImage, look: Look, name: str,
+                 found: Measurement | None) -> None:
         """Take the measurement of a neighbour near its expected place, if it was found there."""
         if found is None:
             return
         if self._of_candidate(look, found):
             look.others.append(found)
             return
+        found = look.told(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
         unchecked = look.camera.unchecked
-        if unchecked[name]:
+        if found.margin is not None:
+            unchecked[name] = MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
+        elif unchecked[name]:
             unchecked[name] -= 1
-        elif found.margin is not None and found.margin > MARGIN:
-            unchecked[name] = MIRRORED_EVERY - 1
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""
@@ -355,8 +358,9 @@ class Tracker:
         turn[:3, :3] = place * view.T_smooth_camera.rotation
         turn[3:, 3:] = attitude * view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
+        alike = measurement.alike * covariance if measurement.alike else None
         covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
-        return _Placed(view, exposed, time, T_smooth_body, covariance)
+        return _Placed(view, exposed, time, T_smooth_body, covariance, alike)
 
     def _report(self, look: Look, measurement: Measurement, placed: _Placed, taken: Taken) -> None:
         """Add the outcome of a measurement to the sighting, and learn from it."""

@@ -120,6 +120,18 @@ def test_white_that_swells_in_one_direction_does_not_move_the_pose(axis: int) ->
     np.testing.assert_allclose(found.pose.translation, truth.translation, atol=0.002)
 
 
+def test_over_exposed_edges_are_followed_from_image_to_image() -> None:
+    pose = facing((0.02, -0.01, 1.8), (0.1, 0.25, 0.05))
+    image = render(CAMERA, {3: pose}, black=60.0, white=1500.0, blur=1.0)
+    found = fitted(image, off(pose, 1))
+    for seed in range(3):  # from as near as a prediction is
+        start = Transform(pose.rotation, pose.translation
+                          + np.random.default_rng(seed).normal(0.0, 0.001, 3))
+        again = fitted(image, start, spacing=found.spacing)
+        assert again.inliers > 0.9
+        assert np.abs(error(again, pose)[:2]).max() < 0.0005
+
+
 @pytest.mark.parametrize('side', ['left', 'right', 'top', 'bottom'])
 @pytest.mark.parametrize('level', [0.0, 110.0, 250.0])
 def test_a_covered_side_does_not_drag_the_pose(side: str, level: float) -> None:

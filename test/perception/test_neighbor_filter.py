@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import math
+
 from marker_images import known
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.perception.innovation import ALIKE_TIME
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -215,6 +218,51 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
     np.testing.assert_allclose(e[:3], 0.0, atol=1e-9)
     np.testing.assert_allclose(e[6:9], 0.0, atol=1e-9)
     assert np.linalg.norm(e[3:6]) < 0.3
+
+
+@pytest.mark.parametrize(('modelled', 'least', 'most'), [(True, 2.0, 4.0), (False, 5.0, 10.0)])
+def test_errors_that_are_alike_from_image_to_image_do_not_average_out(
+        modelled: bool, least: float, most: float) -> None:
+    alike, squares = 0.8 * NOISE, []
+    for seed in range(16):
+        rng, tracker, same = np.random.default_rng(seed), NeighborFilter(), np.zeros(6)
+        for k in range(25):
+            kept = math.exp(-DT / ALIKE_TIME) if k else 0.0
+            same = kept * same + rng.multivariate_normal(np.zeros(6), (1.0 - kept**2) * alike)
+            e = same + rng.multivariate_normal(np.zeros(6), NOISE - alike)
+            body = truth(k * DT)
+            rotation = rotation_vector_to_matrix(e[3:]) @ body.rotation
+            seen = Transform(rotation, body.apply(TAIL[None])[0] + e[:3] - rotation @ TAIL)
+            tracker.update(k * DT, seen, TAIL, NOISE, alike=alike if modelled else None)
+        estimate = known(tracker.newest)
+        np.linalg.cholesky(estimate.covariance)
+        off = error(estimate, body, VELOCITY)[:3]
+        squares.append(off @ np.linalg.solve(estimate.covariance[:3, :3], off))
+    assert least < np.mean(squares) < most
+
+
+def test_alike_errors_are_forgotten_once_measurements_have_none() -> None:
+    with_some, without = NeighborFilter(), NeighborFilter()
+    for k in range(90):
+        seen = measured(truth(k * DT))
+        with_some.update(k * DT, seen, TAIL, NOISE, alike=0.8 * NOISE if k < 30 else None)
+        update(without, k * DT, seen)
+        if k == 29:
+            assert (known(with_some.newest).covariance[0, 0]
+                    > 2.0 * known(without.newest).covariance[0, 0])
+    np.testing.assert_allclose(known(with_some.newest).covariance[:3, :3],
+                               known(without.newest).covariance[:3, :3], rtol=0.1, atol=1e-7)
+
+
+@pytest.mark.parametrize(('rate', 'images'), [(30.0, 6), (15.0, 4), (10.0, 3), (7.0, 3)])
+def test_a_contradicted_attitude_is_dropped_within_0_3_s(rate: float, images: int) -> None:
+    tracker, period = NeighborFilter(), 1.0 / rate
+    for k in range(20):
+        update(tracker, k * period, mirrored(measured(truth(k * period))))
+    outcomes = [update(tracker, k * period, measured(truth(k * period)))
+                for k in range(20, 20 + images)]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * (images - 1) + [UpdateOutcome.STARTED]
+    assert (images - 1) * period < 0.3
 
 
 @pytest.mark.parametrize(('t', 'outcome'), [

@@ -17,8 +17,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 import warnings
 
+import cv2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_images import (
@@ -41,6 +43,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.neighbors_file import MarkedNeighbor, Marker
+from flock_follower.perception import pose as pose_module
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
@@ -51,6 +54,7 @@ from flock_follower.perception.measurement import (
     PosePrior,
 )
 from flock_follower.perception.pose import locate, Target, target, track
+from flock_follower.perception.smear_fit import fit_smeared
 
 LEADER = target(MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)), DICTIONARY)
 CAMERA = make_camera()
@@ -188,6 +192,49 @@ def test_the_wrong_branch_is_left_where_the_image_is_clear(
     assert known(again.margin) > known(found.margin) > 0.0
     np.testing.assert_allclose(again.T_camera_body.rotation, found.T_camera_body.rotation,
                                atol=0.03)
+
+
+@pytest.mark.parametrize(('turn', 'smear'), [
+    ((0.0, 0.45, 0.0), (3.0, 2.0)), ((0.4, 0.3, 0.2), (0.0, 6.0)), ((0.0, -0.5, 0.0), (8.0, 0.0))])
+def test_the_wrong_branch_is_left_where_the_marker_is_smeared(
+        turn: tuple[float, float, float], smear: tuple[float, float]) -> None:
+    marker = facing((0.03, -0.02, 1.2), turn)
+    image = render(SMALL, {0: marker}, motion=smear)
+    truth, wrong = body(marker), body(mirrored(marker))
+    stuck = known(fit_smeared(image, SMALL, LEADER.smears[0], wrong))
+    turned = stuck.pose.rotation @ truth.rotation.T
+    assert np.linalg.norm(matrix_to_rotation_vector(turned)) > 0.5  # a minimum of its own
+    found = tracked(image, SMALL, LEADER, wrong, True)
+    assert found.spacing is None
+    assert np.linalg.norm(error(found, truth)[3:]) < 0.1
+    assert chi2(found, truth) < 22.5
+    assert known(found.margin) > 9.0
+
+
+@pytest.mark.parametrize(('cells', 'blurred'), [(0.1, False), (1.0, True)])
+def test_a_print_whose_edges_run_together_is_fitted_whole(cells: float, blurred: bool) -> None:
+    marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
+    motion = cells * SIDE / 6.0 * SMALL.matrix[0, 0] / 1.2
+    found = tracked(render(SMALL, {0: marker}, motion=(motion, 0.0)), SMALL, LEADER, body(marker))
+    assert (found.spacing is None) is blurred
+    assert (found.alike > 0.0) is blurred
+    assert np.linalg.norm(error(found, body(marker))[3:]) < 0.05
+
+
+def test_clear_edges_whose_code_is_hidden_are_not_taken_for_a_smear(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    marker = facing((0.03, -0.02, 1.2), (0.1, 0.3, 0.05))
+    image, corners = render(SMALL, {0: marker}), corners_of(SMALL, marker)
+    size = float(np.ptp(corners[:, 0]))
+    cv2.circle(image, np.rint(corners.mean(axis=0)).astype(int).tolist(), round(0.27 * size), 255,
+               -1)  # a reflex
+
+    def smeared(*_: Any) -> None:
+        raise AssertionError('the marker is not smeared')
+
+    monkeypatch.setattr(pose_module, 'fit_smeared', smeared)
+    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, True) is None
+    assert locate(image, SMALL, LEADER, 0, corners, PosePrior(body(marker))) is None
 
 
 def test_where_both_attitudes_are_probable_the_covariance_covers_both() -> None:

@@ -31,7 +31,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.smear_fit import fit_smeared, smear_model
+from flock_follower.perception.smear_fit import descend, fit_smeared, smear_model
 
 CAMERA = make_camera(width=240, height=180)
 CELL = SIDE / 6.0
@@ -77,6 +77,17 @@ def test_a_smeared_marker_has_an_honest_covariance(cells: float, gamma: float) -
         np.linalg.cholesky(found.covariance)
         squares.append(error @ np.linalg.solve(found.covariance, error) / 6.0)
     assert np.mean(squares) < 1.5
+
+
+@pytest.mark.parametrize('cells', [1.0, 1.5, 1.8])
+def test_a_fit_ends_where_it_leads_no_farther(cells: float) -> None:
+    image = smeared(HERE, cells, 0.4, gamma=2.2)
+    found = known(fit_smeared(image, CAMERA, MODEL, off(body(HERE), 2)))
+    again = known(descend(image, CAMERA, MODEL, found.pose, found.smear, found.lens))
+    turned = matrix_to_rotation_vector(again.pose.rotation @ found.pose.rotation.T)
+    assert np.linalg.norm(turned) < 0.01
+    assert np.linalg.norm(again.smear - found.smear) < 0.02
+    assert np.linalg.norm(found.smear) == pytest.approx(cells, abs=0.15)
 
 
 @pytest.mark.parametrize('cells', [0.0, 1.0, 1.5])

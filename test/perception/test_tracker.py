@@ -24,8 +24,10 @@ import pytest
 
 from flock_follower.geometry import (
     Array,
+    matrix_to_rotation_vector,
     quaternion_from_rpy,
     quaternion_to_matrix,
+    rotation_vector_to_matrix,
     Transform,
 )
 from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
@@ -34,6 +36,7 @@ from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams
 from flock_follower.perception.tracker import camera_mounting, MARGIN, MIRRORED_EVERY, Tracker
 
@@ -171,6 +174,35 @@ def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
     for _ in range(2 * MIRRORED_EVERY + 2):
         drone.see(image)
     assert done == ([True] + [False] * (MIRRORED_EVERY - 1)) * 2 + [True]
+
+
+def test_a_detection_turns_a_track_round_that_only_smears_confirm(
+        monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
+    drone, truth = hovering(), hovering().see(image).estimates['leader'].rotation
+    locate, track = tracker_module.locate, tracker_module.track
+    turn = rotation_vector_to_matrix([0.0, 0.7, 0.0])
+
+    def turned(found: Measurement) -> Measurement:
+        pose = found.T_camera_body
+        rotation = turn @ pose.rotation
+        place = pose.apply(found.reference) - rotation @ found.reference
+        return found._replace(T_camera_body=Transform(rotation, place), spacing=None)
+
+    def confirming(*arguments: Any) -> Any:
+        found = track(*arguments)
+        return found and turned(found)
+
+    def off() -> float:
+        estimate = drone.see(image).estimates['leader'].rotation @ truth.T
+        return float(np.linalg.norm(matrix_to_rotation_vector(estimate)))
+
+    monkeypatch.setattr(tracker_module, 'track', confirming)
+    with monkeypatch.context() as begun:
+        begun.setattr(tracker_module, 'locate', lambda *arguments: turned(locate(*arguments)))
+        assert off() > 0.5
+    after = [off() for _ in range(12)]  # 0.6 s
+    assert after[0] > 0.5
+    assert max(after[6:]) < 0.05
 
 
 # Several neighbours, several markers, and others
