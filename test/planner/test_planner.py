@@ -34,7 +34,15 @@ from flock_follower.geometry import Array
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import late, next_state, odometry_fault, State
-from flock_follower.planner.params import ALTITUDE_MODES, AVOID, Member, PlannerParams, ROLES
+from flock_follower.planner.params import (
+    ALTITUDE_MODES,
+    AVOID,
+    COLUMN_V_MAX,
+    FOLLOWER,
+    Member,
+    PlannerParams,
+    ROLES,
+)
 from flock_follower.planner.step import Decision, step
 
 PARAMS = flown.PARAMS
@@ -413,8 +421,10 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int, cou
     rng = np.random.default_rng(seed)
     roles = {f'n{k}': Member(str(rng.choice(ROLES)), float(rng.choice([0.0, 0.3, 1.5])))
              for k in range(count)}
-    params = PlannerParams(altitude_mode=altitude_mode, vehicles=roles if count > 1 else {},
-                           v_max=float(rng.choice([0.5, 2.0])))
+    vehicles = roles if count > 1 else {}
+    column = any(each.role == FOLLOWER for each in vehicles.values())
+    params = PlannerParams(altitude_mode=altitude_mode, vehicles=vehicles,
+                           v_max=float(rng.choice([0.5, COLUMN_V_MAX if column else 2.0])))
     memory, now = Memory(), 100.0
     for _ in range(25):
         now += float(rng.choice([0.1] * 15 + [0.7, 3.0, -0.05, -8.0]))
