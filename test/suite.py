@@ -12,10 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Run the suite, as ``make test`` does: what computes, and beside it what waits for nodes.
+Run the suite, as ``make test`` does: what waits for nodes, and then what computes.
 
-What computes yields a little, and both go on beside other work. Every 20 s a line reports the
-tests done, their number, the time left, and the logs. A test of nodes that failed while other
+Nothing computes beside the nodes, which fly in real time, and all have the ordinary priority: both
+parts go on beside other work. Every 20 s a line reports the tests done, their number, the time
+left, and the log. A test of nodes that failed while other
 programs had the processors may have failed for that: it is repeated alone at the end, and that
 result counts. Exit code 0 if all passed, 1 if one failed, 3 if only tests failed for which it was
 too busy alone, too.
@@ -26,8 +27,7 @@ too busy alone, too.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
-import contextlib
+from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
@@ -40,8 +40,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRESS = 20.0  # s between two lines
 PYTEST = (sys.executable, '-m', 'pytest', '--timeout', '600', '--timeout-method', 'thread', '-v')
 PARALLEL = ('-n', '2', '--dist', 'loadfile', '--no-loadscope-reorder')
-#: What computes leaves three quarters of a processor to what waits for nodes in real time.
-COMPUTING, NICENESS = 'test-computing', 5
+#: The parts of the whole suite, in this order: the name of the log, and what pytest is asked for.
+PARTS = {'test-nodes': ('-m', 'ros and not sweep'),
+         'test-computing': (*PARALLEL, '-m', 'not ros and not sweep')}
 #: Where conftest.py writes how far a run is.
 STATUS = 'FLOCK_FOLLOWER_TEST_STATUS'
 FAILED, TOO_BUSY = 1, 3  # exit codes
@@ -76,16 +77,15 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     if options.tests or options.markers:
         markers = ('-m', options.markers) if options.markers else ()
-        ended = run({'test': (*PARALLEL, *options.tests, *markers)})
+        ended = [run('test', (*PARALLEL, *options.tests, *markers))]
     else:
-        ended = run({'test-nodes': ('-m', 'ros and not sweep'),
-                     COMPUTING: (*PARALLEL, '-m', 'not ros and not sweep')})
+        ended = [run(*part) for part in PARTS.items()]
     again = [test for each in ended for test in each.status.busy]
     alone = []
     if again:
         print(f'{len(again)} tests failed while other programs had the processors: again, alone',
               flush=True)
-        alone = run({'test-again': again})
+        alone = [run('test-again', again)]
     code = verdict(ended, alone)
     if code == TOO_BUSY:
         print('too busy: tests failed alone, too, while other programs had the processors: '
@@ -100,36 +100,27 @@ def verdict(ended: Sequence[Run], alone: Sequence[Run]) -> int:
     return next((code for code in codes if code not in (0, TOO_BUSY)), max(codes, default=0))
 
 
-def run(runs: Mapping[str, Sequence[str]]) -> list[Run]:
-    """Run pytest with each list of arguments, side by side, with progress."""
+def run(name: str, arguments: Sequence[str]) -> Run:
+    """Run pytest with arguments and a log of that name, with progress."""
     build = ROOT / 'build'
     build.mkdir(exist_ok=True)
-    began = time.monotonic()
-    with contextlib.ExitStack() as stack:
-        children = {}
-        for name, arguments in runs.items():
-            log = stack.enter_context(open(build / f'{name}.log', 'wb'))
-            (build / f'{name}.json').unlink(missing_ok=True)
-            children[name] = stack.enter_context(subprocess.Popen(
-                ['nice', '-n', str(NICENESS if name == COMPUTING else 0), *PYTEST, *arguments],
-                cwd=ROOT, stdout=log, stderr=subprocess.STDOUT,
-                env=environment(build / f'{name}.json')))
-        due = began
-        # Ctrl-C reaches them, too; they end, and are waited for.
-        while any(child.poll() is None for child in children.values()):
+    status = build / f'{name}.json'
+    status.unlink(missing_ok=True)
+    due = began = time.monotonic()
+    with open(build / f'{name}.log', 'wb') as log, subprocess.Popen(
+            [*PYTEST, *arguments], cwd=ROOT, stdout=log, stderr=subprocess.STDOUT,
+            env=environment(status)) as child:
+        while child.poll() is None:  # Ctrl-C reaches it, too; it ends, and is waited for
             if time.monotonic() >= due:
                 due += PROGRESS
-                print(progress({name: read_status(build / f'{name}.json') for name in runs},
-                               time.monotonic() - began), flush=True)
+                print(progress(name, read_status(status), time.monotonic() - began), flush=True)
             time.sleep(0.2)
-    for name, child in children.items():
-        text = (build / f'{name}.log').read_text(encoding='utf-8', errors='replace')
-        if child.returncode:  # from the failures on, if it came so far
-            print(text[max(text.find('= FAILURES ='), text.find('= ERRORS ='), 0):], flush=True)
-        else:
-            print(f'build/{name}.log: {text.strip().splitlines()[-1].strip("= ")}', flush=True)
-    return [Run(child.returncode, read_status(build / f'{name}.json'))
-            for name, child in children.items()]
+    text = (build / f'{name}.log').read_text(encoding='utf-8', errors='replace')
+    if child.returncode:  # from the failures on, if it came so far
+        print(text[max(text.find('= FAILURES ='), text.find('= ERRORS ='), 0):], flush=True)
+    else:
+        print(f'build/{name}.log: {text.strip().splitlines()[-1].strip("= ")}', flush=True)
+    return Run(child.returncode, read_status(status))
 
 
 def environment(status: Path) -> dict[str, str]:
@@ -139,15 +130,12 @@ def environment(status: Path) -> dict[str, str]:
     return {**kept, STATUS: str(status)}
 
 
-def progress(statuses: Mapping[str, Status], elapsed: float) -> str:
-    """Return a line: tests done, their number, the time left if they go on so, and the logs."""
-    done, total, failed = (sum(status[k] for status in statuses.values()) for k in (1, 0, 2))
-    left = max((elapsed * (each.total / each.done - 1.0) for each in statuses.values()
-                if each.done), default=0.0)
-    known = all(each.done for each in statuses.values())
-    return (f'{clock(elapsed)}: {done} of {total if known else "?"} tests done, {failed} failed, '
-            f'{f"about {clock(left)} left" if known else "collecting"}; '
-            f'{", ".join(f"build/{name}.log" for name in statuses)}')
+def progress(name: str, status: Status, elapsed: float) -> str:
+    """Return a line: tests done, their number, the time left if they go on so, and the log."""
+    left = (f'about {clock(elapsed * (status.total / status.done - 1.0))} left' if status.done
+            else 'collecting')
+    return (f'{clock(elapsed)}: {status.done} of {status.total if status.done else "?"} tests '
+            f'done, {status.failed} failed, {left}; build/{name}.log')
 
 
 def read_status(path: Path) -> Status:

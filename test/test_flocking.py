@@ -111,7 +111,7 @@ def rounding(flock: tuple[Array, Array]) -> float:
     x, v = flock
     i, j = np.triu_indices(len(x), k=1)
     r2 = np.sum((x[i] - x[j]) ** 2, axis=-1)
-    stiffness = np.max(separation(r2, FLIGHT) + cohesion(r2, FLIGHT), initial=0.0)
+    stiffness = np.sum(separation(r2, FLIGHT) + cohesion(r2, FLIGHT))  # the forces of all add
     return float(1e-14 * stiffness * (1.0 + disagreement(v)))
 
 

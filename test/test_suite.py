@@ -43,11 +43,9 @@ def test_a_run_that_ended_for_another_reason_is_never_excused(code: int) -> None
 
 
 def test_the_line_has_done_total_time_left_and_logs() -> None:
-    statuses = {'test-nodes': Status(100, 25, 1), 'test-computing': Status(300, 150)}
-    assert progress(statuses, 60.0) == (
-        '1:00: 175 of 400 tests done, 1 failed, about 3:00 left; '
-        'build/test-nodes.log, build/test-computing.log')
-    assert '0 of ? tests done, 0 failed, collecting' in progress({'test': Status()}, 1.0)
+    assert progress('test-nodes', Status(100, 25, 1), 60.0) == (
+        '1:00: 25 of 100 tests done, 1 failed, about 3:00 left; build/test-nodes.log')
+    assert '0 of ? tests done, 0 failed, collecting' in progress('test', Status(), 1.0)
 
 
 def test_the_status_is_what_a_run_of_tests_wrote(tmp_path: Path) -> None:
@@ -84,11 +82,11 @@ def test_what_failed_on_a_busy_machine_is_repeated_alone(
         monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     runs = []
 
-    def pretend(asked: dict[str, list[str]]) -> list[Run]:
-        runs.append(asked)
-        return [BUSY]
+    def pretend(name: str, asked: list[str]) -> Run:
+        runs.append((name, asked))
+        return BUSY
     monkeypatch.setattr('suite.run', pretend)
     assert main(['test/nodes']) == 3
-    assert [[*asked] for asked in runs] == [['test'], ['test-again']]
-    assert runs[1] == {'test-again': ['a', 'b']}
+    assert [name for name, _ in runs] == ['test', 'test-again']
+    assert runs[1] == ('test-again', ['a', 'b'])
     assert capsys.readouterr().out.splitlines()[-1].startswith('too busy: ')
