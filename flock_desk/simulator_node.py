@@ -31,6 +31,7 @@ vehicle of another simulator node, so followers fly in a column; the node ends w
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import sys
@@ -38,7 +39,7 @@ import time
 
 import cv2
 import numpy as np
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
@@ -211,23 +212,24 @@ class Simulator(FlockNode):
         executor.add_node(self)
         next_service = 0.0
         try:
-            while self.context.ok() and not self._finished():
-                # An external vehicle is stepped once a pose has come, which ends the wait.
-                wake = min(self._step_due() if self._external is None else math.inf, next_service,
-                           self._start + self._outputs.next_image)
-                self._end.receive(wake - time.monotonic())
-                now = time.monotonic()
-                while (now if self._external is None
-                       else self._external.known(now)) >= self._step_due():
-                    self._step()
-                    if self._external is None:
-                        break  # lost time is flown through, but the bridge is answered between
-                self._outputs.send_images(now, self._start)
-                if now >= next_service:
-                    next_service = now + SERVICE_PERIOD
-                    for _ in range(1 if self._ahead is None else MESSAGES):
-                        executor.spin_once(timeout_sec=0.0)
-                    self._watch(now)
+            with contextlib.suppress(ExternalShutdownException):
+                while self.context.ok() and not self._finished():
+                    # An external vehicle is stepped once a pose has come, which ends the wait.
+                    wake = min(self._step_due() if self._external is None else math.inf,
+                               next_service, self._start + self._outputs.next_image)
+                    self._end.receive(wake - time.monotonic())
+                    now = time.monotonic()
+                    while (now if self._external is None
+                           else self._external.known(now)) >= self._step_due():
+                        self._step()
+                        if self._external is None:
+                            break  # lost time is flown through, but the bridge is answered between
+                    self._outputs.send_images(now, self._start)
+                    if now >= next_service:
+                        next_service = now + SERVICE_PERIOD
+                        for _ in range(1 if self._ahead is None else MESSAGES):
+                            executor.spin_once(timeout_sec=0.0)
+                        self._watch(now)
             self._line.end()
             if self._values['log']:
                 self._save_log()  # also if asked to end: what was flown is judged

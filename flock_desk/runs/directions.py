@@ -67,10 +67,11 @@ def opposed(log: Mapping[str, Array], commands: Sequence[tuple[float, Any]]) -> 
     """
     Return whether each setpoint points against what it rests on.
 
-    With a fresh command: horizontally against that command; its vertical part holds the offset of
-    the thrust. Without a command: along the velocity, because the gate brakes. The guard, the
-    limits and late messages turn some round, a wrong sign almost all. Setpoints between the two
-    cases, and those that rest on too little, are left out.
+    With fresh commands: horizontally against each of them, and not against the velocity either,
+    because the gate may brake, and on a busy machine rests on a command before the newest; its
+    vertical part holds the offset of the thrust. Without a command: along the velocity, because
+    the gate brakes. A wrong sign turns almost all round. Setpoints between the two cases, and
+    those that rest on too little, are left out.
 
     :param log: the autopilot's: times, s, setpoints and velocities (n, 3), ENU.
     :param commands: as published, each with its time of arrival, s, on the same clock.
@@ -86,9 +87,12 @@ def opposed(log: Mapping[str, Array], commands: Sequence[tuple[float, Any]]) -> 
         for _, message in commands)])
     newest = np.searchsorted(arrived, times, side='right') - 1
     age = times - arrived[newest]
-    basis = np.where((age < FRESH)[:, None], wanted[newest],
-                     np.where((age > SILENT)[:, None], -velocity, 0.0))
+    fresh, silent = age < FRESH, age > SILENT
+    along_velocity = np.sum(velocity * setpoints, axis=1)
+    with_some = np.array([np.any(wanted[(arrived > time - SILENT) & (arrived <= time)] @ setpoint
+                                 > 0.0) for time, setpoint in zip(times, setpoints)])
+    basis = np.where(fresh[:, None], wanted[newest], np.where(silent[:, None], velocity, 0.0))
     clear = (np.linalg.norm(basis, axis=1) > SHORTEST) & (
         np.linalg.norm(setpoints, axis=1) > SHORTEST_SETPOINT)
-    against: NDArray[np.bool_] = np.sum(basis * setpoints, axis=1) < 0.0
+    against: NDArray[np.bool_] = (along_velocity > 0.0) & (silent | ~with_some)
     return against[clear]

@@ -194,8 +194,10 @@ def read_flown(scenario: Scenario, out: Path, namespace: str = '') -> LiveFlight
 
     :param namespace: of its nodes; others publish their diagnostics on the same topic.
     :raises BagError: if its record cannot be read.
-    :raises LateError: if the scenario never began, or no image was made.
+    :raises LateError: if the scenario never began, no image was made, or nothing was written.
     """
+    if not (out / 'flight.npz').is_file():
+        raise LateError('the simulator was ended before it had written its record')
     with np.load(out / 'flight.npz') as file:
         log = dict(file)
     began, ended = float(log['began']), float(log['ended'])

@@ -33,7 +33,7 @@ from flock_desk.runs.flight import (
     spacing,
 )
 from flock_desk.runs.judge import flat, judge
-from flock_desk.runs.processes import Processes
+from flock_desk.runs.processes import LateError, Processes
 from flock_desk.runs.record import LiveFlight, read_flown
 from flock_desk.runs.summary import scenario_figures
 from flock_desk.scenarios.scenario import Outage, Scenario
@@ -415,6 +415,11 @@ def test_a_scenario_shorter_than_the_requested_duration_is_flown_to_its_end(
     assert flown == [60.0, 20.0]
     assert capsys.readouterr().out.count(
         'indoor lasts 60 s: it is flown for so long, not for --duration = 120 s\n') == 1
+
+
+def test_a_flight_without_a_record_is_late(tmp_path):
+    with pytest.raises(LateError, match='before it had written'):
+        read_flown(load('indoor'), Path(tmp_path))
 
 
 def test_a_flight_that_never_began_is_an_error(tmp_path):
