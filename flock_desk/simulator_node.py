@@ -31,7 +31,6 @@ vehicle of another simulator node, so followers fly in a column; the node ends w
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import sys
@@ -39,7 +38,7 @@ import time
 
 import cv2
 import numpy as np
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
@@ -212,7 +211,7 @@ class Simulator(FlockNode):
         executor.add_node(self)
         next_service = 0.0
         try:
-            with contextlib.suppress(ExternalShutdownException):
+            try:
                 while self.context.ok() and not self._finished():
                     # An external vehicle is stepped once a pose has come, which ends the wait.
                     wake = min(self._step_due() if self._external is None else math.inf,
@@ -230,6 +229,9 @@ class Simulator(FlockNode):
                         for _ in range(1 if self._ahead is None else MESSAGES):
                             executor.spin_once(timeout_sec=0.0)
                         self._watch(now)
+            except Exception:
+                if self.context.ok():
+                    raise  # during a shutdown rclpy raises from any place
             self._line.end()
             if self._values['log']:
                 self._save_log()  # also if asked to end: what was flown is judged
