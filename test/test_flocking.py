@@ -140,7 +140,8 @@ def test_one_agent_computes_what_the_flock_does(flock: tuple[Array, Array]) -> N
     x, v = flock
     for i, expected in enumerate(accelerations(x, v, FLIGHT)):
         others = [j for j in range(len(x)) if j != i]
-        assert_close(acceleration(x[others] - x[i], v[others] - v[i], FLIGHT), expected)
+        assert_close(acceleration(x[others] - x[i], v[others] - v[i], FLIGHT), expected,
+                     rounding(flock))
 
 
 def test_law_equals_its_formula_written_out() -> None:
