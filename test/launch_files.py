@@ -29,7 +29,6 @@ import runpy
 import sys
 from types import ModuleType
 from typing import Any
-from unittest import mock
 
 LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 
@@ -96,8 +95,14 @@ def stand_ins() -> Iterator[None]:
     modules = {name: ModuleType(name) for name in holding}
     for name, members in holding.items():
         vars(modules[name]).update(members)
-    with mock.patch.dict(sys.modules, modules):
+    before = {name: sys.modules[name] for name in modules if name in sys.modules}
+    sys.modules.update(modules)  # modules that a launch file imports stay imported
+    try:
         yield
+    finally:
+        for name in modules:
+            del sys.modules[name]
+        sys.modules.update(before)
 
 
 def launched(file: str, **arguments: str) -> tuple[dict[str, Node], Context]:
