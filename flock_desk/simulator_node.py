@@ -209,26 +209,9 @@ class Simulator(FlockNode):
             return 0
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        next_service = 0.0
         try:
             try:
-                while self.context.ok() and not self._finished():
-                    # An external vehicle is stepped once a pose has come, which ends the wait.
-                    wake = min(self._step_due() if self._external is None else math.inf,
-                               next_service, self._start + self._outputs.next_image)
-                    self._end.receive(wake - time.monotonic())
-                    now = time.monotonic()
-                    while (now if self._external is None
-                           else self._external.known(now)) >= self._step_due():
-                        self._step()
-                        if self._external is None:
-                            break  # lost time is flown through, but the bridge is answered between
-                    self._outputs.send_images(now, self._start)
-                    if now >= next_service:
-                        next_service = now + SERVICE_PERIOD
-                        for _ in range(1 if self._ahead is None else MESSAGES):
-                            executor.spin_once(timeout_sec=0.0)
-                        self._watch(now)
+                self._fly_in_real_time(executor)
             except Exception:
                 if self.context.ok():
                     raise  # during a shutdown rclpy raises from any place
@@ -246,6 +229,27 @@ class Simulator(FlockNode):
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
         return 0
+
+    def _fly_in_real_time(self, executor: SingleThreadedExecutor) -> None:
+        """Step the flight as time passes, until the scenario is flown or ROS shuts down."""
+        next_service = 0.0
+        while self.context.ok() and not self._finished():
+            # An external vehicle is stepped once a pose has come, which ends the wait.
+            wake = min(self._step_due() if self._external is None else math.inf, next_service,
+                       self._start + self._outputs.next_image)
+            self._end.receive(wake - time.monotonic())
+            now = time.monotonic()
+            while (now if self._external is None
+                   else self._external.known(now)) >= self._step_due():
+                self._step()
+                if self._external is None:
+                    break  # lost time is flown through, but the bridge is answered between
+            self._outputs.send_images(now, self._start)
+            if now >= next_service:
+                next_service = now + SERVICE_PERIOD
+                for _ in range(1 if self._ahead is None else MESSAGES):
+                    executor.spin_once(timeout_sec=0.0)
+                self._watch(now)
 
     def _blame(self, what: str) -> None:
         """Raise TooBusyError if the machine was too busy, and the node ends then."""

@@ -31,8 +31,8 @@ import numpy as np
 
 from flock_follower.geometry import Array, skew
 
-#: Time constant of the errors, s, and after how many of them they are forgotten.
-ALIKE_TIME, FORGOTTEN = 0.25, 6.0
+ALIKE_TIME = 0.25  # s, time constant of the errors
+FORGET_AFTER = 6.0  # time constants without such a measurement until the errors are forgotten
 
 
 class AlikeErrors:
@@ -47,7 +47,7 @@ class AlikeErrors:
         self._age += dt
         if self.cross is not None:
             self.cross = math.exp(-dt / ALIKE_TIME) * transition.dot(self.cross)
-            if self._age > FORGOTTEN * ALIKE_TIME:
+            if self._age > FORGET_AFTER * ALIKE_TIME:
                 self.cross = None
 
     def take(self, remain: Array, gain: Array, root: Array | None) -> None:

@@ -44,9 +44,10 @@ from flock_follower.perception.pose import locate, refine, Target
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.time_offset import MountedCamera
 
-#: A fit to a smeared marker starts from the estimate. If there was nothing else for this long, s,
-#: the marker is detected, and replaces a fit whose attitude differs by more than this, rad.
-UNTOLD, CONTRARY = 0.1, 0.3
+#: A fit to a smeared marker starts from the estimate: after this time, s, without a measurement
+#: of another kind the marker is detected to confirm the fit.
+CONFIRM_PERIOD = 0.1
+MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's is replaced
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
 
@@ -219,12 +220,12 @@ class Look:
         """Return the neighbours to search for that are not measured yet."""
         return [name for name in self.anywhere if name not in self.measured]
 
-    def told(self, image: GrayImage, found: Measurement, sought: Target,
+    def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
              dictionary: str) -> Measurement:
         """Return a measurement of a neighbour, or what its detected marker shows instead."""
-        name, told = found.name, self.camera.told
+        name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
-            if self.stamp - told.get(name, -math.inf) <= UNTOLD:
+            if self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD:
                 return found
             place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
             ids, corners = search.near(
@@ -233,11 +234,11 @@ class Look:
                 middle = place.apply(marker.T_body_marker.translation)
                 for outline in corners[ids == marker.marker_id]:
                     again = locate(image, self.model, sought, index, outline, prior)
-                    if again is not None and angle(again.T_camera_body, place) > CONTRARY and (
+                    if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
                                       middle) < marker.side_length):
                         return again._replace(stage='roi')  # the next image is searched, too
-        told[name] = self.stamp
+        confirmed_at[name] = self.stamp
         return found
 
     def distance(self, measurement: Measurement) -> float:

@@ -67,12 +67,16 @@ SIGMA_FLOOR = 0.05
 NARROW = 0.01
 #: Of a marker that is not tracked yet, more than this share of the edges must agree.
 FOUND_INLIERS = 0.8
-#: If more than this share of the edges agrees, to within this RMS, px, none of them is smeared: if
+#: If more than this share of the edges agrees, to within SHARP_RMS, none of them is smeared: if
 #: the code is not shown, either they are not of the marker, or something covers it.
-SHARP = 0.7, 0.15
-#: Share of the variances of errors alike from image to image, if edges are blurred by more than
-#: this share of a cell (1 sigma), shifted by more than SWOLLEN, or fewer than this share agree.
-ALIKE, BLURRED, PLAIN_INLIERS = 0.8, 0.2, 0.9
+SHARP_INLIERS = 0.7
+SHARP_RMS = 0.15  # px
+#: Share of the variances of errors that are alike from image to image, unless edges are plain.
+ALIKE_SHARE = 0.8
+#: Plain edges are blurred by less than this share of a cell (1 sigma) and shifted by less than
+#: SWOLLEN, and more than PLAIN_INLIERS of them agree.
+PLAIN_BLUR = 0.2
+PLAIN_INLIERS = 0.9
 #: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
 RUN_TOGETHER = 0.25
 #: So many samples of a smeared print count to decide between two attitudes. Most of what is left
@@ -257,12 +261,11 @@ def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: T
 
 def _plain(found: EdgeFit) -> bool:
     """Return whether edges have no errors that last: by a smear, over-exposure or a reflex."""
-    return found.blur < BLURRED and found.bloom < SWOLLEN and found.inliers > PLAIN_INLIERS
+    return found.blur < PLAIN_BLUR and found.bloom < SWOLLEN and found.inliers > PLAIN_INLIERS
 
 
 def _sharp(found: EdgeFit) -> bool:
-    share, rms = SHARP
-    return found.inliers > share and found.rms < rms
+    return found.inliers > SHARP_INLIERS and found.rms < SHARP_RMS
 
 
 def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
@@ -303,7 +306,7 @@ def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, index: int
     found = best.chosen.fit
     measurement = Measurement(
         sought.neighbor.name, found.pose, marker.T_body_marker.translation,
-        found.covariance * WIDENING**2, found.rms, None, alike=ALIKE)
+        found.covariance * WIDENING**2, found.rms, None, alike=ALIKE_SHARE)
     return widened(measurement, best) if check_mirrored else measurement
 
 
@@ -385,5 +388,5 @@ def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measure
         covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
         sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing,
-        alike=0.0 if _plain(found) else ALIKE)
+        alike=0.0 if _plain(found) else ALIKE_SHARE)
     return measurement if best is None else widened(measurement, best)

@@ -203,7 +203,7 @@ class MountedCamera:
         """Whether the next search of a whole image is thorough."""
         self.unchecked = dict.fromkeys(names, 0)
         """Number of images for which a neighbour's mirrored attitude need not be checked."""
-        self.told: dict[str, float] = {}
-        """Stamp of the last image in which a neighbour was told by more than its smear, s."""
+        self.confirmed_at: dict[str, float] = {}
+        """Stamp of the last image in which a neighbor was measured by more than its smear, s."""
         self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
         """That of the brightness profiles of each neighbour's last measurement, px."""

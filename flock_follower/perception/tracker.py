@@ -252,7 +252,7 @@ class Tracker:
         if self._of_candidate(look, found):
             look.others.append(found)
             return
-        found = look.told(image, found, self._targets[name], self.config.dictionary)
+        found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
         unchecked = look.camera.unchecked
         if found.margin is not None:

@@ -39,7 +39,7 @@ Behind another follower a headway T_h grows the near edge with the own speed -n 
 dg_near/dt = s + T_h (n . a + w_t . v_F / r) then has the own acceleration in it: with A the right
 side above, n . a >= (A - S'(g_near) T_h w_t . v_F / r) / (1 + S'(g_near) T_h). At the edge the
 velocity of the follower is that of the one ahead through (1 + tau z) / (1 + (tau + T_h) z), z the
-Laplace variable: no motion of a column grows from one follower to the next.
+Laplace variable: without delays no motion of a column grows from one follower to the next.
 
 The air below and above another vehicle is disturbed, so the horizontal distance has a bound of
 its own. The height of a neighbor out of sight is unknown: only its horizontal distance counts.

@@ -282,8 +282,8 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     age, radii_sum = me.stamp - n.stamp, params.radius + n.member.radius
     seen = here and (memory.lost is None or bool(neighbors.flock) or n.member.role == AVOID)
     joined = here and n.name in neighbors.edges
-    places = [_hovering(n, params) if silent(n, me.stamp, params)
-              else _expected(n, memory, me, params)]
+    has_failed = silent(n, me.stamp, params)
+    places = [_hovering(n, params) if has_failed else _expected(n, memory, me, params)]
     if age > SEEN and not n.received:  # its acceleration is a guess: never chase
         places.append(expected(n, np.zeros(3), age, params))
     # A follower in sight may go back at any time, as fast and as hard as the own vehicle can.
@@ -295,7 +295,7 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, scene: Scene, velocity: Array,
     if memory.lost is not None and not (seen or n.received):
         found = [retreating(each, memory.lost, me.position, velocity, params,
                             n.name == memory.lost.name) for each in found]
-    if silent(n, me.stamp, params):
+    if has_failed:
         found += [each._replace(normal=_aside(each.normal)) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
     return [each._replace(seen=False) for each in found] if n.received else found

@@ -71,7 +71,8 @@ def test_a_flight_that_the_bridge_ends_is_over_once_landed_and_its_log_has_time_
         110.0, 113.0, 60.0, 'TAKEN_OVER: the pilot took over')
 
 
-def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(ros):
+def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_ends_it(
+        ros, tmp_path):
     ear, executor = rclpy.create_node('ear'), SingleThreadedExecutor()
     executor.add_node(ear)
     raw = {topic: [] for topic in TOPICS}
@@ -82,7 +83,8 @@ def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_end
         ear.create_subscription(kind, topic, raw[topic].append, qos, raw=True)
     child = subprocess.Popen(
         [sys.executable, '-m', 'flock_desk.simulator_node', '--ros-args', '-p',
-         'scenario:=hover', '-p', f'connection:=127.0.0.1:{free_udp_port()}'],
+         'scenario:=hover', '-p', f'connection:=127.0.0.1:{free_udp_port()}',
+         '-p', f'log:={tmp_path / "flight.npz"}'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
     def received():
@@ -97,6 +99,7 @@ def test_odometry_images_calibration_and_truth_share_their_stamps_and_ctrl_c_end
         child.kill()
         ear.destroy_node()
     assert child.returncode == 0 and 'Traceback' not in output + errors
+    assert (tmp_path / 'flight.npz').is_file()  # what was flown is judged
     messages = {topic: [deserialize_message(data, TOPICS[topic]) for data in found]
                 for topic, found in raw.items()}
     times = {topic: np.array([stamp_to_nanoseconds(m.header.stamp) for m in found])

@@ -81,16 +81,16 @@ class WatchedParameters(RemoteParameters):
     """
 
     def __init__(self, node: Node, other: str, flying: Callable[[], bool]) -> None:
-        super().__init__(node, other, self._compare)
+        super().__init__(node, other)
         self._other, self._flying = other, flying
-        self._before: dict[str, Any] | None = None
         self._difference = ''
         node.create_timer(WATCH_PERIOD, self.ask, clock=STEADY)
 
-    def _compare(self, values: dict[str, Any]) -> None:
-        before, self._before = self._before, values
-        if before is not None and self._flying():
-            self._difference = differences(before, values)
+    def take(self, values: dict[str, Any]) -> None:
+        """Take all values of the other node, and what differs from those before in flight."""
+        if self.values is not None and self.values != values and self._flying():
+            self._difference = differences(self.values, values)
+        super().take(values)
 
     def changed_in_flight(self, now: float) -> str:
         """Return the last change of this flight, with both values; '' if there was none."""
