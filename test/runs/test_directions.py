@@ -36,8 +36,8 @@ def log(setpoint, velocity):
 
 
 @pytest.mark.parametrize(('setpoint', 'velocity', 'commanded', 'share'), [
-    # The offset of the thrust does not count.
-    ([1.0, 0.0, -1.2], -EAST, True, 0.0), (-EAST, EAST, True, 1.0),
+    # The offset of the thrust does not count, and a gate that brakes is no turned sign.
+    ([1.0, 0.0, -1.2], -EAST, True, 0.0), (-EAST, EAST, True, 0.0), (-EAST, -EAST, True, 1.0),
     (-EAST, EAST, False, 0.0), (EAST, EAST, False, 1.0),
     ([0.0, 0.0, 1.0], [0.0, 0.0, 1.0], False, 1.0)])
 def test_a_turned_sign_is_against_the_command_or_along_the_velocity(
