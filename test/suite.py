@@ -12,14 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Run the suite, as ``make test`` does: what waits for nodes, and then what computes.
+Run the suite, as ``make test`` does: flights of all nodes alone, and then all else, two by two.
 
-Nothing computes beside the nodes, which fly in real time, and all have the ordinary priority: both
-parts go on beside other work. Every 20 s a line reports the tests done, their number, the time
-left, and the log. A test of nodes that failed while other
-programs had the processors may have failed for that: it is repeated alone at the end, and that
-result counts. Exit code 0 if all passed, 1 if one failed, 3 if only tests failed for which it was
-too busy alone, too.
+Nothing computes beside the flights, which are in real time, and all have the ordinary priority:
+both parts go on beside other work. Every 20 s a line reports the tests done, their number, the
+time left, and the log. A test of nodes that failed while other programs had the processors may
+have failed for that: it is repeated alone at the end, and that result counts. Exit code 0 if all
+passed, 1 if one failed, 3 if only tests failed for which it was too busy alone, too.
 
 ``test/suite.py [TEST ...] [-m MARKERS]``: some tests only.
 """
@@ -41,8 +40,8 @@ PROGRESS = 20.0  # s between two lines
 PYTEST = (sys.executable, '-m', 'pytest', '--timeout', '600', '--timeout-method', 'thread', '-v')
 PARALLEL = ('-n', '2', '--dist', 'loadfile', '--no-loadscope-reorder')
 #: The parts of the whole suite, in this order: the name of the log, and what pytest is asked for.
-PARTS = {'test-nodes': ('-m', 'ros and not sweep'),
-         'test-computing': (*PARALLEL, '-m', 'not ros and not sweep')}
+PARTS = {'test-flights': ('-m', 'ros and slow and not sweep'),
+         'test-others': (*PARALLEL, '-m', 'not (ros and slow) and not sweep')}
 #: Where conftest.py writes how far a run is.
 STATUS = 'FLOCK_FOLLOWER_TEST_STATUS'
 FAILED, TOO_BUSY = 1, 3  # exit codes

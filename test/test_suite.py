@@ -43,8 +43,8 @@ def test_a_run_that_ended_for_another_reason_is_never_excused(code: int) -> None
 
 
 def test_the_line_has_done_total_time_left_and_logs() -> None:
-    assert progress('test-nodes', Status(100, 25, 1), 60.0) == (
-        '1:00: 25 of 100 tests done, 1 failed, about 3:00 left; build/test-nodes.log')
+    assert progress('test-flights', Status(100, 25, 1), 60.0) == (
+        '1:00: 25 of 100 tests done, 1 failed, about 3:00 left; build/test-flights.log')
     assert '0 of ? tests done, 0 failed, collecting' in progress('test', Status(), 1.0)
 
 

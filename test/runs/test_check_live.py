@@ -62,6 +62,7 @@ def amiss(found: dict[str, list[Any]], level: str) -> list[str]:
     return [what for what, findings in found.items() for f in findings if f['level'] == level]
 
 
+@pytest.mark.slow
 def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
     port = free_udp_port()
     with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
