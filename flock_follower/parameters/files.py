@@ -49,6 +49,7 @@ COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'
 
+
 def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
     """
     Return the checked values of every parameter of the nodes of ``table``, defaults included.
