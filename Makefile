@@ -7,7 +7,7 @@
 #   make test      run the test suite (about nine minutes on two cores); exit code 3 if a machine that is too busy fails it
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
-#   make lint      style and types
+#   make lint      style, types and names
 #   make site      build the pages of docs/ as a site, with every link checked (build/site)
 #   make px4-events  write flock_follower/mavlink/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
 #   make bless     make the present result of the sample bag the golden one (test/frozen)
@@ -113,6 +113,7 @@ site:
 lint: setup
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+	@$(RUN) test/names.py
 
 bless: setup
 	@$(RUN) test/frozen.py --write sample
