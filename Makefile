@@ -7,9 +7,9 @@
 #   make test      run the test suite (about nine minutes on two cores); exit code 3 if a machine that is too busy fails it
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
-#   make lint      style and types
+#   make lint      style, types and names
 #   make site      build the pages of docs/ as a site, with every link checked (build/site)
-#   make px4-events  write config/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
+#   make px4-events  write flock_follower/mavlink/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
 #   make bless     make the present result of the sample bag the golden one (test/frozen)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
 #   make frozen    compare with them, bit for bit (minutes; RUNS=4: the first 4 runs of each scenario)
@@ -35,7 +35,7 @@
 #   ROS=kilted          ROS 2 Kilted instead of Jazzy
 #   VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
 #   TESTS=test/mavlink  what `make test` runs
-#   MARKERS='not ros'   which of its tests: an expression of unit, ros, slow and sweep
+#   MARKERS='not ros'   which of its tests: an expression of unit, ros, slow, sweep and linter
 #   SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
@@ -113,6 +113,7 @@ site:
 lint: setup
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+	@$(RUN) test/names.py
 
 bless: setup
 	@$(RUN) test/frozen.py --write sample

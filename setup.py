@@ -14,24 +14,23 @@
 
 from glob import glob
 import os
-import sys
 
 from setuptools import find_packages, setup
 
 package_name = 'flock_follower'
-# colcon and ROS's packages install by these, with setup.cfg's lib/flock_follower for the programs.
-for_ros = {'install', 'develop'} & set(sys.argv)
+URL = 'https://github.com/flock-follower/flock_follower'
 
 setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=['flock_*']),
+    package_data={'flock_desk': ['data/*'], 'flock_follower.mavlink': ['*.txt']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
         (os.path.join('share', package_name, 'config'), sorted(glob('config/*.*'))),
-        (os.path.join('share', package_name, 'config', 'scenarios'),
-         sorted(glob('config/scenarios/*.yaml'))),
+        *((os.path.join('share', package_name, folder), sorted(glob(f'{folder}/*')))
+          for folder in ('config/dds', 'config/scenarios', 'config/views')),
         (os.path.join('share', package_name, 'launch'), sorted(glob('launch/*.launch.py'))),
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
         (os.path.join('share', package_name, 'deploy'), sorted(glob('deploy/*'))),
@@ -40,7 +39,9 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     maintainer='The flock_follower developers',
-    maintainer_email='flock-follower@example.com',
+    maintainer_email='flock-follower@users.noreply.github.com',
+    url=URL,
+    project_urls={'Bugs': f'{URL}/issues', 'Security': f'{URL}/security/advisories/new'},
     description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
     license='Apache-2.0',
     # Not needed in flight: for the figures, and for large flocks.
@@ -50,7 +51,7 @@ setup(
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
                                 'ros-jazzy-common-interfaces==5.3.6', 'matplotlib', 'numpy>=1.26',
                                 'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags',
-                                'mcap', 'tqdm'],
+                                'mcap', 'scipy', 'tqdm'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
@@ -71,8 +72,7 @@ setup(
             'figures = flock_desk.figures:main',
             'flights = flock_desk.flights:main',
             'marker = flock_desk.marker:main',
-        ] if for_ros else [
-            # pip puts programs into bin, where names such as `replay` belong to others.
+            # All of the above by one name, for a virtual environment.
             'flock_follower = flock_desk.program:main',
         ],
     },

@@ -212,7 +212,7 @@ class Follower:
 
     def attitude(self, time: int, quaternion: Array, rates: Array) -> OdometryState | None:
         """
-        Take the autopilot's attitude (x, y, z, w), FLU to ENU, and its rates (3,), rad/s, FLU.
+        Take the autopilot's attitude, (x, y, z, w), FLU to ENU, and its rates (3,), rad/s, FLU.
 
         :returns: the motion without odometry, while that is flown on.
         """

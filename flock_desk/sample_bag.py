@@ -207,7 +207,7 @@ class Recording:
 PARAMETERS = """\
 # The parameters of this flight that are not the defaults. `evaluate` and `make demo` read them;
 # beside a replay start planner and bridge with --params-file and this file.
-/**/follower:
+/**:
   ros__parameters:
     v_max: 2.0                 # m/s; a first flight has 0.5
 """

@@ -48,7 +48,7 @@ _YOUNG: Final = 10.0
 
 
 def profile_variables(relative: str) -> dict[str, str]:
-    """Return the variables for a profile that the package ships, such as 'config/fastdds.xml'."""
+    """Return the variables for a profile of the package, such as 'config/dds/fastdds.xml'."""
     return dict.fromkeys(PROFILE_VARIABLES, str(resource(relative)))
 
 

@@ -19,7 +19,9 @@ Keeps every test on this machine and repeatable, and marks it ``unit``, ``ros`` 
 ``ros``, and to modules that import ROS. Another test that starts a process of ours says it itself.
 ``slow``: takes seconds, or belongs to a module of such tests; says it itself.
 ``sweep``: more cases of what another test holds; says it itself, and runs with ``make test-slow``.
-``unit``: all else. A test without ``ros`` that loads rclpy or starts a process of ours fails.
+``linter``: one of ROS's linters; says it itself.
+``unit``: all else. Without paths and markers pytest runs these and the linters: `colcon test`.
+A test without ``ros`` that loads rclpy or starts a process of ours fails.
 
 A test with ``ros`` that fails while other programs had the processors says so.
 """
@@ -52,8 +54,10 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = private_environment()['ROS_DOMAIN_ID']
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 # Nodes find each other in a fifth of a second instead of up to 2.5 s.
-os.environ.update(profile_variables('config/fastdds.xml'))
+os.environ.update(profile_variables('config/dds/fastdds.xml'))
 
+#: The tests that run unless paths or markers are given.
+FAST = 'unit or linter'
 #: Modules of the packages that import rclpy.
 NODES = 'flock_follower.nodes', 'flock_desk.simulator_', 'flock_desk.recorder_node'
 
@@ -102,7 +106,7 @@ def pytest_ignore_collect(collection_path, config):
         return True
     if asked.startswith('ros') and not may_use_ros(collection_path):
         return True
-    if asked in ('unit', 'not slow') and is_slow(collection_path):
+    if asked in ('unit', FAST, 'not slow') and is_slow(collection_path):
         return True
     return None  # others may have reasons to leave it out
 
@@ -113,7 +117,7 @@ def pytest_collection_modifyitems(items):
         if (HERE / 'nodes' in item.path.parents or 'ros' in item.fixturenames
                 or loads_ros(item.path)):
             item.add_marker('ros')
-        if not any(item.get_closest_marker(name) for name in ('ros', 'slow', 'sweep')):
+        if not any(item.get_closest_marker(name) for name in ('ros', 'slow', 'sweep', 'linter')):
             item.add_marker('unit')
     items.sort(key=lambda item: item.get_closest_marker('slow') is None)
 
@@ -188,7 +192,9 @@ class Progress:
 
 
 def pytest_configure(config):
-    """Measure the load, where tests run; count them, where they are reported."""
+    """Choose the tests; measure the load, where they run; count them, where they are reported."""
+    if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.option.markexpr:
+        config.option.markexpr = FAST
     threading.Thread(target=measure_load, daemon=True).start()
     if not hasattr(config, 'workerinput'):
         config.pluginmanager.register(Progress(os.environ.pop('FLOCK_FOLLOWER_TEST_STATUS', '')))

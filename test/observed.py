@@ -220,7 +220,7 @@ def _healthy(live: bool) -> Observed:
                   for n in range(12)],
         shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
         statuses={node: NodeStatus(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
-              for node in OURS} if live else {},
+                  for node in OURS} if live else {},
         machine=Machine(Load(0.01, 0.4, 4), 8000.0, 512 * 1024, domain='0'))
 
 

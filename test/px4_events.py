@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Make ``config/px4_events.txt`` from the sources of several versions of PX4.
+Make ``flock_follower/mavlink/px4_events.txt`` from the sources of several versions of PX4.
 
 ``px4_events.py 1.16=FOLDER 1.18=FOLDER``: each folder holds the sources of a version in which
 ``make px4_sitl`` was run, which writes the metadata of the events. Change ``TEXTS``, not the file.
@@ -31,7 +31,7 @@ from flock_follower.mavlink.status_texts import (
     OTHER,
 )
 
-PATH = Path(__file__).resolve().parents[1] / 'config' / 'px4_events.txt'
+PATH = Path(__file__).resolve().parents[1] / 'flock_follower/mavlink/px4_events.txt'
 METADATA = 'build/px4_sitl_default/events/all_events.json'
 #: Id in the metadata of the component that sends the events: the autopilot.
 AUTOPILOT = '1'

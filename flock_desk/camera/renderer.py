@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -34,12 +35,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flock_desk.camera.lens import Camera
-from flock_follower.files import resource
 from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
 from flock_follower.perception.markers import draw_marker
 
 Image = NDArray[np.float32]
 
+#: The surroundings: a photograph in all directions.
+PANORAMA = Path(__file__).resolve().parents[1] / 'data' / 'panorama.jpg'
 NEAR = 0.05  # m: nothing nearer to the camera is seen
 _SHIFT = 4  # bits behind the point in the corners of polygons
 _MARGIN = 2  # px around a body
@@ -150,14 +152,14 @@ def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:
 
 class _Panorama:
     """
-    The surroundings in all directions, from config/panorama.jpg.
+    The surroundings in all directions, from ``PANORAMA``.
 
     A row is an elevation, a column an azimuth, anticlockwise seen from above; the first and last
     row are repeated up to the zenith and down to the nadir.
     """
 
     def __init__(self, camera: Camera) -> None:
-        stored: Any = cv2.imread(str(resource('config/panorama.jpg')), cv2.IMREAD_GRAYSCALE)
+        stored: Any = cv2.imread(str(PANORAMA), cv2.IMREAD_GRAYSCALE)
         self._light = (_SKY * (stored / 255.0) ** 2.2).astype(np.float32)
         self._shape = camera.height, camera.width
         # Middles of cells, from one cell before the image to one behind it.

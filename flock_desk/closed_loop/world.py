@@ -125,7 +125,7 @@ class World:
 
     @property
     def velocities(self) -> Array:
-        """Return the true velocities (n, m + 1, 3), m/s, the leader first."""
+        """Return the true velocities, (n, m + 1, 3), m/s, the leader first."""
         return self._all(self._leader_velocity[self._step], self.vehicle.velocity)
 
     @property
@@ -141,7 +141,7 @@ class World:
 
     @property
     def distances(self) -> Array:
-        """Return the true distances (rows, m) to the others, m; infinite if one is gone."""
+        """Return the true distances, (rows, m) to the others, m; infinite if one is gone."""
         both = self.present[self.others] & self.present[1:, None]
         return np.where(both, np.sqrt(np.sum(self.offsets ** 2, axis=3)), np.inf).reshape(
             -1, len(self.others))
@@ -187,7 +187,7 @@ class World:
                 self.vio.position, self.vio.velocity, yaw.tolist())])
 
     def attitudes(self) -> Array:
-        """Return the attitudes (rows, 3, 3) by the autopilots, FLU to ENU, with their errors."""
+        """Return the attitudes, (rows, 3, 3) by the autopilots, FLU to ENU, with their errors."""
         tilt = self._tilt.step()
         x, y = tilt.T
         error = np.tile(np.eye(3), (len(tilt), 1, 1))

@@ -271,7 +271,7 @@ class Evaluation(Listener):
 
     @property
     def ticks(self) -> Array:
-        """Return the ticks (n, 4)."""
+        """Return the ticks, (n, 4)."""
         return np.reshape(np.array(self.tick_rows, dtype=float), (-1, 4))
 
     @property
@@ -283,7 +283,7 @@ class Evaluation(Listener):
 
     @property
     def setpoints(self) -> Array:
-        """Return the setpoints (n, 5)."""
+        """Return the setpoints, (n, 5)."""
         return np.reshape(np.array(self.setpoint_rows, dtype=float), (-1, 5))
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:

@@ -112,7 +112,7 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
     handles = [*_agent_handles(names), *(
         Line2D([], [], color=INK, marker='o', markerfacecolor=fill, linestyle='', markersize=4,
                label=label) for fill, label in (('white', 'start'), (INK, f'after {end:g} s'))),
-        Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
+               Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
     return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
                    share=(False, False))
 

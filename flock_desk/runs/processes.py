@@ -91,7 +91,7 @@ def private_environment(domain_id: int | None = None) -> dict[str, str]:
         **os.environ,
         'ROS_DOMAIN_ID': str(_own_domain() if domain_id is None else domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        **profile_variables('config/fastdds.xml'),
+        **profile_variables('config/dds/fastdds.xml'),
         'PYTHONUNBUFFERED': '1',
     }
 

@@ -387,7 +387,7 @@ def rate(times: Array) -> float:
 
 
 def norms(vectors: Array) -> Array:
-    """Return the norms (n,) of vectors (n, 3)."""
+    """Return the norms, (n,) of vectors (n, 3)."""
     return np.linalg.norm(vectors, axis=1)
 
 

@@ -187,7 +187,7 @@ class VioErrors(Part):
         0.02, Range(0.0, 10.0, 'm'),
         'Drift of each horizontal coordinate, m after 1 s, growing with the root of time.')
     height_walk: float = parameter(0.02, Range(0.0, 10.0, 'm'),
-        'Drift of the height, m after 1 s.')
+                                   'Drift of the height, m after 1 s.')
     yaw_walk: float = parameter(
         0.0017, Range(0.0, 1.0, 'rad'),
         'Drift of the yaw, rad after 1 s; it turns the later course.')
@@ -204,11 +204,11 @@ class VioErrors(Part):
     attitude: float = parameter(
         0.0004, Range(0.0, 0.5, 'rad'), 'White noise of the attitude about each axis, rad.')
     velocity: float = parameter(0.02, Range(0.0, 5.0, 'm/s'),
-        'Error of the velocity per axis, m/s.')
+                                'Error of the velocity per axis, m/s.')
     velocity_memory: float = parameter(
         0.3, Range(0.01, 600.0, 's'), 'Correlation time of that error, s.')
     velocity_white: float = parameter(0.006, Range(0.0, 5.0, 'm/s'),
-        'White noise of the velocity, m/s.')
+                                      'White noise of the velocity, m/s.')
     gyro_bias: float = parameter(
         0.002, Range(0.0, 1.0, 'rad/s'), 'Remaining bias of the gyroscopes, rad/s, constant.')
     gyro: float = parameter(
@@ -221,7 +221,7 @@ class RangeErrors(Part):
 
     rate: float = parameter(0.0, Range(0.0, 60.0, 'Hz'), 'Rate of the ranges, Hz; 0: no ranges.')
     noise: float = parameter(0.1, Range(0.0, 10.0, 'm'),
-        'Standard deviation of the white noise, m.')
+                             'Standard deviation of the white noise, m.')
     bias: float = parameter(
         0.1, Range(0.0, 10.0, 'm'),
         'Standard deviation of the constant error, m; each run draws one.')

@@ -76,12 +76,12 @@ class Estimator:
 
     @property
     def position(self) -> Array:
-        """Return the estimated position (3,), m."""
+        """Return the estimated position, (3,), m."""
         return self._vehicle.position + self._position_error
 
     @property
     def velocity(self) -> Array:
-        """Return the estimated velocity (3,), m/s."""
+        """Return the estimated velocity, (3,), m/s."""
         return self._vehicle.velocity + self._velocity_error
 
     @property
@@ -157,7 +157,7 @@ class Barometer:
         self._time: float | None = None
 
     def heights(self, true: Array, now: float) -> Array:
-        """Return the heights (n,), m, measured at a time, s, of true ones (n,), m."""
+        """Return the heights, (n,), m, measured at a time, s, of true ones (n,), m."""
         drawn = np.stack([g.standard_normal(2) for g in self._generators])
         keep = 1.0 if self._time is None else math.exp(-(now - self._time) / DRIFT_TIME)
         self._time = now

@@ -98,7 +98,7 @@ def _shared_memory(machine: Machine, image: int) -> Finding:
          'fastdds shm clean'),
         (image > machine.segment, WARNING,
          f'images of {image / 1024:.0f} kB, of which some may be lost',
-         ' and '.join(f'{name}=.../config/fastdds.xml' for name in PROFILE_VARIABLES)
+         ' and '.join(f'{name}=.../config/dds/fastdds.xml' for name in PROFILE_VARIABLES)
          + ' for every node'),
         (free is None, UNMEASURED, 'the space in /dev/shm is unknown', ''),
         (not image, UNMEASURED, 'no image was seen', ''),

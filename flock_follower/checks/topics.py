@@ -242,10 +242,10 @@ def _check_network(reach: Iterable[tuple[str, Reach | None]]) -> Finding:
     return first(
         'network', 'the network does not reach the nodes',
         (found, WARNING, f'any computer on it can command: it finds {found}',
-         'start every node with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST and config/fastdds.xml, '
-         'see docs/deploy.md'),
+         'start every node with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST and '
+         'config/dds/fastdds.xml, see docs/deploy.md'),
         (addressed, WARNING, 'a computer that names the address of this one as a peer can '
-         f'command: it reaches {addressed}', 'start every node with config/fastdds.xml; a flock '
-         'with peers needs a firewall: see docs/deploy.md'),
+         f'command: it reaches {addressed}', 'start every node with config/dds/fastdds.xml; a '
+         'flock with peers needs a firewall: see docs/deploy.md'),
         (unknown, UNMEASURED, f'no socket of DDS is seen in {unknown}', ''),
         (True, OK, 'ROS stays on this computer', ''))

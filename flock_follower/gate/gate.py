@@ -279,8 +279,8 @@ class Gate:
         if (motion := self.relative.reckoning) is not None:
             return Location(height, float(motion.velocity[2]))
         return Location(height, self.heights.climb_rate if height is not None else 0.0,
-                     None if position is None or self._start is None else (
-                         position - self._start)[:2])
+                        None if position is None or self._start is None else (
+                            position - self._start)[:2])
 
     def handover(self, now: float) -> str:
         """Return why the vehicle must be handed to the autopilot's hold mode, or ''."""

@@ -17,7 +17,8 @@ Connection URLs, and the texts of errors of their devices, with remedies.
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
 ``/dev/DEVICE[,BAUD]`` is a serial port. The forms of other programs for the same are taken:
-pymavlink's ``udp:`` (``udpin:``), ``udpin://HOST:PORT``, ``/dev/DEVICE:BAUD``, ``serial:///dev/...``.
+pymavlink's ``udp:`` (``udpin:``), ``udpin://HOST:PORT``, ``/dev/DEVICE:BAUD``,
+``serial:///dev/...``.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ Texts of the autopilot, and reports to the pilot's ground station.
 PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
 refuses a mode. PX4 reports its arming checks by EVENTs on every link: one for each failed check,
 with the modes concerned, between two summaries. PX4 sends them after a change, and after
-MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``config/px4_events.txt`` has
+MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; ``px4_events.txt`` has
 the names and texts of several versions. An event without a name there is reported by its number.
 
 ``GroundStationReport`` reports the planner's state as STATUSTEXT and the distance as a number.
@@ -33,15 +33,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 import math
+from pathlib import Path
 import struct
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.files import resource
-
-#: Kinds of the rows of ``config/px4_events.txt``, see there.
+#: Kinds of the rows of ``px4_events.txt``, see there.
 CHECK, COMMANDER, ACTION, OTHER = 'check', 'commander', 'action', 'other'
 #: The upper byte of the number of an event of the autopilot.
 _AUTOPILOT_EVENTS: Final[int] = 1
@@ -75,7 +74,7 @@ def event_number(name: str) -> int:
 
 
 class EventRow(NamedTuple):
-    """A row of ``config/px4_events.txt``."""
+    """A row of ``px4_events.txt``."""
 
     versions: tuple[str, ...]
     """The versions of PX4 that send it."""
@@ -86,8 +85,8 @@ class EventRow(NamedTuple):
 
 
 def read_events() -> dict[str, EventRow]:
-    """Return the rows of ``config/px4_events.txt`` by the names of the events."""
-    lines = resource('config/px4_events.txt').read_text(encoding='utf-8').splitlines()
+    """Return the rows of ``px4_events.txt`` by the names of the events."""
+    lines = Path(__file__).with_name('px4_events.txt').read_text(encoding='utf-8').splitlines()
     rows = (line.split(' | ') for line in lines if not line.startswith('#'))
     return {name: EventRow(tuple(versions.split()), kind, text)
             for name, versions, kind, text in rows}

@@ -161,7 +161,7 @@ class MavlinkBridge(FlockNode):
         if shared_memory_size():
             self.get_logger().warning(
                 'Fast DDS shares memory with other processes here: connecting to one can '
-                'stop the setpoints for up to 1 s; config/fastdds_udp.xml prevents that')
+                'stop the setpoints for up to 1 s; config/dds/fastdds_udp.xml prevents that')
 
     def _connect(self, values: Mapping[str, Any]) -> None:
         """Create the subscriptions, timers and services."""

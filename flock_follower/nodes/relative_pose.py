@@ -99,7 +99,6 @@ class _Camera:
         return ERROR, (f'no image{self.of} processed for {now - self.dropping_since:.0f} s: '
                        f'{self._last_rejection}')
 
-
     def _rectified_problem(self, now: float) -> Problem | None:
         model = self._node.camera_model(self.name)
         if model is None or not model.distortion.any() or not marked_rectified(self._images):

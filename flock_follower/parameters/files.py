@@ -27,13 +27,12 @@ from typing import Any
 
 from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.sections import (
-    ALL,
-    find_sections,
+    ALL_NODES,
     last,
     names,
     naming,
     read,
-    SHARED,
+    read_sections,
 )
 from flock_follower.parameters.spec import (
     check_values,
@@ -49,6 +48,7 @@ COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'
+
 
 def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
     """
@@ -85,21 +85,20 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
 
     :raises ValueError: naming the fault.
     """
-    named: dict[str, dict[str, Any]] = {name: {} for name in (*table, SHARED, ALL)}
+    named: dict[str, dict[str, Any]] = {name: {} for name in (*table, ALL_NODES)}
     found: dict[str, dict[str, Any]] = {node: {} for node in table}
     matched = False
-    for section, parameters in find_sections('', document):
-        name = ALL if last(section) == '*' else last(section)
+    for section, parameters in read_sections(document):
+        name = ALL_NODES if last(section) == '*' else last(section)
         if name in named:
             matched = True
             named[name].update(parameters)
-            for node in table if name == ALL else table.keys() & {name}:
+            for node in table if name == ALL_NODES else (name,):
                 found[node].update(parameters)
-        elif near := difflib.get_close_matches(name, [*table, SHARED], n=1):
+        elif near := difflib.get_close_matches(name, table, n=1):
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
     if not matched:
         raise ValueError(f'holds ros__parameters neither of /** nor of {", ".join(table)}')
-    found = {node: {**named[SHARED], **values} for node, values in found.items()}
     known = {node: names(specs, found[node]) for node, specs in table.items()}
     for name, parameters in named.items():
         refuse_unknown(parameters, known.get(name) or set().union(*known.values()), name)

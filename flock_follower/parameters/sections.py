@@ -17,9 +17,8 @@ ROS 2 parameter files, read without ROS.
 
 A file maps names of nodes to their parameters, under ``ros__parameters``. The section ``/**`` is
 for every node; if it and the section of a node set one parameter, the last one in the file wins,
-as in rcl. A name under ``/**`` must be a parameter of one of the nodes, not of all. ROS has no
-section for some nodes; the nodes themselves read the section ``follower``: each takes the
-parameters that it has, unless its own section, ``/**`` or the command line sets them.
+as in rcl. A name under ``/**`` must be a parameter of one of the nodes, not of all: each node
+takes those that it has.
 """
 
 from __future__ import annotations
@@ -40,31 +39,32 @@ from flock_follower.parameters.spec import expanded, refuse_unknown, Spec
 
 #: Key of a node's diagnostics: its parameter files.
 PARAMETER_FILES: Final = 'parameter_files'
-#: The section whose parameters hold for each node of a follower that has them.
-SHARED: Final = 'follower'
+#: Name similarity, 0 to 1, from which a section is taken for a misspelled one.
+_MISSPELLED_SIMILARITY = 0.85
+#: Last token of a section for every node.
+ALL_NODES: Final = '**'
+#: Last tokens of sections for nodes of any name.
+_ANY_NAME = (ALL_NODES, '*')
+#: Former section of shared parameters: ROS applies it to no node.
+_FORMER_SHARED = 'follower'
 
-#: From this similarity on, a name is taken as a misspelt one; 1 is equal.
-_MISSPELT = 0.85
-#: The name of sections for every node.
-ALL = '**'
 
-
-def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
+def names_for_any_node(paths: Sequence[str | Path], node: str, specs: Sequence[Spec]) -> set[str]:
     """
-    Return the values of the sections ``follower`` beside a node; the last file wins.
+    Return the parameters that sections such as ``/**`` set for a node, whether it has them or not.
 
-    :param node: the node's full name, as '/drone1/planner'.
-    :raises ValueError: naming the file and its fault.
+    :param node: the node's full name, as '/drone1/planner'. :param specs: of its own parameters.
+    :raises ValueError: naming the file and its fault, such as a name that no node knows.
     :raises OSError: if a file cannot be read.
     """
-    follower = f'{node.rpartition("/")[0]}/{SHARED}'
-    found: dict[str, Any] = {}
+    found: set[str] = set()
     for path in paths:
         with naming(path):
-            for section, values in find_sections('', read(path)):
-                if means(section, follower) and last(section) == SHARED:
-                    refuse_unknown(values, FLIGHT_NAMES | names(CAMERA_SPECS, values), SHARED)
-                    found.update(values)
+            for section, values in read_sections(read(path)):
+                if last(section) in _ANY_NAME and means(section, node):
+                    known = FLIGHT_NAMES | names(CAMERA_SPECS, values) | names(specs, values)
+                    refuse_unknown(values, known, section)
+                    found |= values.keys() & known
     return found
 
 
@@ -79,9 +79,9 @@ def files_in(arguments: Sequence[str]) -> list[str]:
     return files
 
 
-def unheeded(path: str | Path, node: str) -> str:
+def ignored_sections(path: str | Path, node: str) -> str:
     """
-    Return a warning if ROS takes nothing from a file for a node, or not all that was meant; or ''.
+    Return a warning about sections that ROS will not apply to a node; '' if there are none.
 
     :param node: the node's full name, as '/drone1/planner'.
     :raises ValueError: if no section is for the node, but one has its name in another namespace,
@@ -89,12 +89,13 @@ def unheeded(path: str | Path, node: str) -> str:
     :raises OSError: if the file cannot be read.
     """
     with naming(path):
-        sections = [section for section, _ in find_sections('', read(path))]
+        sections = [section for section, _ in read_sections(read(path))]
     meant = [section for section in sections if difflib.SequenceMatcher(
-        None, last(section), last(node)).ratio() >= _MISSPELT]
+        None, last(section), last(node)).ratio() >= _MISSPELLED_SIMILARITY]
     if any(means(section, node) for section in sections):
-        misspelt = [] if any(last(section) == last(node) for section in meant) else meant
-        return f'{path}: {misspelt[0]} is another node: did you mean {node}?' if misspelt else ''
+        if not meant or any(last(section) == last(node) for section in meant):
+            return ''
+        return f'{path}: {meant[0]} is another node: did you mean {node}?'
     if meant:
         raise ValueError(f'{path}: holds parameters for {", ".join(meant)}, but none for {node}: '
                          f'name the section {node}, or /**/{last(node)}')
@@ -121,19 +122,29 @@ def names(specs: Sequence[Spec], values: Mapping[str, Any]) -> set[str]:
     return {spec.name for spec in expanded(specs, values)}
 
 
-def find_sections(prefix: str, document: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+def read_sections(document: Any) -> list[tuple[str, dict[str, Any]]]:
     """
-    Yield the full names of the nodes, or their patterns, with their parameters.
+    Return the full names of the nodes, or their patterns, with their parameters.
 
-    :raises ValueError: for a value that is not below ros__parameters: ROS takes no such file.
+    :raises ValueError: for a value that is not below ros__parameters: ROS takes no such file;
+        for a section ``follower``: ``/**`` has replaced it.
     """
+    sections = [*_find_sections('', document)]
+    for section, _ in sections:
+        if last(section) == _FORMER_SHARED:
+            raise ValueError(f'{section}: no node has this name: name the section of shared '
+                             f'parameters /**, and put it before those of the nodes')
+    return sections
+
+
+def _find_sections(prefix: str, document: Any) -> Iterator[tuple[str, dict[str, Any]]]:
     if not isinstance(document, Mapping):
         raise ValueError(f'{prefix or "the file"} = {document!r}: must be below ros__parameters')
     for key, content in document.items():
         if key == 'ros__parameters' and isinstance(content or {}, Mapping):
             yield prefix, _flat('', content or {})
         else:
-            yield from find_sections(f'{prefix}/{str(key).strip("/")}', content)
+            yield from _find_sections(f'{prefix}/{str(key).strip("/")}', content)
 
 
 def means(section: str, node: str) -> bool:

@@ -83,7 +83,7 @@ def widened(covariance: Array, part: slice | Array, factor: float) -> Array:
 
 
 def expected_innovation(prior: Array, jacobian: Array, noise: Array,
-                shared: Array | None) -> tuple[Array, Array]:
+                        shared: Array | None) -> tuple[Array, Array]:
     """
     Return the covariances of an innovation with the state, (n, 15), and of itself, (n, n).
 

@@ -92,7 +92,7 @@ class LearntNoise:
         return math.sqrt(place), math.sqrt(turn)
 
     def covariance(self, sight: Array) -> Array:
-        """Return the covariance (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
+        """Return the covariance, (6, 6) that it adds to a pose measured at ``sight`` (3,), m."""
         # An attitude error e turns all measurements about the own vehicle: it moves a marker at r
         # by e x r, and tilts it by e.
         leverage = _LEVERAGE.copy()

@@ -221,7 +221,7 @@ class Look:
         return [name for name in self.anywhere if name not in self.measured]
 
     def confirmed(self, image: GrayImage, found: Measurement, sought: Target,
-             dictionary: str) -> Measurement:
+                  dictionary: str) -> Measurement:
         """Return a measurement of a neighbour, or what its detected marker shows instead."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:

@@ -177,7 +177,7 @@ def _differences(side: int) -> Array:
 
 
 def quadrilaterals(logarithm: GrayImage) -> Array:
-    """Return the quadrilaterals (n, 4, 2), px, clockwise, that may be the outlines of markers."""
+    """Return the quadrilaterals, (n, 4, 2), px, clockwise, that may be the outlines of markers."""
     smooth = cv2.blur(logarithm, (3, 3))
     found = []
     for window, brush in _WINDOWS:

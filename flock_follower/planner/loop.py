@@ -243,7 +243,6 @@ class PlannerLoop:
             self._frame, stamp, nanoseconds - stamp, decision.altitude,
             decision.state is State.RELATIVE)
 
-
     def _acceleration(self, n: OdometryState) -> Array | None:
         """Return the acceleration (3,), m/s^2, of a neighbor, by the message nearest in time."""
         near = [each for each in (*self._earlier_accelerations, *self._accelerations)

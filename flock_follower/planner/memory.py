@@ -162,7 +162,7 @@ class Memory(NamedTuple):
     """When odometry was lost or returned last, s: the frame before is another one."""
 
     def acceleration(self, n: Neighbor) -> Array:
-        """Return a neighbor's acceleration (3,), m/s^2; zero for a received one, as outdated."""
+        """Return a neighbor's acceleration, (3,), m/s^2; zero for a received one, as outdated."""
         motion = self.motions.get(n.name)
         return np.zeros(3) if n.received or motion is None else motion.acceleration
 

@@ -70,4 +70,4 @@ def _vehicles(path: str) -> Mapping[str, Member]:
     return {n.name: Member(n.role, n.radius, tuple(
         math.atan2(*normal[1::-1]) for normal in (
             marker.T_body_marker.rotation[:, 2].round(6) + 0.0 for marker in n.markers)))
-        for n in load(path).neighbors}
+            for n in load(path).neighbors}

@@ -362,7 +362,7 @@ FAULTS: list[Fault] = [
           machine(reach=[('planner', Reach.NETWORK), ('mavlink_bridge', Reach.NETWORK),
                          ('relative_pose', Reach.ADDRESS)])),
     Fault('ROS open to those that know the address', LIVE, WARNING, 'network',
-          'it reaches relative_pose', 'config/fastdds.xml',
+          'it reaches relative_pose', 'config/dds/fastdds.xml',
           machine(reach=[('planner', Reach.COMPUTER), ('relative_pose', Reach.ADDRESS),
                          ('mavlink_bridge', None)])),
     Fault('ROS by other means', LIVE, UNMEASURED, 'network', 'seen in planner', '',

@@ -23,7 +23,7 @@ import pytest
 from flock_follower.checks.reach import find_reach, Reach
 
 #: Sockets of a node on domain 77, whose ports begin with 0x681A = 26650. Fast DDS 2.14 and 3.2
-#: bind the same: by ROS's default, with LOCALHOST, and with config/fastdds.xml. 0x1B58 and the
+#: bind the same: by ROS's default, with LOCALHOST, and with config/dds/fastdds.xml. 0x1B58 and the
 #: last one, by which it sends, are no ports of the domain.
 DEFAULT = ['00000000:1B58', '00000000:681A', '00000000:6824', '00000000:6825', '020200C0:E56C']
 LOCALHOST = ['00000000:1B58', '00000000:6824', '00000000:6825', '020200C0:E896']

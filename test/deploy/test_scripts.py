@@ -55,8 +55,8 @@ def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: 
 
 
 def test_without_peers_ros_keeps_to_the_loopback(workspace: Path) -> None:
-    profile = workspace / 'config' / 'fastdds.xml'
-    profile.parent.mkdir()
+    profile = workspace / 'config' / 'dds' / 'fastdds.xml'
+    profile.parent.mkdir(parents=True)
     profile.touch()
     kilted, jazzy = PROFILE_VARIABLES
     for variables, profiles in (

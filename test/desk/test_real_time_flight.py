@@ -75,7 +75,7 @@ class Commanded:
 
     def __init__(self, camera, acceleration=(0.0, 0.0, 0.0), yaw=0.0, **fields):
         self.flight = RealTimeFlight(scenario(sensing=STILL, **fields), 0,
-                                    EmbeddedVehicle(0.0, 1.5), camera)
+                                     EmbeddedVehicle(0.0, 1.5), camera)
         # Acceleration and yaw, as the bridge sends them: mask 0x83F.
         self._setpoint = mavlink.MAVLink_set_position_target_local_ned_message(
             0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, 0x83F, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,

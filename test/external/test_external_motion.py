@@ -95,7 +95,7 @@ def test_a_place_told_in_steps_of_a_centimetre_moves_evenly_and_does_not_drift()
 
 def test_between_poses_the_motion_is_interpolated_and_beyond_them_it_stands_still():
     motion = received(*((20 * k, truth('SIM_STATE', (k * JUMP * 0.02, 0.0, 0.0), (JUMP, 0.0, 0.0),
-                                    yaw=math.pi - 0.1 + 0.1 * k)) for k in range(3)))
+                                       yaw=math.pi - 0.1 + 0.1 * k)) for k in range(3)))
     half = motion.at(30 * MS)
     assert half.position[1] == pytest.approx(1.5 * JUMP * 0.02, abs=0.006)
     # Across the seam of the angles, the short way.
@@ -120,8 +120,8 @@ def test_what_happened_in_a_gap_or_after_the_last_pose_is_not_known():
 def test_the_estimate_counts_only_where_no_truth_came():
     assert received((0, estimate(1_000, (1.0, 0.0, 0.0)))).newest is None
     motion = received(*((20 * k, estimate(1_000 + 20 * k, (1.0 + 0.01 * k, 0.5, -2.0),
-                                       (0.5, 0.0, 0.0), yaw=0.5)) for k in range(3)),
-                   (70, truth('SIM_STATE', (9.0, 9.0, 9.0))), by_estimate=True)
+                                          (0.5, 0.0, 0.0), yaw=0.5)) for k in range(3)),
+                      (70, truth('SIM_STATE', (9.0, 9.0, 9.0))), by_estimate=True)
     assert motion.estimated and motion.knows(30 * MS) and motion.newest == 40 * MS
     now = motion.at(30 * MS)
     np.testing.assert_allclose(now.position, [0.0, 0.015, 0.0], atol=1e-6)

@@ -40,6 +40,8 @@ from flock_follower.flocking import accelerations, FlockingParams
 from flock_follower.geometry import Array
 
 pytestmark = pytest.mark.slow
+
+
 @pytest.mark.parametrize(('disagreement', 'settled'), [
     ([1.0, 1e-1, 1e-3, 1e-3], 1.5), ([1.0, 1e-3, 1e-1, 1e-3], 2.5), ([1.0, 1e-3, 1e-3, 0.1], None),
     ([1.0, 1e-2, 1e-3, 1e-4], 1.0), ([1.0, 1e-3, 1e-3, np.nan], None), ([0.0] * 4, None)])

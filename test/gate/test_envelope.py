@@ -188,7 +188,7 @@ def test_the_flight_defaults():
         'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
         'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0,
         'height_min': 0.5, 'height_max': 10.0, 'radius_max': 50.0,
-            'relative_flight': False, 'relative_timeout': 30.0}
+        'relative_flight': False, 'relative_timeout': 30.0}
     with pytest.raises(ValueError, match=r'height_max = 0.5: must be .* where height_min = 0.5'):
         GateLimits(height_max=0.5)
 

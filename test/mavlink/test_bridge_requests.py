@@ -181,4 +181,3 @@ def test_only_answers_to_us_are_believed(system, component, estimated):
         target_component=component).pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(1.0)
     assert (request.outcome is not None and 'denied' in request.outcome.message) == estimated
-

@@ -217,4 +217,3 @@ def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_fai
     success, message = request.outcome
     assert not success and message.startswith('takeoff not reached within 16.7 s')
     assert f'; land: HEARTBEAT shows {land}, armed' in message
-

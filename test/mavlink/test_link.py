@@ -149,8 +149,8 @@ def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out():
     bench = Bench(signing=Signing(KEY, UNIX))
     bench.beats('vehicle', now=100.0, signing=Signing(KEY, UNIX))
     for ahead, now, received in ((86400.0, 101.0, False), (1.0, 101.0, True), (59.0, 100.0, True),
-                              # Our clock goes on: what was too far ahead is not any more.
-                              (100.0, 139.0, False), (100.0, 141.0, True)):
+                                 # Our clock goes on: what was too far ahead is not any more.
+                                 (100.0, 139.0, False), (100.0, 141.0, True)):
         bench.codecs['vehicle'].signing.timestamp = Signing(KEY, UNIX + ahead).state.timestamp
         assert bool(bench.beats('vehicle', now=now)) == received
 

@@ -76,7 +76,8 @@ def test_position_and_attitude_arrive_in_enu_and_flu():
 
 def test_telemetry_that_is_not_finite_is_dropped():
     telemetry = received(mavlink.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0),
-                      mavlink.MAVLink_attitude_quaternion_message(0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
+                         mavlink.MAVLink_attitude_quaternion_message(
+                          0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
     assert telemetry.local_position is telemetry.attitude is None
 
 

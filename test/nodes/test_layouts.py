@@ -32,8 +32,8 @@ from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.visualizer import Visualizer
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config'
-PAGE = CONFIG.parent / 'docs' / 'deploy.md'
+VIEWS = Path(__file__).resolve().parents[2] / 'config' / 'views'
+PAGE = VIEWS.parents[1] / 'docs' / 'deploy.md'
 OF_ALL = {'rosout', 'parameter_events', 'diagnostics'}
 OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_type_description')
 
@@ -69,8 +69,8 @@ def test_the_table_from_which_a_policy_is_written_is_that_of_the_nodes(
 
 
 def named_topics() -> list[str]:
-    panels = json.loads((CONFIG / 'foxglove.json').read_text())['configById'].values()
-    rviz = yaml.safe_load((CONFIG / 'follower.rviz').read_text())['Visualization Manager']
+    panels = json.loads((VIEWS / 'foxglove.json').read_text())['configById'].values()
+    rviz = yaml.safe_load((VIEWS / 'follower.rviz').read_text())['Visualization Manager']
     return [*(topic for panel in panels for topic in panel.get('topics', {})),
             *(panel['imageMode']['imageTopic'] for panel in panels if 'imageMode' in panel),
             *(panel['topicToRender'] for panel in panels if 'topicToRender' in panel),

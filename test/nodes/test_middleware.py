@@ -34,7 +34,7 @@ from flock_follower.nodes.support.middleware import avoid_shared_memory
 KILTED, JAZZY = PROFILE_VARIABLES
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-OWN, UDP, UDP_IMAGES, IMAGES = (profile_variables(f'config/{name}.xml') for name in (
+OWN, UDP, UDP_IMAGES, IMAGES = (profile_variables(f'config/dds/{name}.xml') for name in (
     'fastdds', 'fastdds_udp', 'fastdds_udp_images', 'fastdds_images'))
 NO_PROFILE = dict.fromkeys(PROFILE_VARIABLES)
 #: Of the user; whichever variable he sets is the one that his distribution reads.
@@ -100,7 +100,7 @@ def test_images_come_without_where_the_kernel_has_room_for_them(given, changed):
     ('avoid', {**NO_PROFILE, RANGE: 'OFF'}, (0, Reach.ADDRESS))])
 def test_the_shared_memory_and_the_reach_of_a_process_are_found(avoid, changed, found):
     # Another test of this worker may have set the transport.
-    environment = {**os.environ, RANGE: 'LOCALHOST', **profile_variables('config/fastdds.xml'),
+    environment = {**os.environ, RANGE: 'LOCALHOST', **profile_variables('config/dds/fastdds.xml'),
                    TRANSPORTS: None, **changed}
     looked = subprocess.run(
         [sys.executable, '-c', LOOK, avoid], text=True, capture_output=True, timeout=30.0,

@@ -27,7 +27,8 @@ from flock_follower import neighbors_file
 from flock_follower.files import resource
 from flock_follower.flight_parameters import TABLE
 from flock_follower.parameters.files import parse_parameters, read_parameters
-from flock_follower.parameters.sections import files_in, SHARED, shared, unheeded
+from flock_follower.parameters.sections import files_in, ignored_sections, names_for_any_node
+from flock_follower.parameters.spec import Spec
 from flock_follower.planner.parameter_table import planner_params
 from flock_follower.planner.params import Member, RADIUS, ROLES
 
@@ -48,36 +49,37 @@ def test_a_section_sets_its_parameters_and_the_others_have_their_defaults(sectio
 def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
     path = resource('config/follower.yaml')
     sections = yaml.safe_load(path.read_text())
-    assert set(sections) == {f'/**/{node}' for node in (*TABLE, SHARED)}
+    assert list(sections) == ['/**', *(f'/**/{node}' for node in TABLE)]
     defaults = parse_parameters(of('/**'), TABLE)
     assert read_parameters(path, TABLE) == defaults
 
 
-def test_the_section_follower_holds_for_each_node_unless_its_own_sets_it() -> None:
-    for document in ({**of('follower', v_max=0.3, K=2.0), **of('planner', v_max=0.7)},
-                     {**of('planner', v_max=0.7), **of('/**/follower', v_max=0.3, K=2.0)}):
-        values = parse_parameters(document, TABLE)
-        assert values['planner']['v_max'] == 0.7 and values['planner']['K'] == 2.0
-        assert values['mavlink_bridge']['v_max'] == 0.3
+def test_a_shared_parameter_holds_until_a_later_section_sets_it() -> None:
+    values = parse_parameters({**of('/**', v_max=0.3, K=2.0), **of('planner', v_max=0.7)}, TABLE)
+    assert values['planner']['v_max'] == 0.7 and values['planner']['K'] == 2.0
+    assert values['mavlink_bridge']['v_max'] == 0.3
 
 
-def test_a_node_takes_what_the_section_follower_of_its_namespace_sets(tmp_path: Path) -> None:
+def test_a_node_knows_the_shared_names_of_its_namespace(tmp_path: Path) -> None:
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
-    first.write_text(yaml.safe_dump({**of('/**/follower', v_max=0.3, a_max=1.0),
-                                     **of('/**', K=2.0), **of('/other/follower', v_max=9.0)}))
-    second.write_text(yaml.safe_dump(of('/drone1/follower', v_max=0.4)))
-    assert shared([first, second], '/drone1/planner') == {'v_max': 0.4, 'a_max': 1.0}
-    assert shared([first, second], '/planner') == {'v_max': 0.3, 'a_max': 1.0}
-    second.write_text(yaml.safe_dump(of('follower', vmax=0.4)))
-    with pytest.raises(ValueError, match='second.yaml: unknown parameter vmax '):
-        shared([first, second], '/planner')
+    first.write_text(yaml.safe_dump({**of('/**', K=2.0, use_sim_time=True), **of('planner', m=1),
+                                     **of('/other/*', connection='x')}))
+    second.write_text(yaml.safe_dump(of('/drone1/**', **{'cameras': ['a'], 'camera.a.image': 'b'},
+                                        depth=3)))
+    flock = [Spec('depth', 1, 'queue depth')]
+    assert names_for_any_node([first, second], '/drone1/flock', flock) == {
+        'K', 'cameras', 'camera.a.image', 'depth'}
+    assert names_for_any_node([first, second], '/flock', flock) == {'K'}
+    second.write_text(yaml.safe_dump(of('/**', vmax=0.4)))
+    with pytest.raises(ValueError, match='second.yaml: unknown parameter vmax .* mean v_max'):
+        names_for_any_node([first, second], '/flock', flock)
 
 
 @pytest.mark.parametrize(('document', 'message'), [
     (of('planner', vmax=1.0), 'unknown parameter vmax for node planner: did you mean v_max?'),
     (of('/**', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
-    (of('follower', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
-    (of('folower', a_max=1.0), 'unknown node /folower: did you mean follower?'),
+    *((of(section, a_max=2.0), '/follower: no node has this name: .* shared parameters /[*][*],')
+      for section in ('follower', '/**/follower')),
     (of('planner', v_max='fast'), "planner: v_max = 'fast': must be a number in "),
     (of('planner', connection='x'), 'unknown parameter connection for node planner'),
     (of('planer', v_max=1.0), 'unknown node /planer: did you mean planner?'),
@@ -138,7 +140,7 @@ def test_a_file_that_means_another_node_is_reported(
     nested = {'drone3': {'camera': PARAMETERS}} if sections else {}
     path.write_text(yaml.safe_dump({**dict.fromkeys(sections, PARAMETERS), **nested}))
     try:
-        reported = unheeded(path, node)
+        reported = ignored_sections(path, node)
     except ValueError as error:
         reported = f'error {error}'
     assert reported.replace(f'{path}: ', '') == said

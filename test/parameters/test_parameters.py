@@ -16,7 +16,7 @@
 
 import pytest
 
-from flock_follower.parameters.sections import unheeded
+from flock_follower.parameters.sections import ignored_sections
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 
@@ -119,7 +119,7 @@ def test_what_is_told_of_a_file_is_what_ros_does_with_it(tmp_path, section, name
     rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
     node = FlockNode('tested', namespace=namespace, context=context)
     try:
-        silent = not unheeded(path, node.get_fully_qualified_name())
+        silent = not ignored_sections(path, node.get_fully_qualified_name())
     except ValueError:
         silent = False
     assert node.has_parameter('a_max') == silent

@@ -313,7 +313,7 @@ STARBOARD = Transform(rotation_vector_to_matrix([0.0, 0.0, 0.3]) @ TAIL.rotation
 SIDEWAYS = Transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
                      np.array([0.0, -0.3, 0.0]))  # faces right: seen edge on from behind
 WINGED = target(MarkedNeighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
-                                    Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
+                                          Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
 #: T_camera_body of a neighbour ahead, a little above, turned by 14 degrees.
 AHEAD = Transform(rotation_vector_to_matrix([0.0, 0.25, 0.0])
                   @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),

@@ -71,8 +71,6 @@ def default_finds() -> Callable[[GrayImage], bool]:
     return finds
 
 
-
-
 def shares(images: list[GrayImage], default_finds: Callable[[GrayImage], bool],
            largest: float) -> tuple[float, float]:
     """

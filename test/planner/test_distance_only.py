@@ -67,7 +67,7 @@ def test_a_neighbor_at_the_own_place_is_on_no_sphere() -> None:
 def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandered() -> None:
     straight, = clear_of_sphere(ranged(0.0, 1.3, -0.4), seen(), own(), np.zeros(3), PARAMS)
     aside, = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), seen(), own(),
-                            np.zeros(3), PARAMS)
+                             np.zeros(3), PARAMS)
     for found in (straight, aside):
         assert found.normal == pytest.approx(-AHEAD)
         assert found.distance == pytest.approx(1.3)
@@ -75,7 +75,7 @@ def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandere
     assert aside.least == pytest.approx(straight.least)
     assert straight.least > 1.0
     elsewhere, = clear_of_sphere(ranged(0.0, 1.3, towards=np.array([0.0, 1.0, 0.0])), None, own(),
-                                np.zeros(3), PARAMS)
+                                 np.zeros(3), PARAMS)
     assert elsewhere.normal == pytest.approx([0.0, -1.0, 0.0])
     assert not elsewhere.seen
 

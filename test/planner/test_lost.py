@@ -85,9 +85,9 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
 
 
 @pytest.mark.parametrize(('reported', 'least', 'most'), [(0.05, 0.0, 0.001), (0.2, 0.09, 0.11),
-                                                     (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
+                                                         (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
 def test_an_acceleration_counts_as_far_as_it_is_more_than_noise(reported: float, least: float,
-                                                                     most: float) -> None:
+                                                                most: float) -> None:
     estimated = expected(seen(), np.array([0.0, -reported, 0.0]), 0.1, PARAMS).acceleration
     assert least <= -estimated[1] <= most
     assert estimated[0] == estimated[2] == 0.0

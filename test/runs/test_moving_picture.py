@@ -21,9 +21,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip('matplotlib')
-from PIL import Image
-
-from flock_desk.runs.moving_picture import moving_picture
+Image = pytest.importorskip('PIL.Image')
+moving_picture = pytest.importorskip('flock_desk.runs.moving_picture').moving_picture
 
 
 def test_it_has_eight_pictures_each_second_also_without_an_estimate():

@@ -24,8 +24,8 @@ from flock_follower.fast_dds import PROFILE_VARIABLES, profile_variables
 from flock_follower.nodes.support.middleware import avoid_shared_memory, UDP_PROFILE
 
 #: With a receive buffer for images: for ROS on this computer alone, and otherwise.
-_UDP_IMAGES_PROFILE = 'config/fastdds_udp_images.xml'
-_IMAGES_PROFILE = 'config/fastdds_images.xml'
+_UDP_IMAGES_PROFILE = 'config/dds/fastdds_udp_images.xml'
+_IMAGES_PROFILE = 'config/dds/fastdds_images.xml'
 IMAGES_BUFFER: Final = 4 * 1024 * 1024
 
 

@@ -27,8 +27,8 @@ from flock_follower.files import resource
 _SEGMENT_SHARE: Final = 64 / 67
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-_OWN_PROFILE = 'config/fastdds.xml'
-UDP_PROFILE = 'config/fastdds_udp.xml'
+_OWN_PROFILE = 'config/dds/fastdds.xml'
+UDP_PROFILE = 'config/dds/fastdds_udp.xml'
 
 
 def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:

@@ -23,7 +23,7 @@ taken whole or refused with a reason that names the parameter, its value and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import math
 from pathlib import Path
 from types import ModuleType
@@ -81,18 +81,21 @@ class Parameters(Generic[T]):
     then refused with that reason.
 
     :param flying: returns whether the vehicle flies by this node; see ``refuse_in_flight``.
-    :param shared: values of the section ``follower`` in parameter files; the overrides of the
-        node's own win.
+    :param elsewhere: names of parameters of other nodes, which a parameter file sets for all
+        nodes: the node does not declare them.
     :raises ValueError: at construction, for an invalid or an unknown parameter override.
     """
 
     def __init__(self, node: Node, specs: Sequence[Spec], build: Callable[[dict[str, Any]], T],
-                 flying: Callable[[], bool], shared: Mapping[str, Any]) -> None:
+                 flying: Callable[[], bool], elsewhere: Collection[str]) -> None:
         overrides = node.get_parameters_by_prefix('')
-        given = {**shared, **{name: parameter.value for name, parameter in overrides.items()}}
+        given = {name: parameter.value for name, parameter in overrides.items()}
         self._specs = {spec.name: spec for spec in expanded(specs, given)}
         self._build, self._flying = build, flying
-        refuse_unknown(overrides, self._specs, node.get_name())
+        of_others = overrides.keys() & elsewhere - self._specs.keys()
+        refuse_unknown(overrides.keys() - of_others, self._specs, node.get_name())
+        for name in of_others:
+            node.undeclare_parameter(name)
         self.values: dict[str, Any] = check_values(specs, given)
         self.current: T = build(self.values)
         self._start = dict(self.values)

@@ -50,7 +50,12 @@ from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error, STEADY
 from flock_follower.nodes.support.parameters import Parameters, usage
 from flock_follower.odometry.reader import read_odometry
-from flock_follower.parameters.sections import files_in, PARAMETER_FILES, shared, unheeded
+from flock_follower.parameters.sections import (
+    files_in,
+    ignored_sections,
+    names_for_any_node,
+    PARAMETER_FILES,
+)
 from flock_follower.parameters.spec import Spec
 
 Message = TypeVar('Message')
@@ -120,10 +125,10 @@ class FlockNode(Node):
         name = self.get_fully_qualified_name()
         self.diagnostics.values[PARAMETER_FILES] = ', '.join(self.parameter_files)
         for path in self.parameter_files:
-            if warning := unheeded(path, name):
+            if warning := ignored_sections(path, name):
                 self.get_logger().warning(warning)
-        self._table = table = Parameters(self, specs, build, flying,
-                                         shared(self.parameter_files, name))
+        self._table = table = Parameters(
+            self, specs, build, flying, names_for_any_node(self.parameter_files, name, specs))
         return table
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
