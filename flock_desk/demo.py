@@ -34,7 +34,7 @@ import numpy as np
 
 from flock_desk.runs.console import guarded, logs_in
 from flock_desk.runs.figure_table import bounds
-from flock_desk.runs.flight import COUNTED, RECORDED, start
+from flock_desk.runs.flight import COUNTER_PERIOD, RECORDED, start
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
@@ -140,7 +140,7 @@ def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | No
         replay.wait()
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')
-        time.sleep(COUNTED)
+        time.sleep(COUNTER_PERIOD)
         return processes.stop_all(), processes.load.worst(began)
 
 

@@ -55,7 +55,8 @@ Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mea
 Acceleration = Callable[[float, Array, Array], Array]
 State = tuple[Array, Array]
 
-VICSEK_STEP, VICSEK_RADIUS = 0.1, 1.0  # s, and m: how far an agent sees
+VICSEK_STEP = 0.1  # s
+VICSEK_RADIUS = 1.0  # m, within which an agent sees others
 _LOOK_PERIOD = 0.05  # s between searches for new edges
 _SKIN = 0.05  # m that agents may move before near pairs are searched again
 

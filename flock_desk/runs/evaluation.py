@@ -44,7 +44,7 @@ from flock_follower.bags.schedule import Gaps
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
-from flock_follower.checks.recorded_system import LONGEST, RecordedSystem
+from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
@@ -293,7 +293,7 @@ class Evaluation(Listener):
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
         self.errors.odometry(self._moved(state))
-        if self.own is not None and state.stamp < self.bag.start_ns + LONGEST * NANOSECONDS:
+        if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)
 
     def image(self, outcome: ImageOutcome) -> None:

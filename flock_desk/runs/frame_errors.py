@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.neighbors_file import MarkedNeighbor, Marker
-from flock_follower.odometry.buffer import between, OdometrySample
+from flock_follower.odometry.buffer import interpolate, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import Estimate
 
@@ -57,9 +57,10 @@ Table = Mapping[str, Array]
 MAX_GAP = NANOSECONDS // 2
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
-#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of the
-#: result of an image: stage, position, velocity, rotation matrix, covariance (6, 6).
-_STATE, _SEEN = 14, 52
+#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity.
+_STATE_LENGTH = 14
+#: Numbers of an image's result: stage, position, velocity, rotation matrix, covariance (6, 6).
+_SIGHTING_LENGTH = 52
 
 
 class _States(NamedTuple):
@@ -115,14 +116,14 @@ class FrameErrors:
         self._cameras.append(camera)
         for name, seen in self._seen.items():
             estimate = estimates.get(name)
-            seen.extend((0.0, *[np.nan] * (_SEEN - 1)) if estimate is None else (
+            seen.extend((0.0, *[np.nan] * (_SIGHTING_LENGTH - 1)) if estimate is None else (
                 STAGES.index(stages.get(name, 'full')), *estimate.position, *estimate.velocity,
                 *estimate.rotation.ravel(), *estimate.covariance[:6, :6].ravel()))
 
     def _take(self, states: array[float], state: OdometryState) -> None:
         """Keep states in the order of their stamps: a late one is dropped."""
         time = state.stamp - self._start
-        if not states or time > states[-_STATE]:
+        if not states or time > states[-_STATE_LENGTH]:
             states.extend((time, *state.position, *state.quaternion, *state.velocity,
                            *state.angular_velocity))
 
@@ -140,7 +141,7 @@ class FrameErrors:
         stamps = np.array(self._stamps)
         own, true_own, true = (
             _at(states, stamps) for states in (self._own, self._true[''], self._true[name]))
-        seen = np.array(self._seen[name]).reshape(-1, _SEEN)
+        seen = np.array(self._seen[name]).reshape(-1, _SIGHTING_LENGTH)
         position, velocity, rotation = seen[:, 1:4], seen[:, 4:7], seen[:, 7:16]
         covariance = seen[:, 16:].reshape(-1, 6, 6)
         estimated = _relative(_States(position, velocity, rotation.reshape(-1, 3, 3)), own)
@@ -198,7 +199,7 @@ def _at(states: array[float], stamps: Array) -> _States:
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     result = _States(*(np.full((len(stamps), *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
-    rows = np.array(states).reshape(-1, _STATE)
+    rows = np.array(states).reshape(-1, _STATE_LENGTH)
     if not len(rows):
         return result
     times = rows[:, 0]
@@ -210,7 +211,7 @@ def _at(states: array[float], stamps: Array) -> _States:
         begin = times[before[k]]
         state = _sample(rows[before[k]], begin)
         if before[k] != after[k]:
-            state = between(state, _sample(rows[after[k]], begin),
+            state = interpolate(state, _sample(rows[after[k]], begin),
                             float(stamps[k] - begin) / NANOSECONDS)
         result.position[k], result.velocity[k] = state.position, state.velocity
         result.rotation[k] = quaternion_to_matrix(state.quaternion)

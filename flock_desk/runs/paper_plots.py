@@ -39,7 +39,7 @@ from flock_desk.flocks.agents import Simulation
 from flock_follower.flocking import FlockingParams
 from flock_follower.whole_file import whole_file
 
-WIDTH = 3.33  # in: a column of the paper's two
+COLUMN_WIDTH = 3.33  # in: a column of the paper's two
 # Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
 COLOURS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
 INK, PALE = '#333333', '#BBBBBB'
@@ -164,7 +164,7 @@ def agreement(runs: Runs, end: float) -> Figure:
 
     A dot is where their disagreement has fallen below 1 % of the first for good.
     """
-    figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 3.6), layout='constrained')
     above, below = figure.subplots(2, 1, sharex=True)
     law = next(iter(runs.values())).metrics
     shown = law.time <= end
@@ -189,7 +189,7 @@ def agreement(runs: Runs, end: float) -> Figure:
 @styled()
 def flock(run: Simulation) -> Figure:
     """Return paths from above, distances and agreement of a larger flock on a graph."""
-    figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 5.6), layout='constrained')
     paths, below, agreeing = figure.subplots(3, 1, height_ratios=(2.2, 1.0, 1.0))
     # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
     x = (run.positions - run.positions.mean(axis=1, keepdims=True))[:, :, :2]
@@ -224,7 +224,7 @@ def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
             y_label: str, note: str, height: float = 4.3,
             share: tuple[Any, Any] = ('all', 'all')) -> Figure:
     """Return a panel for each of five runs, the legend in the second place, a note below."""
-    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
+    figure = Figure(figsize=(COLUMN_WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
     axes = figure.subplots(3, 2, sharex=share[0], sharey=share[1])
     for letter, axis, (name, run) in zip('abcde', axes.flat[[0, 2, 3, 4, 5]], runs.items()):
         axis.set_title(f'({letter}) {name}'.replace(', ', ',\n'))
@@ -255,7 +255,7 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
 
     :param results: by ``v_max``, the jerk, m/s^3, and the share of each controller.
     """
-    figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.4), layout='constrained')
     axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
     for axis, (v_max, points) in zip(axes, results.items()):
         for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):

@@ -44,7 +44,8 @@ _SHADE = '#CC79A7'
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
-PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
+PAIR_PERIOD = 5.0  # s between the lines from follower to leader
+MAX_PAIRS = 24  # lines from follower to leader
 NARROWEST = 0.35  # of its length, of a map
 TIME = 'time [s]'
 
@@ -176,7 +177,7 @@ def draw_above(axis: Axes, flight: Flight) -> None:
     Both axes have one scale, and a box as narrow as the data, within ``NARROWEST``.
     """
     times, paths = flight.table['time'], [path[:, :2] for path in flight.paths.values()]
-    period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
+    period = max(PAIR_PERIOD, flight.duration / MAX_PAIRS)
     for label, path, colour in zip(flight.paths, paths, (LEADER, FOLLOWER)):
         axis.plot(*path.T, color=colour, linewidth=1.7, label=label)
         known = path[np.isfinite(path).all(axis=1)]

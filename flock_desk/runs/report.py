@@ -30,7 +30,7 @@ import sys
 import textwrap
 from typing import Any, NamedTuple
 
-from flock_desk.runs.console import WIDTH
+from flock_desk.runs.console import LINE_WIDTH
 from flock_desk.runs.figure_table import parts_of, shown, words
 from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
@@ -88,7 +88,7 @@ def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[s
         line = f'  {key:<{width}}  {text(value):>10}  {_verdict(key, value)}'
         if key in judged:
             line += f'{judged[key].bound!s:<16}  {judged[key].verdict}'
-        lines += textwrap.wrap(line, WIDTH, drop_whitespace=False,
+        lines += textwrap.wrap(line, LINE_WIDTH, drop_whitespace=False,
                                subsequent_indent=' ' * (width + 4))
     return [line.rstrip() for line in lines]
 

@@ -48,7 +48,7 @@ from flock_follower.topic_names import (
 )
 
 #: s: of a longer bag only the beginning is checked.
-LONGEST: Final = 300.0
+MAX_DURATION: Final = 300.0
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: The topics to take, and their types.
@@ -100,7 +100,7 @@ class RecordedSystem:
                 name: TopicSeen([TopicEnd('', topic.msgtype)])
                 for name, topic in bag.topics.items() if topic.count})
         self._neighbors = load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
-        self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
+        self._collector = Collector(self.seen, min(self.seen.duration, MAX_DURATION))
         self._gaps = Gaps()
         self._start_ns = bag.start_ns
         if bag.set_back_ns > MAX_GAP * NANOSECONDS:
@@ -114,7 +114,7 @@ class RecordedSystem:
 
     def is_long_enough(self, time_ns: int) -> bool:
         """Return whether what comes at a time, ns, is not checked any more."""
-        return time_ns - self._start_ns - self._gaps.skipped_ns >= LONGEST * NANOSECONDS
+        return time_ns - self._start_ns - self._gaps.skipped_ns >= MAX_DURATION * NANOSECONDS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
              ) -> tuple[Any, GrayImage | None]:

@@ -30,7 +30,7 @@ import pytest
 from flock_desk import figures
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.runs import paper_plots
-from flock_desk.runs.paper_plots import styled, WIDTH
+from flock_desk.runs.paper_plots import COLUMN_WIDTH, styled
 
 pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
@@ -66,7 +66,7 @@ def assert_legible(figure: Figure, name: str) -> None:
     """Every text is on its page, large enough, and no title."""
     with styled():
         figure.draw_without_rendering()
-    assert figure.get_size_inches()[0] == WIDTH and not figure.get_suptitle(), name
+    assert figure.get_size_inches()[0] == COLUMN_WIDTH and not figure.get_suptitle(), name
     texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
     assert min(t.get_fontsize() for t in texts) >= 7.0, name
     labels = [text for legend in figure.findobj(Legend) for text in legend.get_texts()]
