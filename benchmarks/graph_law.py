@@ -16,7 +16,7 @@
 Whether flocks stay together and apart: ``python benchmarks/graph_law.py``, some minutes.
 
 Random starts in 2-D and 3-D, in the narrow band of the paper's simulations and the wide one of
-its flights, 20 s each on the neighbour graph; a start counts as kept where no pair ever came to
+its flights, 20 s each on the neighbor graph; a start counts as kept where no pair ever came to
 r^2 <= d0 and no edge ever to r^2 >= d1, so that the graph stayed connected. Exit code 0 only if
 all were kept.
 """

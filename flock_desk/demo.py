@@ -99,10 +99,10 @@ def _demonstrate(out: Path) -> int:
         with explained(None if failed(exit_codes) else load):
             flight = read_replayed(BAG, out, params)
         summary = replay_figures(flight, exit_codes, load)
-        judgements = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
+        judgments = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
                             chapters(flight), load=load)
         print()
-        return announce(summary, judgements, [out / 'report.html'], out, load)
+        return announce(summary, judgments, [out / 'report.html'], out, load)
 
 
 def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | None], Load | None]:

@@ -150,14 +150,14 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
             flight, own(flown.cores, namespace), own(flown.exit_codes, namespace), flown.load)
         demanded = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in demanded]
-        judgements = report(
+        judgments = report(
             out / namespace, f'{title} {namespace}'.rstrip(), scenario.summary, summary, demanded,
             scenario_chapters(flight), cautions(summary), load=flown.load)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         nearest = FigureBound('nearest_m', nearest_allowed(scenario), load=LATE)
-        judgements = report(
+        judgments = report(
             out, f'{title}, a column of {followers}', scenario.summary, summary,
             [nearest, *limits], (), parts=summaries, load=flown.load)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
@@ -165,7 +165,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
     for each in summaries.values():
         for warning in cautions(each):
             print(f'warning: {warning}', file=sys.stderr)
-    return announce(summary, judgements, pages, out, flown.load)
+    return announce(summary, judgments, pages, out, flown.load)
 
 
 def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[FigureBound]:

@@ -16,7 +16,7 @@
 ``ros2 run flock_follower marker --id 0 --dictionary DICT_4X4_50 --size 0.16 --output marker.pdf``.
 
 Draws markers to scale, one to a page, each with the white border that detection needs and a ruler,
-and prints the neighbours file. With ``--panel`` all are on one page, for one leader that is seen
+and prints the neighbors file. With ``--panel`` all are on one page, for one leader that is seen
 from near and from far: the largest on top, the smaller ones below it. The panel's origin is the
 middle of the smallest: nearby, the camera sees little else, so it belongs at the height of the
 camera. Two runs write the same bytes.
@@ -66,7 +66,7 @@ Box = tuple[float, float, float, float]
 _ENTRY = """\
 {first}marker_id: {marker_id}
 {next}side_length: {side_length:g}  # m; measure the print
-{next}position: [-0.20, 0.0, {up:.4f}]  # m, the centre on the body: forward, left, up
+{next}position: [-0.20, 0.0, {up:.4f}]  # m, the center on the body: forward, left, up
 {next}rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
 
 
@@ -113,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _write(options: argparse.Namespace) -> int:
-    """Write the file and print the neighbours file."""
+    """Write the file and print the neighbors file."""
     ids, sizes = options.id, options.size
     sizes = sizes or ([*SIZES] if options.panel else [DEFAULT_SIDE])
     ids = ids or [*range(len(sizes))]
@@ -234,7 +234,7 @@ def pdf(pages: Sequence[Page], title: str) -> bytes:
             out, metadata=about) as file:
         for page in pages:
             file.savefig(_figure(page))
-        # matplotlib has no option for it: its catalogue is written again, the last one counts.
+        # matplotlib has no option for it: its catalog is written again, the last one counts.
         file._file.writeObject(file._file.rootObject, {
             'Type': Name('Catalog'), 'Version': Name('1.6'), 'Pages': file._file.pagesObject,
             'ViewerPreferences': {'PrintScaling': Name('None')}})
@@ -257,7 +257,7 @@ def _figure(page: Page) -> Figure:
 
 
 def neighbors_file(dictionary: str, prints: Sequence[Sequence[Placed]]) -> str:
-    """Return the neighbours file of leaders that each carry a print on the tail."""
+    """Return the neighbors file of leaders that each carry a print on the tail."""
     lines = [f'dictionary: {dictionary}', 'neighbors:']
     for markers in prints:
         name = 'leader' if len(prints) == 1 else f'drone{markers[0].marker_id}'

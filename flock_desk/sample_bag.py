@@ -84,8 +84,8 @@ def _enlarged(width: int, height: int) -> Camera:
     small = Camera()
     finer = width / small.width
     return Camera(width, height, finer * small.focal_x, finer * small.focal_y,
-                  width / 2 + finer * (small.centre_x - small.width / 2),
-                  height / 2 + finer * (small.centre_y - small.height / 2))
+                  width / 2 + finer * (small.center_x - small.width / 2),
+                  height / 2 + finer * (small.center_y - small.height / 2))
 
 
 VARIANTS = {

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The law against the paper's setups, its invariants, and its behaviour outside the band."""
+"""The law against the paper's setups, its invariants, and its behavior outside the band."""
 
 from __future__ import annotations
 

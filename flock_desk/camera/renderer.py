@@ -18,7 +18,7 @@ A rendered camera: a leader before its surroundings, through a distorting lens, 
 The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
 everything but the leader is taken to be far away. Of the leader an image is the mean of poses
 spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
-centre of the top-left pixel.
+center of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Sensor:
     read_noise: float = 12.0
     """Standard deviation, electrons."""
     gain: float = 1.5
-    """Share of the full well that a radiance of 1 fills, in the image's centre."""
+    """Share of the full well that a radiance of 1 fills, in the image's center."""
     gamma: float = 2.2
     vignetting: float = 0.35
     """Relative light 1 / (1 + this r^2)^2, r the tangent of the angle off axis; 1 is cos^4."""
@@ -229,7 +229,7 @@ class _Drawing:
         fine = np.zeros((n * size[1], n * size[0], 2), np.float32)
         light = _AMBIENT_SHARE + (1.0 - _AMBIENT_SHARE) * np.maximum(
             self._normals @ body.rotation.T @ _SUN_DIRECTION, 0.0)
-        # The centre of a sample lies half a sample from the edge of its pixel.
+        # The center of a sample lies half a sample from the edge of its pixel.
         corners = np.rint((((pixels - low) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         eye = pose.inverse().translation
         shown = np.logical_and.reduceat(ahead, self._starts) & (

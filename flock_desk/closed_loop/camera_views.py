@@ -75,7 +75,7 @@ class Sighted(NamedTuple):
 
 
 class CameraViews:
-    """The cameras and the neighbour filters of all rows of a world."""
+    """The cameras and the neighbor filters of all rows of a world."""
 
     def __init__(self, world: World, noise: PerceptionNoise) -> None:
         self._world, self._noise = world, noise
@@ -216,7 +216,7 @@ class CameraViews:
         """
         Add a print to the images just taken that show it.
 
-        Which of two is the leader is not modelled: perception is taken to know, as its tests show.
+        Which of two is the leader is not modeled: perception is taken to know, as its tests show.
         """
         world, vio = self._world, self._world.vio
         offsets = np.array(place.position) - world.vehicle.position

@@ -17,7 +17,7 @@ Flights in lock step: leader, air, vehicle and sensors around the real followers
 
 No clock, no rendering, no messages: the runs fly ``follower.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
-COURSE_STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with
+COURSE_STEP for many runs at once. The neighbor filters of perception are fed at 30 Hz with
 positions
 whose noise has the covariance given with them; a marker is seen if it is in the field of view and
 not too oblique, with no vehicle in between.
@@ -117,7 +117,7 @@ def _followers(world: World, guard: bool, noise: PerceptionNoise,
     """Return the follower of every row."""
     scenario, flock = world.scenario, world.scenario.company
     aside, up = math.atan(noise.half_width), math.atan(noise.half_height)
-    # The planner keeps neighbours in the view ahead, unless cameras look to all sides.
+    # The planner keeps neighbors in the view ahead, unless cameras look to all sides.
     ahead = 'front' in flock.cameras and not flock.all_round
     view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []

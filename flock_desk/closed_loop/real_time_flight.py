@@ -183,7 +183,7 @@ def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
 
 def calibration(camera: Camera) -> dict[str, Any]:
     """Return the calibration as the fields of a ``sensor_msgs/CameraInfo``."""
-    k = [camera.focal_x, 0.0, camera.centre_x, 0.0, camera.focal_y, camera.centre_y,
+    k = [camera.focal_x, 0.0, camera.center_x, 0.0, camera.focal_y, camera.center_y,
          0.0, 0.0, 1.0]
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
     return {'height': camera.height, 'width': camera.width, 'distortion_model': camera.model,

@@ -70,7 +70,7 @@ class Simulation:
     velocities: Array
     params: FlockingParams
     graph: Graph | None = field(default=None, repr=False)
-    """The neighbour graph at the end, if there is one."""
+    """The neighbor graph at the end, if there is one."""
 
     @cached_property
     def metrics(self) -> Metrics:
@@ -109,7 +109,7 @@ def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: Flocking
                    duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
                    progress: Callable[[], object] = lambda: None) -> Simulation:
     """
-    Return how a flock moves on its neighbour graph; see ``simulate``.
+    Return how a flock moves on its neighbor graph; see ``simulate``.
 
     :param dt: s, the longest step.
     :param progress: called at each of the times returned.
@@ -127,7 +127,7 @@ def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: Flocking
 
 
 class _GrowingGraph:
-    """The neighbour graph of a flock, which grows with its motion, and the law on it."""
+    """The neighbor graph of a flock, which grows with its motion, and the law on it."""
 
     def __init__(self, positions: Array, params: FlockingParams) -> None:
         self.edges = pairs_within(positions, np.sqrt(params.d1))

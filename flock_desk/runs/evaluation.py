@@ -151,8 +151,8 @@ class Evaluation(Listener):
     ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
 
     :param values: the checked values of every parameter, by node, see ``TABLE``.
-    :raises ValueError: if values do not fit together, or the neighbours file is wrong.
-    :raises OSError: if the neighbours file cannot be read.
+    :raises ValueError: if values do not fit together, or the neighbors file is wrong.
+    :raises OSError: if the neighbors file cannot be read.
     """
 
     def __init__(self, bag: Bag, values: dict[str, dict[str, Any]], writer: BagWriter) -> None:
@@ -266,7 +266,7 @@ class Evaluation(Listener):
 
     @cached_property
     def tables(self) -> dict[str, Table]:
-        """Return the errors of each neighbour by its name, once all messages were taken."""
+        """Return the errors of each neighbor by its name, once all messages were taken."""
         return {each.name: self.errors.table(each.name) for each in self.neighbors}
 
     @property

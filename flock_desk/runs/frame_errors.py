@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Errors of the estimates against the truth: one row per image and neighbour.
+Errors of the estimates against the truth: one row per image and neighbor.
 
-Errors are those of the neighbour's state relative to the follower, each in its follower's body
+Errors are those of the neighbor's state relative to the follower, each in its follower's body
 frame (FLU): estimate minus own odometry against truth minus truth, so that drift, which is common
 to leader and follower in odom, does not count. Their covariances follow from the published ones.
 
@@ -75,7 +75,7 @@ class FrameErrors:
     """
     Collects images, odometry and truth as they arrive; :meth:`table` compares them.
 
-    An hour takes about 130 MB: 112 bytes for each state, 0.4 kB for each image and neighbour.
+    An hour takes about 130 MB: 112 bytes for each state, 0.4 kB for each image and neighbor.
 
     :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
@@ -86,7 +86,7 @@ class FrameErrors:
         self.models: dict[str, CameraModel | None] = {}
         """The calibration of each camera, '' of the only one, if known."""
         self.strangers: set[str] = set()
-        """Names in the truth that are no neighbour's."""
+        """Names in the truth that are no neighbor's."""
         self._neighbors = {n.name: n for n in neighbors}
         mounted = {'': cameras} if isinstance(cameras, Transform) else cameras
         self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
@@ -102,7 +102,7 @@ class FrameErrors:
         self._take(self._own, state)
 
     def truth(self, state: OdometryState, own: bool = False) -> None:
-        """Take the own true state, or that of the neighbour that the child frame names."""
+        """Take the own true state, or that of the neighbor that the child frame names."""
         name = '' if own else state.child
         if name in self._true:
             self._take(self._true[name], state)
@@ -129,7 +129,7 @@ class FrameErrors:
 
     def table(self, name: str) -> dict[str, Array]:
         """
-        Return the columns of a neighbour by name, a row for each of n images; NaN is unknown.
+        Return the columns of a neighbor by name, a row for each of n images; NaN is unknown.
 
         (n,): ``time``, s; ``stage``, an index into STAGES; ``visible``, 1 if by the truth a marker
         is in view; ``distance`` and ``true_distance``, m; ``nees_position``, ``nees_velocity``;
@@ -185,10 +185,10 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0.0) & (pixels <= [camera.width - 1.0, camera.height - 1.0])
                   ).all(axis=(1, 2))
-        centre = in_camera.mean(axis=1)
+        center = in_camera.mean(axis=1)
         normal = np.cross(in_camera[:, 2] - in_camera[:, 3], in_camera[:, 0] - in_camera[:, 3])
-        facing = -np.einsum('ni,ni->n', normal, centre) > (
-            GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(centre, axis=1))
+        facing = -np.einsum('ni,ni->n', normal, center) > (
+            GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(center, axis=1))
     return np.asarray(inside & facing)
 
 
@@ -223,7 +223,7 @@ def _sample(row: Array, since: float) -> OdometrySample:
 
 
 def _relative(neighbor: _States, own: _States) -> _States:
-    """Return a neighbour's states relative to the own ones, in the follower's body."""
+    """Return a neighbor's states relative to the own ones, in the follower's body."""
     to_body = own.rotation.transpose(0, 2, 1)
     return _States(np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
                    np.einsum('nij,nj->ni', to_body, neighbor.velocity - own.velocity),

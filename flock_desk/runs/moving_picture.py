@@ -54,8 +54,8 @@ def moving_picture(flight: LiveFlight) -> bytes:
     draw_distance(axes['distance'], flight)
     axes['distance'].set(xlim=(0.0, ticks[-1]), xlabel=TIME)
     now = axes['distance'].axvline(0.0, color='black', linewidth=1.2)
-    places = [(path, axes['above'].plot([], [], 'o', color=colour, markersize=9)[0])
-              for path, colour in zip(flight.paths.values(), (LEADER, FOLLOWER))]
+    places = [(path, axes['above'].plot([], [], 'o', color=color, markersize=9)[0])
+              for path, color in zip(flight.paths.values(), (LEADER, FOLLOWER))]
     canvas, pictures = FigureCanvasAgg(figure), []
     for row in np.minimum(np.searchsorted(times, ticks), len(times) - 1):
         follower, leader = (Transform.from_quaternion(

@@ -282,7 +282,7 @@ class FlightParams(Part):
     v_max: float = 0.5
     altitude_min: float = parameter(
         0.0, None,
-        'm above the ground by the odometry, whose height drifts by half a metre in ten minutes.')
+        'm above the ground by the odometry, whose height drifts by half a meter in ten minutes.')
     altitude_max: float = parameter(
         PlannerParams.altitude_max, None, 'm above the same.')
     relative_flight: bool = parameter(

@@ -121,7 +121,7 @@ class ArduCopter(FlightController):
         self._velocity = self._velocity + forward * dt
         self._position = self._position + self._velocity * dt
         if not np.all(np.isfinite([self._velocity, self._position])):
-            # A real one does not refuse NaN; its behaviour then is undefined. This one lets the
+            # A real one does not refuse NaN; its behavior then is undefined. This one lets the
             # motors idle and falls, so that no test overlooks it.
             return IDLE_ACCELERATION
         towards = POSITION_GAIN * (self._position - self.estimator.position)

@@ -170,7 +170,7 @@ class EmbeddedAutopilot:
             case 'SET_POSITION_TARGET_LOCAL_NED':
                 controller.on_setpoint(message, now)
             case 'ODOMETRY':
-                # Before the sender's clock is learnt it is new.
+                # Before the sender's clock is learned it is new.
                 controller.estimator.on_odometry(
                     message, now, 0.0 if self._clock_offset is None else
                     now - self._booted - message.time_usec * 1e-6 - self._clock_offset)

@@ -60,7 +60,7 @@ RATIO_BOUNDS = (0.4, 2.5)
 #: Lasting errors of odometry are partly fitted as motion: errors of the size of tags on walls, in
 #: 34 visits, were up to 6.3 plain deviations.
 ERROR_FACTOR: Final = 3.0
-_MAX_CORRELATION = 0.9  # of neighbouring residuals, at most
+_MAX_CORRELATION = 0.9  # of neighboring residuals, at most
 #: Relative error of the size from which on there is a warning.
 SIZE_WARNING = 0.05
 #: Relative error of the size from which on there is an error.
@@ -88,7 +88,7 @@ class Ratio(NamedTuple):
 
 
 def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
-    """Check the size of the neighbour's marker that was seen most often."""
+    """Check the size of the neighbor's marker that was seen most often."""
     what, wanted = 'marker size', 'as far as odometry moves'
     number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
     rows = np.array(sorted(row for row in seen.sightings if row[1] == number))

@@ -62,7 +62,7 @@ AXES_REDUCTION = 0.4
 #: An offset of stamps is reported if it reduces the unexplained image motion to this share.
 OFFSET_REDUCTION = 0.8
 #: Offset of the camera's stamps, s, from which on there is a warning. At 20, 30 and 50 ms the
-#: squared errors of a neighbour's position are 10, 30 and 350 times its covariance.
+#: squared errors of a neighbor's position are 10, 30 and 350 times its covariance.
 OFFSET_WARNING = 0.010
 #: Offset of the camera's stamps, s, from which on there is an error.
 OFFSET_ERROR = 0.030
@@ -83,7 +83,7 @@ LOWEST_HEIGHT = -0.5
 #: Events of the reader: the property, the level and the action.
 EVENTS: Final = (
     ('odom jumped', 'odom jumps', WARNING,
-     'turn off loop closure and relocalisation, or take the frame without them'),
+     'turn off loop closure and relocalization, or take the frame without them'),
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'))
 #: Error of the mounting, rad, from which on there is a warning.
@@ -108,7 +108,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
                      f'{motion.lost} of {count} are invalid: {motion.last_error}',
-                     'position and attitude', 'wait until its source is initialised; more '
+                     'position and attitude', 'wait until its source is initialized; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return

@@ -28,11 +28,11 @@ from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
 NOISY_MARKER_WIDTH = 18.0
-#: Mean grey level, 0 to 255, below which an image is too dark.
+#: Mean gray level, 0 to 255, below which an image is too dark.
 MEAN_TOO_DARK = 12.0
-#: Mean grey level, 0 to 255, above which an image is too bright.
+#: Mean gray level, 0 to 255, above which an image is too bright.
 MEAN_TOO_BRIGHT = 243.0
-#: Standard deviation of the grey levels below which an image shows nothing.
+#: Standard deviation of the gray levels below which an image shows nothing.
 DEVIATION_TOO_FLAT = 3.0
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
@@ -95,15 +95,15 @@ def _exposure(pictures: list[Picture]) -> Finding:
     newest = pictures[-1]
     brightness = float(np.median([picture.brightness for picture in pictures]))
     contrast = float(np.median([picture.contrast for picture in pictures]))
-    measured = (f'{newest.width}x{newest.height} {newest.encoding}, grey level {brightness:.0f} '
+    measured = (f'{newest.width}x{newest.height} {newest.encoding}, gray level {brightness:.0f} '
                 f'± {contrast:.0f}')
     return first(
-        'images', f'grey level {MEAN_TOO_DARK:.0f} to {MEAN_TOO_BRIGHT:.0f}',
+        'images', f'gray level {MEAN_TOO_DARK:.0f} to {MEAN_TOO_BRIGHT:.0f}',
         (brightness < MEAN_TOO_DARK, ERROR, f'{measured}: black',
          'take off the cap; more light, or a longer exposure'),
         (brightness > MEAN_TOO_BRIGHT, ERROR, f'{measured}: white',
          'expose less (automatic exposure on)'),
-        (contrast < DEVIATION_TOO_FLAT, WARNING, f'{measured}: one grey',
+        (contrast < DEVIATION_TOO_FLAT, WARNING, f'{measured}: one gray',
          'is something before the lens?'),
         (True, OK, measured, ''))
 

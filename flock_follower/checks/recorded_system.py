@@ -78,8 +78,8 @@ class RecordedSystem:
     :param camera: the one of several to check; '': the first.
     :param remaps: names of topics in the bag, by ours, if they differ.
     :param own: filled by the caller, who reads the odometry anyway; None: it is read here.
-    :raises ValueError: for a camera that does not exist, or a neighbours file that is wrong.
-    :raises OSError: if the neighbours file cannot be read.
+    :raises ValueError: for a camera that does not exist, or a neighbors file that is wrong.
+    :raises OSError: if the neighbors file cannot be read.
     """
 
     def __init__(self, bag: Bag, values: Mapping[str, dict[str, Any]], camera: str = '',

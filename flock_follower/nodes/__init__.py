@@ -22,7 +22,7 @@ import threading
 
 from flock_follower.signals import AS_A_PROGRAM, ending, hang_up_as_terminate
 
-#: A signalled process has ended after this, s; the bridge has braked and ended its stream before.
+#: A signaled process has ended after this, s; the bridge has braked and ended its stream before.
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None

@@ -164,7 +164,7 @@ class BlackBox(FlockNode):
                 self._unasked.discard(name)
 
     def _note(self, _: dict[str, Any]) -> None:
-        """Note the parameters flown as a file for ``evaluate``, and the neighbours beside them."""
+        """Note the parameters flown as a file for ``evaluate``, and the neighbors beside them."""
         flown = {}
         for name, node in zip(OURS, self._nodes.values()):
             if node.values is None:
@@ -264,7 +264,7 @@ class BlackBox(FlockNode):
 
 
 def _compressed(data: bytes) -> bytes:
-    """Return a serialised image as a serialised compressed one; ValueError if it is corrupt."""
+    """Return a serialized image as a serialized compressed one; ValueError if it is corrupt."""
     image = deserialize(data, IMAGE)
     compressed = empty(COMPRESSED)
     compressed.header, compressed.format = image.header, 'jpeg'

@@ -286,7 +286,7 @@ class OdometryBuffer:
 
         The noise of the velocities (n, 3) is updated on the way.
 
-        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
+        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbors as far
         apart as first and last. If angular velocities are missing or late, the latter are
         farther apart, and more so than averaging would gain.
         """

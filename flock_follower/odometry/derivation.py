@@ -17,7 +17,7 @@ Velocities derived from positions, and angular velocities from attitudes.
 
 The same Kalman filter serves both: value, rate and acceleration along each axis, driven by white
 jerk (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-section 6.2). The measurement noise is learnt from the innovations.
+section 6.2). The measurement noise is learned from the innovations.
 
 Frame of a source's velocity, found by a comparison with the motion of its positions.
 
@@ -29,7 +29,7 @@ first or later, the velocity is dropped. The velocity is used again once it agre
 windows in motion, or in ``EXPIRES`` windows at rest.
 
 Before the frame is found, REP-105's child frame is used while both readings are the same, and the
-likelier reading once the evidence favours one. Otherwise the velocity is derived from the
+likelier reading once the evidence favors one. Otherwise the velocity is derived from the
 positions, as it is while the last window contradicts both readings, and after a contradiction
 until a frame is found again. A velocity of exactly 0 counts as missing. The covariance of the
 twist includes the probability that the reading is wrong.

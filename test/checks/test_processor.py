@@ -155,7 +155,7 @@ def test_the_longest_wait_is_that_of_one_thread(kernel: Kernel) -> None:
 
 
 @pytest.mark.parametrize(('state', 'expected'), [('T', True), ('t', True), ('S', False)])
-def test_a_stopped_process_is_recognised_whatever_its_name(
+def test_a_stopped_process_is_recognized_whatever_its_name(
         tmp_path: Path, state: str, expected: bool) -> None:
     (tmp_path / '7').mkdir()
     (tmp_path / '7' / 'stat').write_text(f'7 (a) T b) {state} 1 7 7 0\n')

@@ -65,8 +65,8 @@ def test_acceleration_and_jerk_are_bounded_and_speed_is_reached(name: str) -> No
 
 def test_a_circle_is_round_and_a_figure_eight_crosses_itself() -> None:
     later = flown(MOTIONS['circle']).positions[1200:, :2]
-    centre = (later.max(axis=0) + later.min(axis=0)) / 2
-    assert np.linalg.norm(later - centre, axis=1) == pytest.approx(1.6, abs=0.02)
+    center = (later.max(axis=0) + later.min(axis=0)) / 2
+    assert np.linalg.norm(later - center, axis=1) == pytest.approx(1.6, abs=0.02)
     eight = flown(MOTIONS['figure_eight'], bearing=(0.0, 0.0)).positions
     assert np.linalg.norm(eight[1200:] - eight[0], axis=1).min() < 0.05
     assert np.abs(eight[:, 0] - eight[0, 0]).max() == pytest.approx(2.0, abs=0.02)

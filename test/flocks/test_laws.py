@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The law on a neighbour graph: what it shares with the paper's law, and what it promises."""
+"""The law on a neighbor graph: what it shares with the paper's law, and what it promises."""
 
 from __future__ import annotations
 
