@@ -16,7 +16,7 @@
 Whether flocks stay together and apart: ``python benchmarks/graph_law.py``, some minutes.
 
 Random starts in 2-D and 3-D, in the narrow band of the paper's simulations and the wide one of
-its flights, 20 s each on the neighbour graph; a start counts as kept where no pair ever came to
+its flights, 20 s each on the neighbor graph; a start counts as kept where no pair ever came to
 r^2 <= d0 and no edge ever to r^2 >= d1, so that the graph stayed connected. Exit code 0 only if
 all were kept.
 """
@@ -32,7 +32,7 @@ import sys
 from typing import NamedTuple
 
 from flock_desk.flocks.agents import simulate_graph
-from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS, random_start
+from flock_desk.flocks.paper import FLIGHT_PARAMS, PAPER_PARAMS, random_start
 from flock_follower.flocking import FlockingParams
 
 
@@ -66,7 +66,8 @@ def main(args: Sequence[str] | None = None) -> int:
           '|---|---|---|---|---|---|---|')
     lost = 0
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for agents, dimension, params in product(options.agents, (2, 3), (PARAMS, FLIGHT_PARAMS)):
+        for agents, dimension, params in product(options.agents, (2, 3),
+                                                 (PAPER_PARAMS, FLIGHT_PARAMS)):
             results = [*pool.map(kept, [Case(agents, dimension, params, seed, options.dt)
                                         for seed in range(options.seeds)])]
             good, least, greatest, order = zip(*results)

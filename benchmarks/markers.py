@@ -62,7 +62,7 @@ RUNS, IMAGES = 8, 12
 APPROACH, APPROACH_RATE = 44.0, 15.0  # s, Hz
 CAMERA = Camera()
 MODEL = CameraModel(
-    np.array([[CAMERA.focal_x, 0.0, CAMERA.centre_x], [0.0, CAMERA.focal_y, CAMERA.centre_y],
+    np.array([[CAMERA.focal_x, 0.0, CAMERA.center_x], [0.0, CAMERA.focal_y, CAMERA.center_y],
               [0.0, 0.0, 1.0]]), np.array(CAMERA.distortion), CAMERA.model, CAMERA.width,
     CAMERA.height)
 OWN = Transform(translation=np.array([0.0, 0.0, 2.0]))

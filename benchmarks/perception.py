@@ -111,7 +111,7 @@ FLIGHTS = {
     'fisheye': Bounds(7.0),
     'tag36h11': Bounds(7.0, 0.004, 0.03, 0.01),
 }
-#: Of the normalised estimation error squared (NEES) of position and of velocity: half to twice
+#: Of the normalized estimation error squared (NEES) of position and of velocity: half to twice
 #: their three dimensions.
 NEES = 1.5, 6.0
 
@@ -423,7 +423,7 @@ class Cameras:
         """Print what each took, and return that of two cameras over that of one."""
         of_one = {setup: [spent / one for spent, one in zip(turns, self.spent['one'])]
                   for setup, turns in self.spent.items()}
-        print('\ncameras      CPU, ms per image of the first   of one, median   neighbours found')
+        print('\ncameras      CPU, ms per image of the first   of one, median   neighbors found')
         for setup, turns in self.spent.items():
             print(f'  {setup:<15}{sum(turns) / self.images:8.2f}'
                   f'{np.median(of_one[setup]):28.2f}{self.found[setup]:17d}')

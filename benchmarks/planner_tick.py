@@ -15,11 +15,11 @@
 """
 What a tick of the planner costs, and its projection beside others: ``make bench-planner``.
 
-Ticks: short flights with 1, 4, 12 or 18 neighbours at 1.0 to 2.7 m around the follower, so noisy
+Ticks: short flights with 1, 4, 12 or 18 neighbors at 1.0 to 2.7 m around the follower, so noisy
 and so contrary that most of those with many have bounds that leave no room.
 
 Projection: the command nearest to a wanted one within two discs (a_max, v_max) and two bounds for
-each neighbour, the first ones first. Beside ours: the search over all candidates that the tests
+each neighbor, the first ones first. Beside ours: the search over all candidates that the tests
 hold as reference, and quadprog, ProxQP and OSQP where they are installed (``pip install quadprog
 proxsuite osqp``). Those know neither discs, for which they get polygons of 32 sides around them,
 nor an order of importance. Where all bounds can be kept that is one quadratic program, "one QP";
@@ -53,7 +53,7 @@ from flock_follower.planner.projection import Discs, lexicographic, optimum, Sid
 from flock_follower.planner.step import Memory, step
 
 COUNTS = 1, 4, 12, 18
-MOST = {1: 0.25, 12: 5.0, 18: 2.0}  # ms: the 99th percentile of a tick with so many neighbours
+MOST = {1: 0.25, 12: 5.0, 18: 2.0}  # ms: the 99th percentile of a tick with so many neighbors
 TICKS = 12  # of one flight
 NEAR, FAR = 1.0, 2.7  # m
 SPEED = 0.5  # m/s
@@ -84,14 +84,14 @@ def main(args: Sequence[str] | None = None) -> int:
     gc.collect()
     gc.freeze()  # as the node does before it spins
     print(f'numpy {np.__version__}, one thread, CPU time, the least of {ROUNDS} rounds\n')
-    print('one tick    neighbours    p50, ms    p99, ms     most, ms    ticks guarded')
+    print('one tick    neighbors    p50, ms    p99, ms     most, ms    ticks guarded')
     missed = []
     for count in COUNTS:
         ms, guarded = ticks(count, options.flights)
         p50, p99 = np.percentile(ms, (50, 99))
         print(f'{count:22d}{p50:11.3f}{p99:11.3f}{ms.max():13.3f}{guarded:17.0%}', flush=True)
         if p99 > MOST.get(count, np.inf):
-            missed.append(f'{count} neighbours: p99 {p99:.3f} ms, must be at most {MOST[count]}')
+            missed.append(f'{count} neighbors: p99 {p99:.3f} ms, must be at most {MOST[count]}')
     solvers = dict(installed())
     for count in COUNTS:
         contest(count, options.problems, solvers)
@@ -102,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def ticks(count: int, flights: int) -> tuple[Array, float]:
-    """Return the times of ticks with so many neighbours, ms, and the share that was guarded."""
+    """Return the times of ticks with so many neighbors, ms, and the share that was guarded."""
     params = PlannerParams()
     inputs: list[tuple[Any, ...]] = []
     guarded = 0
@@ -132,7 +132,7 @@ def ticks(count: int, flights: int) -> tuple[Array, float]:
 
 
 def problem(count: int, rng: np.random.Generator) -> Problem:
-    """Draw the projection of a tick with so many neighbours."""
+    """Draw the projection of a tick with so many neighbors."""
     guarding = GuardParams()
     edges = Edges.of(FlockingParams(beta=0.25, d1=8.0), guarding)
     v = rng.uniform(-0.35, 0.35, 2)
@@ -157,7 +157,7 @@ def contest(count: int, problems: int, solvers: dict[str, Solve]) -> None:
         methods['all candidates'] = reference
     room = np.array([optimum(p.wanted, False, p.bounds, p.discs)[1] == len(p.bounds)
                      for p in drawn])
-    print(f'\nprojection, {count} neighbours, {2 * count} bounds, '
+    print(f'\nprojection, {count} neighbors, {2 * count} bounds, '
           f'{room.mean():.0%} with room for all')
     print('                        in order              one QP           QPs   error, m/s^2\n'
           '                     p50, ms   p99, ms    p50, ms   p99, ms   mean   median       p99')
@@ -186,7 +186,7 @@ def polygons(discs: Discs) -> tuple[Array, Array]:
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     normals = -np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.vstack([normals, normals]), np.concatenate(
-        [normals @ pair(centre) - radius for centre, radius in (discs[:2], discs[2:])])
+        [normals @ pair(center) - radius for center, radius in (discs[:2], discs[2:])])
 
 
 def pair(number: complex) -> Array:

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-How fast a large flock is simulated on its neighbour graph: ``python benchmarks/simulation.py``.
+How fast a large flock is simulated on its neighbor graph: ``python benchmarks/simulation.py``.
 
-One step beside a plain numpy loop, the search for neighbours included in both. Exit code 0 only
+One step beside a plain numpy loop, the search for neighbors included in both. Exit code 0 only
 if the graph takes no longer.
 """
 
@@ -47,7 +47,7 @@ def main(args: Sequence[str] | None = None) -> int:
     # In turns: the load of the machine is the same for both.
     times = [(timed(on_graph, x, v), timed(plain, x, v)) for _ in range(options.repeats)]
     ours, theirs = map(min, zip(*times))
-    print(f'one step of {n} agents in 2-D: neighbour graph {1e3 * ours:.1f} ms, '
+    print(f'one step of {n} agents in 2-D: neighbor graph {1e3 * ours:.1f} ms, '
           f'plain numpy loop {1e3 * theirs:.1f} ms')
     return 0 if ours <= theirs else 1
 

@@ -47,7 +47,7 @@ out.mkdir(parents=True, exist_ok=True)
 scenario = parse(SCENARIO, 'climbing.yaml')
 flights = fly(scenario, runs=range(10), guard=True)  # a run's number is its seed
 figures = summary(measure(flights))
-judgements = judge(parse_bounds(BOUNDS), figures)
+judgments = judge(parse_bounds(BOUNDS), figures)
 
 figure = Figure(figsize=(9, 3.5), layout='constrained')
 axes = figure.subplots()
@@ -56,6 +56,6 @@ axes.plot(flights.times, np.linalg.norm(flights.leader - flights.follower, axis=
 axes.set(title='true distance, every run; shaded: the band', xlabel='time [s]', ylabel='[m]')
 figure.savefig(out / 'distances.png')
 write_summary(figures, out / 'summary.json')
-write_report(out / 'report.html', scenario.name, scenario.summary, figures, judgements, [
+write_report(out / 'report.html', scenario.name, scenario.summary, figures, judgments, [
     Chapter('Distances', '', [Illustration((out / 'distances.png').read_bytes(), 'distance')])])
-sys.exit(announce(figures, judgements, [out / 'report.html']))
+sys.exit(announce(figures, judgments, [out / 'report.html']))

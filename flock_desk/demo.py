@@ -34,7 +34,7 @@ import numpy as np
 
 from flock_desk.runs.console import guarded, logs_in
 from flock_desk.runs.figure_table import bounds
-from flock_desk.runs.flight import COUNTED, RECORDED, start
+from flock_desk.runs.flight import COUNTER_PERIOD, RECORDED, start
 from flock_desk.runs.judge import FigureBound
 from flock_desk.runs.plots import chapters
 from flock_desk.runs.processes import (
@@ -99,10 +99,10 @@ def _demonstrate(out: Path) -> int:
         with explained(None if failed(exit_codes) else load):
             flight = read_replayed(BAG, out, params)
         summary = replay_figures(flight, exit_codes, load)
-        judgements = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
+        judgments = report(out, TITLE, INTRODUCTION, summary, demo_bounds(params),
                             chapters(flight), load=load)
         print()
-        return announce(summary, judgements, [out / 'report.html'], out, load)
+        return announce(summary, judgments, [out / 'report.html'], out, load)
 
 
 def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | None], Load | None]:
@@ -140,7 +140,7 @@ def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | No
         replay.wait()
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')
-        time.sleep(COUNTED)
+        time.sleep(COUNTER_PERIOD)
         return processes.stop_all(), processes.load.worst(began)
 
 

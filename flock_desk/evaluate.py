@@ -48,7 +48,7 @@ import cv2
 
 from flock_desk.runs.console import explained, guarded
 from flock_desk.runs.evaluation import evaluate
-from flock_desk.runs.judge import check_names, Judgement, load_bounds
+from flock_desk.runs.judge import check_names, Judgment, load_bounds
 from flock_desk.runs.plots import evaluation_chapters
 from flock_desk.runs.processes import computed
 from flock_desk.runs.report import announce, report
@@ -66,7 +66,7 @@ class BagOutcome(NamedTuple):
     code: int
     problems: Sequence[str]
     summary: Mapping[str, Any] = {}
-    judgements: Sequence[Judgement] = ()
+    judgments: Sequence[Judgment] = ()
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -112,7 +112,7 @@ def _evaluate_all(bags: Mapping[str, Path], options: argparse.Namespace) -> int:
         for line in outcome.problems:
             print(line, file=sys.stderr)
         codes.append(outcome.code if outcome.code == 2 else max(outcome.code, announce(
-            outcome.summary, outcome.judgements, [folder / 'report.html'])))
+            outcome.summary, outcome.judgments, [folder / 'report.html'])))
     return max(codes)
 
 
@@ -158,14 +158,14 @@ def evaluated(bag: Path, folder: Path, options: argparse.Namespace) -> BagOutcom
             f'v_max = {evaluation.params.v_max:g} m/s: there the setpoints '
             'brake; set v_max (--config) to the recorded speed')
     flown_with = ', with the parameters flown' if flown else ''
-    judgements = report(
+    judgments = report(
         folder, f'Evaluation of {bag.name}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
         'setpoints.', summary, bounds, evaluation_chapters(evaluation), [*lines, *warnings])
     failed = options.check == 'fail' and not ready(findings)
     return BagOutcome(int(failed), [*lines, *(f'warning: {each}' for each in warnings)],
-                      summary, judgements)
+                      summary, judgments)
 
 
 if __name__ == '__main__':

@@ -18,7 +18,7 @@ The figures of the paper, redrawn: ``python -m flock_desk.figures``.
 Without ``--agents`` the figures of Liu & Qiu (AAMAS 2020) on simulations, and a table of their
 figures, for the law and the models it is compared with; and the controllers that ``flights``
 compared, runs in the band against jerk. With ``--agents N`` one larger flock of the law on a
-neighbour graph. Each is as wide as a column, without a title, as PNG, SVG and PDF. Two runs write
+neighbor graph. Each is as wide as a column, without a title, as PNG, SVG and PDF. Two runs write
 the same bytes. Flights are drawn by the reports of ``fly``.
 """
 
@@ -57,7 +57,8 @@ COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'order', 'W start', 'W end', 'band')
 Row = tuple[str, ...]
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
-DURATION, FLOCK_PERIOD = 20.0, 0.05  # s, of the larger flock
+FLOCK_DURATION = 20.0  # s, of the larger flock
+FLOCK_PERIOD = 0.05  # s between samples of the larger flock
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -91,12 +92,12 @@ def redraw(out: Path) -> list[str]:
     runs: dict[str, dict[str, Simulation]] = {'leaderless': {}, 'leader-follower': {}}
     with progress(2 * len(MODELS)) as bar:
         for scenario, start, led, duration in (
-                ('leaderless', paper.LEADERLESS, False, 20.0),
-                ('leader-follower', paper.LEADER_FOLLOWER, True, 10.0)):
+                ('leaderless', paper.LEADERLESS_START, False, 20.0),
+                ('leader-follower', paper.LEADER_FOLLOWER_START, True, 10.0)):
             for model, name in MODELS.items():
                 bar.set_description_str(f'{scenario}: {name}')
                 runs[scenario][name] = simulate(
-                    *start, paper.PARAMS, duration=duration, model=model, led=led,
+                    *start, paper.PAPER_PARAMS, duration=duration, model=model, led=led,
                     sample_period=SAMPLE_PERIOD)
                 bar.update()
     alone, followed = runs.values()
@@ -143,9 +144,9 @@ def redraw_controllers(out: Path, path: Path) -> list[str]:
 def one_flock(out: Path, agents: int, dim: int, seed: int) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of its files."""
     start = random_start(agents, dim, paper.FLIGHT_PARAMS, seed)
-    with progress(round(DURATION / FLOCK_PERIOD) + 1) as bar:
+    with progress(round(FLOCK_DURATION / FLOCK_PERIOD) + 1) as bar:
         bar.set_description_str(f'{agents} agents, {dim}-D')
-        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=DURATION,
+        run = simulate_graph(*start, paper.FLIGHT_PARAMS, duration=FLOCK_DURATION,
                              sample_period=FLOCK_PERIOD, progress=bar.update)
     m, name = run.metrics, f'flock_{agents}_{dim}d_seed{seed}'
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',

@@ -42,7 +42,7 @@ from typing import Any
 
 import numpy as np
 
-from flock_desk.closed_loop.real_time_flight import SKIPPED
+from flock_desk.closed_loop.real_time_flight import MAX_SKIPPED_SHARE
 from flock_desk.runs.console import guarded, logs_in, within
 from flock_desk.runs.figure_table import bounds, LATE
 from flock_desk.runs.flight import Flown, fly, links, namespaces, own, SIH_TRUTH, spacing
@@ -60,7 +60,7 @@ from flock_desk.runs.summary import (
     outage_name,
     scenario_figures,
 )
-from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
+from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEED_RANGE
 from flock_desk.scenarios.scenario_file import load_for_real_time, names
 from flock_follower.bridge_state import TAKEN_OVER
 from flock_follower.ranges import Range
@@ -81,7 +81,7 @@ def main(args: Sequence[str] | None = None) -> int:
         epilog=f'scenarios: {", ".join(names())}')
     parser.add_argument('--scenario', default='indoor', metavar='NAME',
                         help='a name in config/scenarios, or the path of a file (%(default)s)')
-    parser.add_argument('--seed', type=within(SEEDS), default=0,
+    parser.add_argument('--seed', type=within(SEED_RANGE), default=0,
                         help='of everything that chance decides')
     parser.add_argument('--duration', type=within(DURATIONS), default=0.0, metavar='S',
                         help='fly no longer than this, s; never longer than the scenario')
@@ -150,14 +150,14 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
             flight, own(flown.cores, namespace), own(flown.exit_codes, namespace), flown.load)
         demanded = scenario_bounds(flight, summary)
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in demanded]
-        judgements = report(
+        judgments = report(
             out / namespace, f'{title} {namespace}'.rstrip(), scenario.summary, summary, demanded,
             scenario_chapters(flight), cautions(summary), load=flown.load)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
         summary = column_figures(scenario, flights)
         nearest = FigureBound('nearest_m', nearest_allowed(scenario), load=LATE)
-        judgements = report(
+        judgments = report(
             out, f'{title}, a column of {followers}', scenario.summary, summary,
             [nearest, *limits], (), parts=summaries, load=flown.load)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
@@ -165,7 +165,7 @@ def conclude(scenario: Scenario, out: Path, followers: int, flown: Flown) -> int
     for each in summaries.values():
         for warning in cautions(each):
             print(f'warning: {warning}', file=sys.stderr)
-    return announce(summary, judgements, pages, out, flown.load)
+    return announce(summary, judgments, pages, out, flown.load)
 
 
 def scenario_bounds(flight: LiveFlight, summary: Mapping[str, Any]) -> list[FigureBound]:
@@ -225,7 +225,7 @@ def cautions(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings: images left out, a flight cut short."""
     warnings = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
-    if skipped > SKIPPED:
+    if skipped > MAX_SKIPPED_SHARE:
         warnings.append(f'{100 * skipped:.0f} % of the images were not rendered in time')
     if early := (summary['external'] or {}).get('ended_early'):
         warnings.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')

@@ -282,7 +282,7 @@ class Follower:
         self._process_due()
 
     def range(self, time: int, measured: RangeState) -> None:
-        """Take a range to a neighbour."""
+        """Take a range to a neighbor."""
         self.advance(time)
         if self.perceiver is not None:
             if (rejection := self.perceiver.take_range(measured)) is not None:
@@ -290,7 +290,7 @@ class Follower:
             self._use_ranges(self.perceiver)
 
     def neighbor(self, time: int, state: OdometryState) -> None:
-        """Take a neighbour's state."""
+        """Take a neighbor's state."""
         self.advance(time)
         if self.sharing is not None:
             self.sharing.take_seen(state)

@@ -16,7 +16,7 @@
 ``ros2 run flock_follower marker --id 0 --dictionary DICT_4X4_50 --size 0.16 --output marker.pdf``.
 
 Draws markers to scale, one to a page, each with the white border that detection needs and a ruler,
-and prints the neighbours file. With ``--panel`` all are on one page, for one leader that is seen
+and prints the neighbors file. With ``--panel`` all are on one page, for one leader that is seen
 from near and from far: the largest on top, the smaller ones below it. The panel's origin is the
 middle of the smallest: nearby, the camera sees little else, so it belongs at the height of the
 camera. Two runs write the same bytes.
@@ -57,7 +57,7 @@ SIZES = (0.3, 0.06)
 # drops a square with another, here the paper's edge, within 0.05 of its perimeter.
 MIN_QUIET = 0.16
 MARGIN = 5.0  # mm, along a page's edge where printers do not print
-LINE = 0.2  # mm
+LINE_WIDTH_MM = 0.2  # mm
 CAPTION = (100.0, 30.0)  # mm, with the ruler, whose length is the caption's width
 INCH = 25.4  # mm
 
@@ -66,7 +66,7 @@ Box = tuple[float, float, float, float]
 _ENTRY = """\
 {first}marker_id: {marker_id}
 {next}side_length: {side_length:g}  # m; measure the print
-{next}position: [-0.20, 0.0, {up:.4f}]  # m, the centre on the body: forward, left, up
+{next}position: [-0.20, 0.0, {up:.4f}]  # m, the center on the body: forward, left, up
 {next}rpy: [1.5707963, 0.0, -1.5707963]  # rad; upright, facing backwards"""
 
 
@@ -113,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _write(options: argparse.Namespace) -> int:
-    """Write the file and print the neighbours file."""
+    """Write the file and print the neighbors file."""
     ids, sizes = options.id, options.size
     sizes = sizes or ([*SIZES] if options.panel else [DEFAULT_SIDE])
     ids = ids or [*range(len(sizes))]
@@ -141,7 +141,7 @@ def _write(options: argparse.Namespace) -> int:
 
 def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> list[Placed]:
     """Return markers of these sides, m, in the order of their ids, the largest on top."""
-    top, placed = LINE, []
+    top, placed = LINE_WIDTH_MM, []
     for marker_id, size in sorted(zip(ids, sizes), key=lambda pair: -pair[1]):
         quiet = max(1.0 / marker_cells(dictionary), MIN_QUIET)
         outer = 1e3 * size * (1.0 + 2.0 * quiet)
@@ -156,7 +156,8 @@ def draw(dictionary: str, markers: Sequence[Placed]) -> Page:
 
     :raises ValueError: for an unknown dictionary or id, and a print larger than all pages.
     """
-    cut = markers[0].outer + 2.0 * LINE, markers[-1].y + 0.5 * markers[-1].outer + LINE
+    cut = (markers[0].outer + 2.0 * LINE_WIDTH_MM,
+           markers[-1].y + 0.5 * markers[-1].outer + LINE_WIDTH_MM)
     least = max(cut[0], CAPTION[0]) + 2.0 * MARGIN, cut[1] + CAPTION[1] + 2.0 * MARGIN
     sides = ' and '.join(f'{1e3 * marker.side_length:g}' for marker in markers)
     name = next((name for name, (width, height) in PAGES.items()
@@ -196,11 +197,12 @@ def cells_of(dictionary: str, marker_id: int, left: float, top: float, side: flo
 def corner_marks(left: float, top: float, width: float, height: float) -> list[Box]:
     """Return angles along the inside of a rectangle: they show where to cut."""
     arm = min(8.0, 0.25 * min(width, height))
-    right, bottom = left + width - LINE, top + height - LINE
+    right, bottom = left + width - LINE_WIDTH_MM, top + height - LINE_WIDTH_MM
     boxes = []
     for x, along_x in ((left, left), (right, left + width - arm)):
-        for y, along_y in ((top, top + LINE), (bottom, top + height - arm)):
-            boxes += [(along_x, y, arm, LINE), (x, along_y, LINE, arm - LINE)]
+        for y, along_y in ((top, top + LINE_WIDTH_MM), (bottom, top + height - arm)):
+            boxes += [(along_x, y, arm, LINE_WIDTH_MM),
+                      (x, along_y, LINE_WIDTH_MM, arm - LINE_WIDTH_MM)]
     return boxes
 
 
@@ -213,9 +215,10 @@ def caption(left: float, top: float, *lines: str
     texts += [(left + at, y + 7.0, 2.6, label)
               for at, label in ((0.0, '0'), (50.0, '50'), (100.0 - 11.0, '100 mm'))]
     # The first and last tick end where the ruler ends: 100 mm from outer edge to outer edge.
-    ticks = [(left + at - LINE * at / 100.0, y + LINE, LINE, 3.5 if at % 50 == 0 else 2.0)
+    ticks = [(left + at - LINE_WIDTH_MM * at / 100.0, y + LINE_WIDTH_MM, LINE_WIDTH_MM, 3.5
+              if at % 50 == 0 else 2.0)
              for at in range(0, 101, 10)]
-    return texts, [(left, y, 100.0, LINE), *ticks]
+    return texts, [(left, y, 100.0, LINE_WIDTH_MM), *ticks]
 
 
 def pdf(pages: Sequence[Page], title: str) -> bytes:
@@ -231,7 +234,7 @@ def pdf(pages: Sequence[Page], title: str) -> bytes:
             out, metadata=about) as file:
         for page in pages:
             file.savefig(_figure(page))
-        # matplotlib has no option for it: its catalogue is written again, the last one counts.
+        # matplotlib has no option for it: its catalog is written again, the last one counts.
         file._file.writeObject(file._file.rootObject, {
             'Type': Name('Catalog'), 'Version': Name('1.6'), 'Pages': file._file.pagesObject,
             'ViewerPreferences': {'PrintScaling': Name('None')}})
@@ -254,7 +257,7 @@ def _figure(page: Page) -> Figure:
 
 
 def neighbors_file(dictionary: str, prints: Sequence[Sequence[Placed]]) -> str:
-    """Return the neighbours file of leaders that each carry a print on the tail."""
+    """Return the neighbors file of leaders that each carry a print on the tail."""
     lines = [f'dictionary: {dictionary}', 'neighbors:']
     for markers in prints:
         name = 'leader' if len(prints) == 1 else f'drone{markers[0].marker_id}'

@@ -32,7 +32,7 @@ from rclpy.qos import QoSProfile
 from flock_follower.bags.bag import BagError
 from flock_follower.bags.mcap_file import incomplete
 from flock_follower.bags.writer import BagWriter
-from flock_follower.nodes import unhurried
+from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.runtime import run, spin
 
@@ -57,7 +57,7 @@ class Recorder(Node):
         """Record until asked to end, close the bag, and return the exit code."""
         try:
             # To close a long recording takes longer than the deadline of a shutdown.
-            with unhurried(), self._bag:
+            with no_exit_deadline(), self._bag:
                 spin(self)
                 print(f'closing {self._bag.path}', flush=True)
         except BagError as error:

@@ -54,11 +54,12 @@ from flock_follower.ranges import Range
 
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
-ODOMETRY_RATE, IMAGE_RATE = 200, 30  # Hz
+ODOMETRY_RATE = 200  # Hz
+IMAGE_RATE = 30  # Hz
 #: Odometry arrives 1.5 ms after its stamp, and up to 0.5 ms of transport later.
-ODOMETRY = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015), tilt_bias=0.0)
+ODOMETRY_ERRORS = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015), tilt_bias=0.0)
 
-_MS = 1_000_000  # ns
+_NS_PER_MS = 1_000_000  # ns
 _FIRST_IMAGE_NS = 12_500_000  # not on an odometry stamp: cameras seldom are
 _INFO, _ODOMETRY = 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry'
 
@@ -83,8 +84,8 @@ def _enlarged(width: int, height: int) -> Camera:
     small = Camera()
     finer = width / small.width
     return Camera(width, height, finer * small.focal_x, finer * small.focal_y,
-                  width / 2 + finer * (small.centre_x - small.width / 2),
-                  height / 2 + finer * (small.centre_y - small.height / 2))
+                  width / 2 + finer * (small.center_x - small.width / 2),
+                  height / 2 + finer * (small.center_y - small.height / 2))
 
 
 VARIANTS = {
@@ -116,13 +117,13 @@ class Recording:
         # Longer than recorded, so that the last image's exposure ends within the flight.
         self.leader, self.follower = fly(variant.duration + 0.1, seed, variant.swing)
         count = round(variant.duration * IMAGE_RATE)
-        self.image_stamps_ns = [START_NS + _FIRST_IMAGE_NS + k * 1000 * _MS // IMAGE_RATE
+        self.image_stamps_ns = [START_NS + _FIRST_IMAGE_NS + k * 1000 * _NS_PER_MS // IMAGE_RATE
                                 for k in range(count)]
         rng = np.random.default_rng([seed, 2])
         #: When the images arrive: after exposure, read-out, transport.
         self.image_arrivals_ns = [
-            stamp + round(variant.sensor.exposure * 5e8) + 8 * _MS + int(jitter)
-            for stamp, jitter in zip(self.image_stamps_ns, rng.integers(0, 2 * _MS, count))]
+            stamp + round(variant.sensor.exposure * 5e8) + 8 * _NS_PER_MS + int(jitter)
+            for stamp, jitter in zip(self.image_stamps_ns, rng.integers(0, 2 * _NS_PER_MS, count))]
 
     @cached_property
     def odometry(self) -> list[Odometry]:
@@ -131,7 +132,7 @@ class Recording:
         # Rounded: the last bits differ between processors.
         return [Odometry(o.time, o.position.round(6), o.quaternion.round(8), o.linear.round(6),
                          o.angular.round(6), o.pose_covariance.round(12), o.twist_covariance)
-                for o in odometry(self.follower, times, ODOMETRY, self.seed)]
+                for o in odometry(self.follower, times, ODOMETRY_ERRORS, self.seed)]
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -183,11 +184,12 @@ class Recording:
 
     def odom(self) -> list[BagMessage]:
         """Return the follower's odometry."""
-        jitter = np.random.default_rng([self.seed, 3]).integers(0, _MS // 2, len(self.odometry))
-        latency = round(1e9 * ODOMETRY.latency[0])
+        jitter = np.random.default_rng([self.seed, 3]).integers(0, _NS_PER_MS // 2,
+                                                                len(self.odometry))
+        latency = round(1e9 * ODOMETRY_ERRORS.latency[0])
         messages = []
         for k, (state, late) in enumerate(zip(self.odometry, jitter)):
-            stamp = START_NS + k * 1000 * _MS // ODOMETRY_RATE
+            stamp = START_NS + k * 1000 * _NS_PER_MS // ODOMETRY_RATE
             messages.append(_odometry_message('/odom', 'base_link', stamp,
                                               stamp + latency + int(late), state))
         return messages
@@ -262,7 +264,7 @@ def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,
 
 def _header(stamp_ns: int, frame: str) -> Any:
     types = typestore().types
-    stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1000 * _MS))
+    stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1000 * _NS_PER_MS))
     return types['std_msgs/msg/Header'](stamp, frame)
 
 

@@ -48,19 +48,19 @@ from flock_desk.closed_loop.real_time_flight import (
     calibration,
     IMAGE_RATE,
     LATEST_NS,
+    MAX_SKIPPED_SHARE,
     real_time_camera,
     RealTimeFlight,
     RenderedImage,
-    SKIPPED,
     STEP_NS,
 )
 from flock_desk.external.external_autopilot import ExternalAutopilot, ExternalVehicles
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
-from flock_desk.scenarios.scenario import DURATIONS, SEEDS
+from flock_desk.scenarios.scenario import DURATIONS, SEED_RANGE
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.sensors.vio import Odometry
-from flock_desk.simulator_outputs import LATCHED, ODOMETRY, SimulatorOutputs, VehicleAhead
-from flock_desk.vehicles.embedded import STEP
+from flock_desk.simulator_outputs import LATCHED_QOS, ODOMETRY, SimulatorOutputs, VehicleAhead
+from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.bags.live_line import LiveLine
 from flock_follower.bridge_state import ACTIVE, NO_AUTOPILOT
 from flock_follower.checks.processor import children, LoadMeter
@@ -83,7 +83,7 @@ PICTURE_PERIOD = 10.0  # s between images that are logged
 SPECS = [
     Spec('scenario', 'indoor',
          'a name in config/scenarios, or the path of a .yaml file'),
-    Spec('seed', 0, 'seed of all random numbers', SEEDS),
+    Spec('seed', 0, 'seed of all random numbers', SEED_RANGE),
     Spec('duration', 0.0, 'flight time; 0: the duration of the scenario', DURATIONS),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
     Spec('vehicle', 'embedded',
@@ -136,7 +136,7 @@ class Simulator(FlockNode):
         parent = os.getppid()
         self._load = (LoadMeter(lambda: children(parent)) if self._values['end_if_busy']
                       else None)
-        self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
+        self.subscribe(String, 'planner/state', self._take_state, LATCHED_QOS, required=False)
         seed = self._values['seed']
         # It takes a second or two: the clock starts after it.
         camera = real_time_camera(seed, scenario.prints)
@@ -154,7 +154,7 @@ class Simulator(FlockNode):
             self._end = Endpoint(loopback_address(self._values['connection']),
                                  self._vehicle.autopilot)
         else:
-            self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
+            self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED_QOS)
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
@@ -219,7 +219,7 @@ class Simulator(FlockNode):
             if self._values['log']:
                 self._save_log()  # also if asked to end: what was flown is judged
             skipped = self._flight.skipped_images
-            if skipped > SKIPPED * IMAGE_RATE * self._flight.time:
+            if skipped > MAX_SKIPPED_SHARE * IMAGE_RATE * self._flight.time:
                 self._blame(f'{skipped} images were not rendered in time')
         except (OSError, TooBusyError) as error:
             busy = isinstance(error, TooBusyError)
@@ -273,7 +273,7 @@ class Simulator(FlockNode):
         began = math.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9
         ended = self._start + flight.time_ns * 1e-9
         flown, why = self._early or (self._duration, '')
-        if flight.time > flown + STEP and began + flown < ended:
+        if flight.time > flown + STEP_TIME and began + flown < ended:
             ended = began + flown
         self._log.save(
             self._values['log'], epoch_ns=self._epoch_ns, start=self._start, began=began,

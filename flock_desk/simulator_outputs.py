@@ -46,7 +46,8 @@ ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
     'odom', 'base_link', 'leader', 'camera_optical_frame')
 MOTION_PERIOD_NS = 20_000_000
 SILENT_NS = 500_000_000
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY, OWN_TRUTH, LEADER_TRUTH, MOTION = (
     'odom', 'truth/odom', 'truth/neighbors', 'truth/motion')
 #: The vehicle of each topic of odometry, by the name of its frame.
@@ -70,7 +71,8 @@ class SimulatorOutputs:
         self._images, self._infos, self._ranges = (
             node.create_publisher(kind, topic, qos_profile_sensor_data) for kind, topic in (
                 (Image, 'image_raw'), (CameraInfo, 'camera_info'), (Range, 'ranges')))
-        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', LATCHED)
+        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at',
+                                               LATCHED_QOS)
         self._motion_sent = 0
 
     def armed_below(self) -> None:

@@ -56,8 +56,8 @@ class Command(NamedTuple):
     yaw_rate: float = 0.0
     """rad/s, anticlockwise."""
     separation_axis: Array | None = None
-    """Unit vector (3,) away from a neighbour that would come too near: the part of the
-    acceleration along it is cut last. None without such a neighbour."""
+    """Unit vector (3,) away from a neighbor that would come too near: the part of the
+    acceleration along it is cut last. None without such a neighbor."""
     frame: str = ''
     stamp: int = 0
     ahead: int = 0

@@ -83,12 +83,12 @@ class FlockingParams(Checked):
 
     def command(self, offsets: Array, differences: Array) -> Array:
         """
-        Return the acceleration (n,), m/s^2, of an agent that observes m neighbours.
+        Return the acceleration (n,), m/s^2, of an agent that observes m neighbors.
 
         A subclass may return that of another controller, for comparisons with the law.
 
-        :param offsets: neighbours' positions minus the own one, (m, n), m.
-        :param differences: neighbours' velocities minus the own one, (m, n), m/s.
+        :param offsets: neighbors' positions minus the own one, (m, n), m.
+        :param differences: neighbors' velocities minus the own one, (m, n), m/s.
         """
         velocities = np.concatenate([np.zeros((1, differences.shape[1])), differences])
         return sum_over_neighbors(offsets, differences, disagreement(velocities), self, 'flocking')
@@ -115,12 +115,12 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
                  params: FlockingParams) -> Array:
     """
-    Return the law's command (n,), m/s^2, for one agent that observes its neighbours.
+    Return the law's command (n,), m/s^2, for one agent that observes its neighbors.
 
-    L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
+    L is formed of the observed neighbors and the agent itself. Without neighbors it is zero.
 
-    :param relative_positions: neighbours' positions minus the own one, (m, n), n = 2 or 3, m.
-    :param relative_velocities: neighbours' velocities minus the own one, (m, n), m/s.
+    :param relative_positions: neighbors' positions minus the own one, (m, n), n = 2 or 3, m.
+    :param relative_velocities: neighbors' velocities minus the own one, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
     return params.command(*checked(relative_positions, relative_velocities,

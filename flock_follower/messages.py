@@ -56,7 +56,7 @@ RELATIVE_SILENCE = 0.15
 RELATIVE_MAX = 1.0
 #: Oldest image that such a command may rest on, s.
 OLDEST_MARKER = 0.5
-#: Suffix of a neighbour's name on ``neighbors``: another object with the same marker. The planner
+#: Suffix of a neighbor's name on ``neighbors``: another object with the same marker. The planner
 #: avoids it, and never follows it.
 DUPLICATE = '/duplicate'
 
@@ -64,7 +64,7 @@ DUPLICATE = '/duplicate'
 #: m, m/s, m/s^2, rad/s, and entries of covariances: a larger number is an error. Its square may
 #: overflow in time, and a filter that uses it never recovers.
 SANE = 1e6
-#: m: a neighbour is not measured farther away; m/s: no vehicle of a flock is faster.
+#: m: a neighbor is not measured farther away; m/s: no vehicle of a flock is faster.
 FARTHEST, FASTEST = 100.0, 50.0
 #: m/s: a faster own velocity is an error, and unknown. Up to this, not only to FASTEST, the gate
 #: brakes on it: 5 times the highest ``v_max``.
@@ -78,7 +78,7 @@ MAX_JUMP = 0.5
 #: m: odometry farther from its prediction has another frame than before: places in the old frame
 #: are lost. Any one such jump counts; ``POSITION_JUMP`` is for evidence about a source.
 ODOMETRY_JUMP = 0.25
-#: m: a neighbour's position with a larger standard deviation, sqrt(trace), is not used.
+#: m: a neighbor's position with a larger standard deviation, sqrt(trace), is not used.
 POSITION_STD_MAX = 0.5
 #: Standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
 #: of an odometry whose covariances are missing or invalid.
@@ -88,7 +88,7 @@ Make = Callable[[str], Any]
 
 
 def duplicate_name(name: str, number: int) -> str:
-    """Return the name of the first, second, ... duplicate of a neighbour."""
+    """Return the name of the first, second, ... duplicate of a neighbor."""
     return f'{name}{DUPLICATE}{f"_{number}" if number > 1 else ""}'
 
 
@@ -191,7 +191,7 @@ class RangeState(NamedTuple):
     """
     A Range message in numbers.
 
-    ``stamp`` ns; ``name`` of the neighbour it is to; ``distance``, m; ``limits`` between which it
+    ``stamp`` ns; ``name`` of the neighbor it is to; ``distance``, m; ``limits`` between which it
     is valid, m, both 0 if unknown; ``variance``, m^2, 0 if unknown.
     """
 
@@ -274,7 +274,7 @@ def from_state(make: Make, state: OdometryState) -> Any:
 def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
                  covariance: ArrayLike) -> Any:
     """
-    Return an AccelWithCovarianceStamped of a neighbour, in its own frame ``child``.
+    Return an AccelWithCovarianceStamped of a neighbor, in its own frame ``child``.
 
     ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). Its angular part is not known:
     its covariance is -1.
@@ -290,7 +290,7 @@ def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
 
 
 class AccelerationState(NamedTuple):
-    """A neighbour's acceleration (3,), m/s^2, in its own frame ``child``, at a stamp, ns."""
+    """A neighbor's acceleration (3,), m/s^2, in its own frame ``child``, at a stamp, ns."""
 
     stamp: int
     child: str
@@ -299,7 +299,7 @@ class AccelerationState(NamedTuple):
 
 def from_acceleration(message: Any) -> AccelerationState:
     """
-    Return the acceleration in an AccelWithCovarianceStamped of a neighbour.
+    Return the acceleration in an AccelWithCovarianceStamped of a neighbor.
 
     :raises ValueError: if the acceleration is not finite, or beyond ``SANE``.
     """
@@ -313,7 +313,7 @@ def from_acceleration(message: Any) -> AccelerationState:
 
 
 def with_acceleration(state: OdometryState, acceleration: AccelerationState) -> OdometryState:
-    """Return a neighbour's state with an acceleration given in the neighbour's frame."""
+    """Return a neighbor's state with an acceleration given in the neighbor's frame."""
     return state._replace(
         acceleration=quaternion_to_matrix(state.quaternion) @ acceleration.vector)
 

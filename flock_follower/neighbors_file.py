@@ -13,26 +13,26 @@
 # limitations under the License.
 
 """
-The neighbours and the markers they carry, read from YAML.
+The neighbors and the markers they carry, read from YAML.
 
-A file holds the dictionary of the markers and a list of neighbours::
+A file holds the dictionary of the markers and a list of neighbors::
 
     dictionary: DICT_4X4_50
     neighbors:
       - name: leader             # child_frame_id of its estimates
         marker_id: 0
         side_length: 0.16        # m, outer edge to outer edge of the black border
-        position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
+        position: [-0.20, 0.0, 0.0]         # marker center on the neighbor's body (FLU), m
         rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
 
-A neighbour that carries several has, instead of the last four keys, a list of them::
+A neighbor that carries several has, instead of the last four keys, a list of them::
 
       - name: leader
         markers:
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
-Each neighbour may have keys for the planner::
+Each neighbor may have keys for the planner::
 
         role: follower           # leader (the default), follower, or avoid: kept clear of only
         radius: 0.3              # m, of its hull: distances are kept between hulls; 0
@@ -81,7 +81,7 @@ _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A marker: its id, its side, m, and where it sits on its neighbour's body (FLU)."""
+    """A marker: its id, its side, m, and where it sits on its neighbor's body (FLU)."""
 
     marker_id: int
     side_length: float
@@ -90,7 +90,7 @@ class Marker:
 
 @dataclass(frozen=True, eq=False)
 class MarkedNeighbor:
-    """One neighbour, and the markers mounted rigidly on it, at least one."""
+    """One neighbor, and the markers mounted rigidly on it, at least one."""
 
     name: str
     markers: tuple[Marker, ...]
@@ -104,13 +104,13 @@ class MarkedNeighbor:
 
 @dataclass(frozen=True, eq=False)
 class NeighborConfig:
-    """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
+    """The neighbors to look for; names and marker ids are unique, all of one dictionary."""
 
     dictionary: str
     neighbors: tuple[MarkedNeighbor, ...]
 
     def by_marker(self) -> dict[int, tuple[MarkedNeighbor, Marker]]:
-        """Return the neighbours with their markers, by marker id."""
+        """Return the neighbors with their markers, by marker id."""
         return {marker.marker_id: (neighbor, marker)
                 for neighbor in self.neighbors for marker in neighbor.markers}
 
@@ -130,7 +130,7 @@ def size_by_name(name: str) -> int:
 def load(path: str | Path,
          dictionary_size: Callable[[str], int] = size_by_name) -> NeighborConfig:
     """
-    Read a neighbours file.
+    Read a neighbors file.
 
     :param dictionary_size: returns how many markers a dictionary has; ValueError if unknown.
     :raises ValueError: naming the file, the key, its value and the valid range.

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Whether a set of parameters can fly: one judgement for nodes, ``check``, ``evaluate``, scenarios.
+Whether a set of parameters can fly: one judgment for nodes, ``check``, ``evaluate``, scenarios.
 
 A range bounds one parameter; the rules here bound combinations, with the camera and the marker if
 they are known. What endangers is refused, with the nearest value that flies. What only performs
@@ -59,7 +59,7 @@ class Camera(NamedTuple):
     """Angle from the optical axis to the upper edge of the image, rad."""
 
 
-class Judgement(NamedTuple):
+class Judgment(NamedTuple):
     """One parameter that cannot fly, or flies badly, beside the others."""
 
     dangerous: bool
@@ -78,7 +78,7 @@ class Judgement(NamedTuple):
 UNKNOWN: Final[Camera] = Camera()
 
 
-def judge(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgement]:
+def judge(values: Mapping[str, Any], camera: Camera = UNKNOWN) -> list[Judgment]:
     """
     Return everything that a set of parameters cannot fly, or flies badly; the dangers first.
 
@@ -105,42 +105,42 @@ def left_for_motion(a_max: float) -> float:
     return math.sqrt(max(a_max ** 2 - THRUST_OFFSET_MAX ** 2, 0.0))
 
 
-def _stop(values: Mapping[str, Any]) -> Iterator[Judgement]:
+def _stop(values: Mapping[str, Any]) -> Iterator[Judgment]:
     if not {'a_max', 'v_max'} <= values.keys():
         return
     a_max, v_max = float(values['a_max']), float(values['v_max'])
     if v_max > STOP_TIME * left_for_motion(a_max):
         least = math.hypot(v_max / STOP_TIME, THRUST_OFFSET_MAX)
-        yield Judgement(True, 'a_max', a_max, f'at least {math.ceil(100.0 * least) / 100.0:g} '
+        yield Judgment(True, 'a_max', a_max, f'at least {math.ceil(100.0 * least) / 100.0:g} '
                         f'm/s^2 for v_max = {v_max:g}',
                         f'it stops within {STOP_TIME:g} s, and a wrong hover thrust takes '
                         f'{THRUST_OFFSET_MAX:g} m/s^2 of it')
 
 
-def _band(values: Mapping[str, Any]) -> Iterator[Judgement]:
+def _band(values: Mapping[str, Any]) -> Iterator[Judgment]:
     if not {'d0', 'd1'} <= values.keys():
         return
     near, far = (math.sqrt(float(values[name])) for name in ('d0', 'd1'))
     if near < NEAREST:
-        yield Judgement(True, 'd0', values['d0'], f'at least {NEAREST ** 2:g} m^2',
+        yield Judgment(True, 'd0', values['d0'], f'at least {NEAREST ** 2:g} m^2',
                         f'the band begins {near:.2f} m from the hull of the neighbor')
     least = f'at least {math.ceil(100.0 * (near + NARROWEST) ** 2) / 100.0:g} m^2'
     if far - near < NARROWEST:
-        yield Judgement(True, 'd1', values['d1'], f'{least} for d0 = {values["d0"]:g}',
+        yield Judgment(True, 'd1', values['d1'], f'{least} for d0 = {values["d0"]:g}',
                         f'a band of {far - near:.2f} m is as wide as the errors')
     elif far - near < NARROW:
         wide = math.ceil(100.0 * (near + NARROW) ** 2) / 100.0
-        yield Judgement(False, 'd1', values['d1'], f'at least {wide:g} m^2',
+        yield Judgment(False, 'd1', values['d1'], f'at least {wide:g} m^2',
                         f'a leader that reverses leaves a band of {far - near:.2f} m')
 
 
-def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
+def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgment]:
     if camera.marker is not None and 'd1' in values:
         far, range_max = math.sqrt(float(values['d1'])), camera.marker / MARKER_LOST_WIDTH
         far += float(values.get('radius', 0.0))
         if far > range_max:
             most = max(range_max - float(values.get('radius', 0.0)), 0.0)
-            yield Judgement(True, 'd1', values['d1'],
+            yield Judgment(True, 'd1', values['d1'],
                             f'at most {math.floor(100.0 * most ** 2) / 100.0:g} m^2',
                             f'the marker is not found beyond {range_max:.1f} m')
     if camera.rate is not None and camera.rate > 0.0:
@@ -149,25 +149,25 @@ def _sight(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
                 ('predict_timeout', True, 'it loses the neighbor between two images'),
                 ('perception_timeout', False, 'it brakes between two images')):
             if float(values.get(name, math.inf)) < least:
-                yield Judgement(
+                yield Judgment(
                     dangerous, name, values[name], f'at least {math.ceil(100 * least) / 100:g} s '
                     f'for images at {camera.rate:.1f} Hz', why)
 
 
-def _height(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgement]:
+def _height(values: Mapping[str, Any], camera: Camera) -> Iterator[Judgment]:
     if not {'altitude_offset', 'd0', 'd1'} <= values.keys():
         return
     middle = 0.5 * (math.sqrt(float(values['d0'])) + math.sqrt(float(values['d1'])))
     view = 1.0 if camera.half_height is None else math.sin(camera.half_height)
     most = middle * min(STEEPEST, view)
     if abs(float(values['altitude_offset'])) > most:
-        yield Judgement(True, 'altitude_offset', values['altitude_offset'],
+        yield Judgment(True, 'altitude_offset', values['altitude_offset'],
                         f'within {math.floor(100.0 * most) / 100.0:g} m',
                         'the neighbor leaves the image above or below and comes near unseen')
 
 
-def _hidden(values: Mapping[str, Any]) -> Iterator[Judgement]:
+def _hidden(values: Mapping[str, Any]) -> Iterator[Judgment]:
     assumed = float(values.get('leader_acceleration_max', 0.0))
     if assumed > RESTLESS:
-        yield Judgement(False, 'leader_acceleration_max', assumed, f'at most {RESTLESS:g} m/s^2',
+        yield Judgment(False, 'leader_acceleration_max', assumed, f'at most {RESTLESS:g} m/s^2',
                         'it retreats at every short loss of sight')

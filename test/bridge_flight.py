@@ -21,7 +21,7 @@ from memory_line import MemoryLine
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.embedded import STEP
+from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.command_messages import Command
 from flock_follower.gate.gate import Gate
 from flock_follower.mavlink.bridge import Bridge
@@ -82,7 +82,7 @@ class Flight(SteppedAutopilot):
         self.cycles = []
 
     def fly(self, seconds):
-        for _ in range(round(seconds / STEP)):
+        for _ in range(round(seconds / STEP_TIME)):
             now = self.now
             answers = self.autopilot.step(now)
             for data in self.wire.written:
@@ -134,8 +134,8 @@ class Flight(SteppedAutopilot):
     def ask(self, what, *arguments, seconds=6.0):
         request = getattr(self.bridge.requests, what)(*arguments, self.now)
         while request.outcome is None and seconds > 0.0:
-            self.fly(STEP)
-            seconds -= STEP
+            self.fly(STEP_TIME)
+            seconds -= STEP_TIME
         return request.outcome
 
     def setpoints(self, since=0.0):

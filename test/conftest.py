@@ -42,7 +42,7 @@ from hypothesis import HealthCheck, settings
 import pytest
 
 from flock_desk.runs.processes import private_environment
-from flock_follower.checks.processor import children, LoadMeter, PERIOD
+from flock_follower.checks.processor import children, LOAD_PERIOD, LoadMeter
 from flock_follower.fast_dds import profile_variables
 
 HERE = Path(__file__).resolve().parent
@@ -134,7 +134,7 @@ def measure_load():
     """Measure the load of this process and its nodes as long as it lives."""
     while True:
         LOAD.sample(time.monotonic())
-        time.sleep(PERIOD)
+        time.sleep(LOAD_PERIOD)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -142,7 +142,7 @@ def pytest_runtest_makereport(item, call):
     """Add the load to the report of a test of nodes that failed on a busy machine."""
     report = yield
     if report.failed and item.get_closest_marker('ros'):
-        load = LOAD.worst(time.monotonic() - call.duration - PERIOD)
+        load = LOAD.worst(time.monotonic() - call.duration - LOAD_PERIOD)
         if load is not None and load.busy:
             report.user_properties.append(('too busy', str(load)))
             report.sections.append(('too busy', f'{load}: this may be why'))

@@ -19,7 +19,7 @@ import math
 from faulty_autopilot import FaultyAutopilot
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.embedded import STEP
+from flock_desk.vehicles.embedded import STEP_TIME
 
 MASK_YAW, MASK = 0x83F, 0xC3F
 #: DO_SET_MODE's param2 and param3.
@@ -74,7 +74,7 @@ class SteppedAutopilot:
 
     @property
     def now(self):
-        return self.steps * STEP
+        return self.steps * STEP_TIME
 
     @property
     def controller(self):
@@ -96,8 +96,8 @@ class Flight(SteppedAutopilot):
 
     def fly(self, seconds, *messages, rate=20.0):
         """Fly on, sending messages at a rate; a function among them is called for its message."""
-        every = round(1 / rate / STEP)
-        for _ in range(round(seconds / STEP)):
+        every = round(1 / rate / STEP_TIME)
+        for _ in range(round(seconds / STEP_TIME)):
             if self.steps % every == 0:
                 for message in messages:
                     self.send(message() if callable(message) else message)

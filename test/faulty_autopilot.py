@@ -32,7 +32,7 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_desk import autopilot
-from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, global_position, STEP_TIME
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 
 
@@ -162,14 +162,14 @@ class TruthLink:
             granted = (message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
                        and message.param1 in self._encoders and message.param2 > 0.0)
             if granted:
-                self._periods[int(message.param1)] = max(message.param2 * 1e-6, STEP)
+                self._periods[int(message.param1)] = max(message.param2 * 1e-6, STEP_TIME)
                 self._due[int(message.param1)] = now
             answers.append(self._packed(mavlink.MAVLink_command_ack_message(
                 message.command, 0 if granted else mavlink.MAV_RESULT_UNSUPPORTED)))
         return answers
 
     def step(self, now):
-        due = [kind for kind, when in self._due.items() if now >= when - 0.5 * STEP]
+        due = [kind for kind, when in self._due.items() if now >= when - 0.5 * STEP_TIME]
         for kind in due:
             self._due[kind] += self._periods[kind] * max(
                 1, (now - self._due[kind]) // self._periods[kind])

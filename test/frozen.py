@@ -72,7 +72,7 @@ def table(columns: list[str], rows: dict[str, list[float | str]]) -> Table:
 
 
 def sample(_: argparse.Namespace) -> Table:
-    """Return neighbours and commands of the sample bag."""
+    """Return neighbors and commands of the sample bag."""
     return table(['x', 'y', 'z', 'vx_or_yaw', 'vy', 'vz'], {
         f'{topic} at {time} ns': [*numbers] for topic, time, numbers in golden_result.result()})
 

@@ -167,7 +167,7 @@ class Traffic:
 
 
 class BridgeUnderFire:
-    """A bridge on a fake line in simulated time, and the judgement of what it sends."""
+    """A bridge on a fake line in simulated time, and the judgment of what it sends."""
 
     def __init__(self, seed, personality='px4', signing_key=b''):
         self._random = random.Random(f'bridge {seed}')

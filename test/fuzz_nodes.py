@@ -271,7 +271,7 @@ class NodeUnderFire(Driven):
 
 @contextmanager
 def node_under_fire(kind, seed):
-    """Make a node and take it down again; rclpy is initialised by whoever calls."""
+    """Make a node and take it down again; rclpy is initialized by whoever calls."""
     under_fire = NodeUnderFire(kind, seed)
     try:
         yield under_fire

@@ -44,7 +44,7 @@ def result() -> list[Row]:
     """
     Return (topic, ns since the bag's start, numbers) of all that ``evaluate`` publishes.
 
-    The time is the image's stamp for a neighbour, and the numbers its position and velocity in
+    The time is the image's stamp for a neighbor, and the numbers its position and velocity in
     odom; for commands and setpoints the tick, and acceleration and yaw.
     """
     # Here, because where only perception is installed the rest of the chain is not.
@@ -71,7 +71,7 @@ def _row(topic: str, message: object, start: int) -> Row:
 
 
 def neighbors() -> list[Row]:
-    """Return the rows of the neighbours from perception alone, which needs no pymavlink."""
+    """Return the rows of the neighbors from perception alone, which needs no pymavlink."""
     values = check_values(RELATIVE_POSE, {})
     perceiver, source = Perceiver(tracker(values), max_wait=values['max_wait']), OdometrySource()
     rows: list[Row] = []

@@ -17,10 +17,10 @@ List the names, constants and comments that a reader cannot understand where the
 
 The rules, each with the breach that it lists:
 
-- ``word``: a number of a module has a name of one word, and another module or two functions use it.
+- ``word``: a number of a module has a one-word name, and another module or two functions use it.
 - ``line``: one statement sets several numbers of a module.
-- ``comment``: below another number, a number has no comment or one that goes on from there; or
-  its comment ends in the middle of a sentence.
+- ``comment``: the comment of a number goes on from the one above, or ends within a sentence; or
+  one number has a comment and the next one has none.
 - ``function``: the name of a function is an adverb, a preposition, an adjective or a participle.
 - ``spelling``: a word has a British spelling; ``--mend PATH ...`` replaces it.
 
@@ -73,7 +73,7 @@ NO_PARTICIPLES = frozenset(re.findall(r'\w+', """
 #: The beginning of a comment that goes on from another one.
 GOES_ON = re.compile(
     r'(and|or|but|nor|than|with (less|more)|by so|so (many|much|far|often|long)|of (it|them|these)'
-    r'|the same|as much|beyond that|below that|above that|after that|more than that|which|whose)\b')
+    r'|the same|as much|(beyond|below|above|after|more than) that|which|whose)\b')
 #: The end of a comment that goes on in another one.
 UNFINISHED = re.compile(r'([,:]|\b(and|or|but|than|of|by|with|to|the|a))$')
 
@@ -244,15 +244,16 @@ def running_comments(tree: ast.Module, text: str) -> Iterator[str]:
     """Yield constants without a comment below another one, or with a part of a sentence."""
     comments = {token.start[0]: token.string.lstrip('#: ') for token in tokenize.generate_tokens(
         io.StringIO(text).readline) if token.type == tokenize.COMMENT}
-    previous = None
+    previous, commented = None, False
     for names, node in constants(tree):
         last = node.end_lineno or node.lineno
         own = comments.get(last, comments.get(node.lineno, ''))
         adjacent = previous == node.lineno - 1
         above = comments.get(node.lineno - 1, '') if not adjacent else ''
-        if (adjacent and (not own or GOES_ON.match(own))) or UNFINISHED.search(own or above):
+        shared = adjacent and not own and commented
+        if shared or (adjacent and GOES_ON.match(own)) or UNFINISHED.search(own or above):
             yield names[0]
-        previous = last
+        previous, commented = last, bool(own or above)
 
 
 def function_names(tree: ast.Module) -> Iterator[str]:
@@ -285,7 +286,7 @@ def _as(old: str, new: str) -> str:
 
 
 def read_accepted() -> Breaches:
-    document = yaml.safe_load(ACCEPTED.read_text(encoding='utf-8')) or {}
+    document = yaml.load(ACCEPTED.read_text(encoding='utf-8'), yaml.BaseLoader)
     return {file: {(rule, str(name)) for rule, names in rules.items() for name in names}
             for file, rules in document.items()}
 

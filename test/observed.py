@@ -27,7 +27,7 @@ import numpy as np
 
 from flock_follower.checks.collector import read_own_motion
 from flock_follower.checks.findings import Finding
-from flock_follower.checks.image_motion import COLUMNS, ROWS
+from flock_follower.checks.image_motion import PART_COLUMNS, PART_ROWS
 from flock_follower.checks.observations import (
     Machine,
     NodeStatus,
@@ -152,8 +152,9 @@ def shift_rows(rate: float = 30.0, offset: float = 0.0, mounted: Array | None = 
     """
     camera = CameraModel.from_calibration(
         (known := calibration()).k, known.d, known.distortion_model, known.width, known.height)
-    pixels = np.array([[(x + 0.5) * known.width / COLUMNS, (y + 0.5) * known.height / ROWS]
-                       for y in range(ROWS) for x in range(COLUMNS)])
+    pixels = np.array([[(x + 0.5) * known.width / PART_COLUMNS,
+                        (y + 0.5) * known.height / PART_ROWS]
+                       for y in range(PART_ROWS) for x in range(PART_COLUMNS)])
     rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])
     R_base_optical = (np.eye(3) if mounted is None else mounted) @ R_FLU_OPTICAL
     rows = []

@@ -42,7 +42,7 @@ from flock_follower.messages import (
     to_array,
 )
 
-#: An IMU behind and beside the centre, its axes those of a camera: x right, y down, z ahead.
+#: An IMU behind and beside the center, its axes those of a camera: x right, y down, z ahead.
 IMU_POSITION = (0.06, -0.02, 0.03)
 IMU_RPY = (-np.pi / 2.0, 0.0, -np.pi / 2.0)
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The law against the paper's setups, its invariants, and its behaviour outside the band."""
+"""The law against the paper's setups, its invariants, and its behavior outside the band."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ import pytest
 
 from flock_desk.flocks.agents import simulate, Simulation
 from flock_desk.flocks.flock_metrics import extremum
-from flock_desk.flocks.paper import LEADER_FOLLOWER, LEADERLESS, PARAMS
+from flock_desk.flocks.paper import LEADER_FOLLOWER_START, LEADERLESS_START, PAPER_PARAMS
 from flock_follower.flocking import (
     acceleration,
     accelerations,
@@ -44,7 +44,7 @@ FLIGHT = FlockingParams(beta=0.25, d1=8.0)
 
 @pytest.fixture(scope='module')
 def leaderless() -> Simulation:
-    return simulate(*LEADERLESS, PARAMS, sample_period=0.005)
+    return simulate(*LEADERLESS_START, PAPER_PARAMS, sample_period=0.005)
 
 
 def test_leaderless_distances_reproduce_the_reference(leaderless: Simulation) -> None:
@@ -83,12 +83,13 @@ def test_lyapunov_function_falls_strictly_to_the_reference(leaderless: Simulatio
 def test_predecessors_leave_the_band_as_in_the_reference(
         model: Any, figure: str, extreme: Callable[[Array], float], reference: float,
         digits: float) -> None:
-    run = simulate(*LEADERLESS, PARAMS, model=model, sample_period=0.01)
+    run = simulate(*LEADERLESS_START, PAPER_PARAMS, model=model, sample_period=0.01)
     assert extreme(getattr(run.metrics, figure)) == pytest.approx(reference, abs=digits)
 
 
 def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
-    run = simulate(*LEADER_FOLLOWER, PARAMS, duration=10.0, led=True, sample_period=0.01)
+    run = simulate(*LEADER_FOLLOWER_START, PAPER_PARAMS, duration=10.0, led=True,
+                   sample_period=0.01)
     assert run.metrics.min_r2.min() == pytest.approx(1.3976, abs=1e-4)
     assert run.metrics.max_r2.max() == pytest.approx(2.0049, abs=1e-4)
 
@@ -145,7 +146,7 @@ def test_one_agent_computes_what_the_flock_does(flock: tuple[Array, Array]) -> N
 
 
 def test_law_equals_its_formula_written_out() -> None:
-    x, v = LEADERLESS
+    x, v = LEADERLESS_START
     k, u = len(x), np.zeros_like(x)
     scale = np.sqrt(sum(np.sum((v[i] - v[j]) ** 2) for i in range(k) for j in range(i)) / k)
     for i in range(k):
@@ -153,10 +154,11 @@ def test_law_equals_its_formula_written_out() -> None:
             if i == j:
                 continue
             r2 = np.sum((x[i] - x[j]) ** 2)
-            u[i] += PARAMS.K / (PARAMS.sigma ** 2 + r2) ** PARAMS.beta * (v[j] - v[i])
-            u[i] += scale / (r2 - PARAMS.d0) ** PARAMS.theta * (x[i] - x[j])
-            u[i] += scale / (PARAMS.d1 - r2) ** PARAMS.theta * (x[j] - x[i])
-    assert accelerations(x, v, PARAMS) == pytest.approx(u, rel=1e-12)
+            u[i] += (PAPER_PARAMS.K / (PAPER_PARAMS.sigma ** 2 + r2) ** PAPER_PARAMS.beta
+                     * (v[j] - v[i]))
+            u[i] += scale / (r2 - PAPER_PARAMS.d0) ** PAPER_PARAMS.theta * (x[i] - x[j])
+            u[i] += scale / (PAPER_PARAMS.d1 - r2) ** PAPER_PARAMS.theta * (x[j] - x[i])
+    assert accelerations(x, v, PAPER_PARAMS) == pytest.approx(u, rel=1e-12)
 
 
 @pytest.mark.parametrize(('r2', 'pull'), [(1.0 + 1e-5, -1e10), (8.0 - 1e-5, 1e10)])
@@ -200,7 +202,7 @@ def test_equal_velocities_and_an_agent_alone_give_no_acceleration() -> None:
 @pytest.mark.parametrize('theta', [1.0, 1.5, 2.0, 3.0])
 def test_lyapunov_function_is_positive_falls_and_is_infinite_outside(theta: float) -> None:
     params = FlockingParams(theta=theta)
-    w = simulate(*LEADERLESS, params, duration=2.0, sample_period=0.01).metrics.lyapunov
+    w = simulate(*LEADERLESS_START, params, duration=2.0, sample_period=0.01).metrics.lyapunov
     assert np.all(w > 0.0)
     assert np.all(np.diff(w) < 0.0)
     for distance in (0.9, 1.0, 1.5, 1.6):
@@ -239,6 +241,6 @@ def test_bad_states_are_refused_with_what_to_change(positions: Any, velocities: 
                                                     message: str) -> None:
     for function in (accelerations, lyapunov):
         with pytest.raises(ValueError, match=message):
-            function(positions, velocities, PARAMS)
+            function(positions, velocities, PAPER_PARAMS)
     with pytest.raises(ValueError, match=f'relative_{message}'.replace(' velocities ', ' .*')):
-        acceleration(positions, velocities, PARAMS)
+        acceleration(positions, velocities, PAPER_PARAMS)

@@ -38,7 +38,7 @@ USUAL = Camera(30.0, 610.0 * 0.16, 0.37)
 
 
 def found(camera=USUAL, **changes):
-    """Return parameter and danger of each judgement of the defaults with some changes."""
+    """Return parameter and danger of each judgment of the defaults with some changes."""
     return [(each.parameter, each.dangerous) for each in judge(DEFAULTS | changes, camera)]
 
 
@@ -93,7 +93,7 @@ def test_the_value_that_a_refusal_names_is_accepted(a_max, v_max, d0, d1):
     assert near >= NEAREST - 1e-9 and far - near >= NARROWEST - 1e-9
 
 
-def test_nodes_and_programs_refuse_by_the_same_judgement():
+def test_nodes_and_programs_refuse_by_the_same_judgment():
     slow = DEFAULTS | {'a_max': 1.5, 'v_max': 2.0, 'neighbors_file': '', 'cameras': ['']}
     for build in (refuse, gate_limits, planner_params):
         with pytest.raises(ValueError, match=r'^a_max = 1\.5: must be at least 2\.43 m/s\^2 for '

@@ -39,14 +39,14 @@ class Camera:
     focal_x: float = 611.3
     """px."""
     focal_y: float = 610.6
-    centre_x: float = 322.4
-    centre_y: float = 236.9
+    center_x: float = 322.4
+    center_y: float = 236.9
     model: str = 'plumb_bob'
     """'plumb_bob' (k1, k2, p1, p2, k3) or 'equidistant' (k1, k2, k3, k4)."""
     distortion: tuple[float, ...] = (-0.116, 0.087, 0.0007, -0.0005, 0.0)
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return where the lens shows directions (x, y, 1), before focal lengths and centre."""
+        """Return where the lens shows directions (x, y, 1), before focal lengths and center."""
         r2 = x * x + y * y
         if self.model == 'equidistant':
             radius = np.maximum(np.sqrt(r2), 1e-9)
@@ -68,7 +68,7 @@ class Camera:
 
         Pixels beyond a wide lens's image circle see its rim; vignetting darkens them.
         """
-        xd, yd = (u - self.centre_x) / self.focal_x, (v - self.centre_y) / self.focal_y
+        xd, yd = (u - self.center_x) / self.focal_x, (v - self.center_y) / self.focal_y
         if self.model == 'equidistant':
             radius = np.maximum(np.hypot(xd, yd), 1e-9)
             angles = np.linspace(0.0, _WIDEST, 10_000)
@@ -89,7 +89,7 @@ class Camera:
         aside = points[:, :2] / points[:, 2:]
         radius = np.maximum(np.hypot(aside[:, 0], aside[:, 1]), 1e-9)
         x, y = self._distorted(*(aside.T * np.minimum(1.0, self._reach / radius)))
-        return np.stack([self.focal_x * x + self.centre_x, self.focal_y * y + self.centre_y], 1)
+        return np.stack([self.focal_x * x + self.center_x, self.focal_y * y + self.center_y], 1)
 
     @cached_property
     def _reach(self) -> float:

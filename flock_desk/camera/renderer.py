@@ -18,7 +18,7 @@ A rendered camera: a leader before its surroundings, through a distorting lens, 
 The surroundings are a stored panorama, out of focus and as the middle of the exposure shows it:
 everything but the leader is taken to be far away. Of the leader an image is the mean of poses
 spread over the exposure. Pixel coordinates are OpenCV's: (0, 0) is the
-centre of the top-left pixel.
+center of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -46,12 +46,14 @@ NEAR = 0.05  # m: nothing nearer to the camera is seen
 _SHIFT = 4  # bits behind the point in the corners of polygons
 _MARGIN = 2  # px around a body
 _TEXELS = 8  # per cell of a print; between two of them light changes linearly
-_CELL = 16  # px between the rays whose place in the panorama is computed
+_RAY_SPACING = 16  # px between the rays whose place in the panorama is computed
 _SKY = 0.60  # radiance of the panorama's largest value
-_SUN, _AMBIENT = np.array([-0.48, 0.36, 0.8]), 0.55  # direction; share of light from everywhere
+_SUN_DIRECTION = np.array([-0.48, 0.36, 0.8])  # unit vector in the world
+_AMBIENT_SHARE = 0.55  # share of the light that comes from everywhere
 _FULL = 1.25  # share of the full well: more light than this saturates
 _SCALE = 65535 / _FULL  # of light in 16 bits
-_LEVEL_BITS, _DRAW_BITS = 11, 8  # levels of light, and quantiles of noise, in the table of both
+_LEVEL_BITS = 11  # of the levels of light in the table of noise
+_DRAW_BITS = 8  # of the quantiles of noise in that table
 _SPREAD = 0.607  # px: of the lens's blur, 17 % of a pixel's light on either side
 
 
@@ -68,7 +70,7 @@ class Sensor:
     read_noise: float = 12.0
     """Standard deviation, electrons."""
     gain: float = 1.5
-    """Share of the full well that a radiance of 1 fills, in the image's centre."""
+    """Share of the full well that a radiance of 1 fills, in the image's center."""
     gamma: float = 2.2
     vignetting: float = 0.35
     """Relative light 1 / (1 + this r^2)^2, r the tangent of the angle off axis; 1 is cos^4."""
@@ -163,7 +165,7 @@ class _Panorama:
         self._light = (_SKY * (stored / 255.0) ** 2.2).astype(np.float32)
         self._shape = camera.height, camera.width
         # Middles of cells, from one cell before the image to one behind it.
-        u, v = np.meshgrid(*(np.arange(-0.5 - _CELL / 2, size + _CELL, _CELL)
+        u, v = np.meshgrid(*(np.arange(-0.5 - _RAY_SPACING / 2, size + _RAY_SPACING, _RAY_SPACING)
                              for size in (camera.width, camera.height)))
         self._rays = np.stack([*camera.rays(u, v), np.ones_like(u)])
 
@@ -177,11 +179,13 @@ class _Panorama:
         column = per_rad * (np.arctan2(left, ahead) + heading)
         row = (rows - 1) / 2.0 - per_rad * np.arctan2(up, np.hypot(ahead, left))
         places = cv2.resize(np.dstack([column, np.clip(row, 0.0, rows - 1.0)]).astype(np.float32),
-                            None, fx=_CELL // 2, fy=_CELL // 2, interpolation=cv2.INTER_LINEAR)
+                            None, fx=_RAY_SPACING // 2, fy=_RAY_SPACING // 2,
+                            interpolation=cv2.INTER_LINEAR)
         # Every other pixel is enough: the panorama is coarser than most cameras.
         seen = cv2.remap(self._light, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         full: Image = cv2.resize(seen, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-        return full[_CELL:_CELL + self._shape[0], _CELL:_CELL + self._shape[1]]
+        return full[_RAY_SPACING:_RAY_SPACING + self._shape[0],
+                    _RAY_SPACING:_RAY_SPACING + self._shape[1]]
 
 
 def _around(pixels: Array, low: Any, high: Any) -> tuple[Any, Any]:
@@ -223,9 +227,9 @@ class _Drawing:
             return
         size = (high - low).tolist()
         fine = np.zeros((n * size[1], n * size[0], 2), np.float32)
-        light = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(
-            self._normals @ body.rotation.T @ _SUN, 0.0)
-        # The centre of a sample lies half a sample from the edge of its pixel.
+        light = _AMBIENT_SHARE + (1.0 - _AMBIENT_SHARE) * np.maximum(
+            self._normals @ body.rotation.T @ _SUN_DIRECTION, 0.0)
+        # The center of a sample lies half a sample from the edge of its pixel.
         corners = np.rint((((pixels - low) + 0.5) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         eye = pose.inverse().translation
         shown = np.logical_and.reduceat(ahead, self._starts) & (
@@ -275,8 +279,10 @@ T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
 T_BODY_MARKER = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                           np.array([-0.20, 0.0, 0.0]))
 SIDE_LENGTH = 0.16  # m, of the marker
-INK, PAPER = 0.03, 0.72
-_SQUARE = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+INK_RADIANCE = 0.03  # share of a white surface's
+PAPER_RADIANCE = 0.72  # share of a white surface's
+#: Corners of a marker, in half sides.
+_UNIT_SQUARE = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 
 
 class Face(NamedTuple):
@@ -299,7 +305,7 @@ def box(pose: Transform, size: ArrayLike, value: float) -> list[Face]:
     for axis in range(3):
         for sign in (-1.0, 1.0):
             normal = sign * np.eye(3)[axis]
-            outline = np.roll(np.pad(_SQUARE, ((0, 0), (1, 0))), axis, axis=1) + normal
+            outline = np.roll(np.pad(_UNIT_SQUARE, ((0, 0), (1, 0))), axis, axis=1) + normal
             faces.append(Face(pose.apply(half * outline), pose.rotation @ normal,
                               pose.translation, value))
     return faces
@@ -312,8 +318,8 @@ def marker_print(cells: Array, cell: float, middle: Transform = T_BODY_MARKER) -
     :param cells: (rows, columns), 0 black, 1 white; :param cell: size of each, m.
     """
     half = np.array([cells.shape[1], cells.shape[0], 0.0]) * cell / 2.0
-    return Face(middle.apply(half * np.pad(_SQUARE, ((0, 0), (0, 1)))), middle.rotation[:, 2],
-                middle.translation, cells=INK + (PAPER - INK) * cells)
+    return Face(middle.apply(half * np.pad(_UNIT_SQUARE, ((0, 0), (0, 1)))), middle.rotation[:, 2],
+                middle.translation, cells=INK_RADIANCE + (PAPER_RADIANCE - INK_RADIANCE) * cells)
 
 
 def board(face: Face, thickness: float = 0.01) -> list[Face]:

@@ -17,7 +17,8 @@ Flights in lock step: leader, air, vehicle and sensors around the real followers
 
 No clock, no rendering, no messages: the runs fly ``follower.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
-STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
+COURSE_STEP for many runs at once. The neighbor filters of perception are fed at 30 Hz with
+positions
 whose noise has the covariance given with them; a marker is seen if it is in the field of view and
 not too oblique, with no vehicle in between.
 
@@ -27,7 +28,7 @@ part          rate, Hz  remark
 vehicle, air  120       first the vehicle moves, then everything looks
 odometry      60        arrives ``latency`` later; messages arrive, too
 images        30        estimates arrive ``latency`` later
-planner       10        engaged at ENGAGED, unless an operation does it
+planner       10        engaged at ENGAGE_TIME, unless an operation does it
 control       20        the vehicle obeys ``delay`` later, with its lags
 ============  ========  =======================================================
 """
@@ -38,12 +39,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 import math
 
+from flock_desk.closed_loop.camera_views import CameraViews
 from flock_desk.closed_loop.follower import SimulatedFollower
-from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.metrics import Flights, FlightsLog
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
-from flock_desk.scenarios.courses import STEP
-from flock_desk.scenarios.scenario import ENGAGED, Scenario
+from flock_desk.scenarios.courses import COURSE_STEP
+from flock_desk.scenarios.scenario import ENGAGE_TIME, Scenario
 from flock_desk.sensors.sensing import PerceptionNoise, Radio
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import matrix_to_quaternion, quaternion_from_yaw, Transform
@@ -63,15 +64,15 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param law: the law, or a controller in its place: see ``controllers``.
     """
     world, noise = World(scenario, runs), _noise(scenario)
-    lookout = Lookout(world, noise)
+    lookout = CameraViews(world, noise)
     followers = _followers(world, guard, noise, law)
     flock = scenario.company
     radio: Radio[OdometryState] = Radio(
         flock.followers, flock.delay, flock.loss, world.random('radio'))
-    count = round(scenario.duration / STEP)
+    count = round(scenario.duration / COURSE_STEP)
     log = FlightsLog(world, lookout)
     for k in range(1, count + 1):
-        now = k * STEP
+        now = k * COURSE_STEP
         world.advance(k)
         lookout.look(k)
         log.distances()
@@ -91,7 +92,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.plan(now, looked, seen)
                 radio.send(now, row, follower.outbox)
                 follower.outbox = []
-            if now >= ENGAGED - 1e-9:
+            if now >= ENGAGE_TIME - 1e-9:
                 log.tick(now, followers)
         if flock.fails is not None and now >= flock.fails.at:
             for follower in followers[flock.fails.follower - 1::flock.followers]:
@@ -116,7 +117,7 @@ def _followers(world: World, guard: bool, noise: PerceptionNoise,
     """Return the follower of every row."""
     scenario, flock = world.scenario, world.scenario.company
     aside, up = math.atan(noise.half_width), math.atan(noise.half_height)
-    # The planner keeps neighbours in the view ahead, unless cameras look to all sides.
+    # The planner keeps neighbors in the view ahead, unless cameras look to all sides.
     ahead = 'front' in flock.cameras and not flock.all_round
     view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []

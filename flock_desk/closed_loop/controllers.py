@@ -33,7 +33,8 @@ import numpy as np
 from flock_follower.flocking import accelerations, FlockingParams, Model
 from flock_follower.geometry import Array
 
-PROPORTIONAL, DERIVATIVE = 2.0, 3.0  # 1/s^2 and 1/s
+PROPORTIONAL_GAIN = 2.0  # 1/s^2
+DERIVATIVE_GAIN = 3.0  # 1/s
 
 
 class PdServo(FlockingParams):
@@ -43,7 +44,8 @@ class PdServo(FlockingParams):
         distance = np.linalg.norm(offsets, axis=1, keepdims=True)
         error = distance - (math.sqrt(self.d0) + math.sqrt(self.d1)) / 2.0
         towards = offsets / np.maximum(distance, 1e-6)
-        total: Array = np.sum(PROPORTIONAL * error * towards + DERIVATIVE * differences, axis=0)
+        total: Array = np.sum(PROPORTIONAL_GAIN * error * towards + DERIVATIVE_GAIN * differences,
+                              axis=0)
         return total
 
 

@@ -28,7 +28,7 @@ from flock_desk.closed_loop.scenario_run import ScenarioRun
 from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.external_motion import ExternalMotion, Motion, POSE_GAP
 from flock_desk.sensors.vio import Odometry
-from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, STEP_TIME
 from flock_desk.vehicles.flight_log import FlightLog
 from flock_desk.vehicles.px4 import OFFBOARD
 from flock_follower.geometry import (
@@ -94,7 +94,7 @@ class EmbeddedVehicle(_Reported):
         self._rotation = vehicle.rotation
         self._motion.add(Motion(
             time_ns, vehicle.position, vehicle.velocity, matrix_to_quaternion(self._rotation),
-            matrix_to_rotation_vector(before.T @ self._rotation) / STEP))
+            matrix_to_rotation_vector(before.T @ self._rotation) / STEP_TIME))
         return self.at(time_ns)
 
 
@@ -123,7 +123,7 @@ class ExternalVehicle(_Reported):
                        self._autopilot.mode)
         # Not the reported rates: poses arrive unevenly, and the camera sees that.
         return state._replace(
-            angular=matrix_to_rotation_vector(before.T @ self._rotation) / STEP)
+            angular=matrix_to_rotation_vector(before.T @ self._rotation) / STEP_TIME)
 
 
 FlownVehicle = EmbeddedVehicle | ExternalVehicle

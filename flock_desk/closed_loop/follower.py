@@ -32,11 +32,11 @@ from typing import Final
 
 import numpy as np
 
-from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
+from flock_desk.closed_loop.camera_views import MARKER_TILT, Sighted, YAW_NOISE
 from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.follower import ControlCycle, Follower, Listener, Tick
-from flock_desk.scenarios.courses import STEP
-from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario, VioErrors
+from flock_desk.scenarios.courses import COURSE_STEP
+from flock_desk.scenarios.scenario import ENGAGE_TIME, Operation, Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flocking import FlockingParams
 from flock_follower.gate.envelope import GateLimits
@@ -66,16 +66,19 @@ from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParam
 from flock_follower.planner.sight import View
 from flock_follower.planner.step import Decision
 
-_AFTER = 1  # ns by which ticks come after the messages of their moment
-_ZERO, _LEVEL = np.zeros(3), np.eye(3)
-_UNKNOWN = np.zeros((6, 6))
+_TICK_DELAY_NS = 1  # ns by which ticks come after the messages of their moment
+
+_ZERO_VECTOR = np.zeros(3)
+_LEVEL_ATTITUDE = np.eye(3)
+_NO_COVARIANCE = np.zeros((6, 6))
 _ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of an unknown yaw
 MANUAL, TAKEOFF = 'POSCTL', PX4.takeoff_modes[0]  # the pilot's mode, and that of the take-off
 HEARTBEAT_PERIOD: Final = 1.0  # s
 SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T as recommended
 CLIMB_SPEED: Final = 1.0  # m/s, of the take-off and of the pilot
-UP: Final = np.array([0.0, 0.0, 1.0])
-STIFFNESS, DAMPING = 1.5, 2.2  # 1/s^2 and 1/s, of the autopilot's own position control
+UP_ENU: Final = np.array([0.0, 0.0, 1.0])  # unit vector
+POSITION_GAIN = 1.5  # 1/s^2, of the autopilot's own position control
+VELOCITY_GAIN = 2.2  # 1/s, of the autopilot's own position control
 
 
 class SimulatedFollower(Listener):
@@ -99,9 +102,9 @@ class SimulatedFollower(Listener):
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self._follower = Follower(
             planner, _params(scenario, guard, law, name), self._new_control(), self,
-            cycle_phase=GATE_STEPS // 2 * STEP,
+            cycle_phase=GATE_STEPS // 2 * COURSE_STEP,
             sharing=Sharing(name) if scenario.company.words else None)
-        self._follower.advance(_AFTER)
+        self._follower.advance(_TICK_DELAY_NS)
         self.decision = Decision(State.IDLE)
         self.failed = False
         self.outbox: list[OdometryState] = []
@@ -111,7 +114,8 @@ class SimulatedFollower(Listener):
         self._turn = yaw_from_quaternion(T_odom_world.quaternion)
         self._known: OwnState | None = None
         self._now = 0.0
-        usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_STEPS * STEP)
+        usual = Operation('offboard', 0.0), Operation('engage',
+                                                      ENGAGE_TIME - GATE_STEPS * COURSE_STEP)
         self._waiting = [(o.at, o.what, o.duration if o.what == 'restart' else o.height)
                          for o in sorted(scenario.operations or usual, key=lambda o: o.at)]
         """What is to come: time, s, an operation or its outcome, and its height or duration."""
@@ -140,16 +144,18 @@ class SimulatedFollower(Listener):
         if own is None or own is self._known or self.failed:
             return
         self._known, to_odom = own, self._T_odom_world
-        pose, twist = (_UNKNOWN, _UNKNOWN) if self._alone else _covariances(self._errors, now)
+        pose, twist = (_NO_COVARIANCE,
+                       _NO_COVARIANCE) if self._alone else _covariances(self._errors, now)
         self._follower.odometry(to_nanoseconds(now), OdometryState(
             to_nanoseconds(own.stamp), self._frame, 'base_link', to_odom.apply(own.position),
-            quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity, _ZERO,
-            pose, twist, _LEVEL))
+            quaternion_from_yaw(own.yaw + self._turn), to_odom.rotation @ own.velocity,
+            _ZERO_VECTOR,
+            pose, twist, _LEVEL_ATTITUDE))
 
     def lean(self, now: float, quaternion: Array) -> OdometryState | None:
         """Take the attitude by the autopilot; return the motion without odometry, if flown on."""
         return None if self.failed else self._follower.attitude(
-            to_nanoseconds(now), quaternion, _ZERO)
+            to_nanoseconds(now), quaternion, _ZERO_VECTOR)
 
     def receive(self, now: float, message: OdometryState) -> None:
         """Take a message of another follower."""
@@ -164,7 +170,7 @@ class SimulatedFollower(Listener):
             self._follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
         for each in seen:
             self._see(now, each)
-        self._follower.advance(to_nanoseconds(now) + _AFTER)
+        self._follower.advance(to_nanoseconds(now) + _TICK_DELAY_NS)
 
     def _see(self, now: float, sighted: Sighted) -> None:
         name, n, yaw, relative = sighted
@@ -172,13 +178,13 @@ class SimulatedFollower(Listener):
         axes, pose, twist = to_frame.rotation, np.zeros((6, 6)), np.zeros((6, 6))
         pose[:3, :3] = axes @ n.covariance[POSITION, POSITION] @ axes.T
         twist[:3, :3] = axes @ n.covariance[VELOCITY, VELOCITY] @ axes.T
-        pose[5, 5] = _ANY_YAW if yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
+        pose[5, 5] = _ANY_YAW if yaw is None else YAW_NOISE ** 2 + MARKER_TILT ** 2
         quaternion = quaternion_from_yaw((yaw or 0.0) + yaw_from_quaternion(to_frame.quaternion))
         acceleration = quaternion_to_matrix(quaternion).T @ (axes @ n.acceleration)
         stamp = to_nanoseconds(n.stamp)
         self._follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
             stamp, RELATIVE if relative else self._frame, name, to_frame.apply(n.position),
-            quaternion, axes @ n.velocity, _ZERO, pose, twist, _LEVEL),
+            quaternion, axes @ n.velocity, _ZERO_VECTOR, pose, twist, _LEVEL_ATTITUDE),
             AccelerationState(stamp, name, acceleration)))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
@@ -191,7 +197,7 @@ class SimulatedFollower(Listener):
         time, self._now = to_nanoseconds(now), now
         self._follower.estimate(time, self._T_odom_world.rotation @ estimate)
         self._follower.height(time, altitude, float(position[2]))
-        self._follower.advance(time + _AFTER)
+        self._follower.advance(time + _TICK_DELAY_NS)
         for event in [each for each in self._waiting if each[0] <= now + 1e-9]:
             self._waiting.remove(event)
             self._yaw = yaw
@@ -204,7 +210,7 @@ class SimulatedFollower(Listener):
         return self._fly(now, position, velocity)
 
     def _do(self, what: str, amount: float, now: float, position: Array) -> None:
-        time, above = to_nanoseconds(now), position + amount * UP
+        time, above = to_nanoseconds(now), position + amount * UP_ENU
         match what:
             case 'arm':
                 self._armed = True
@@ -251,8 +257,8 @@ class SimulatedFollower(Listener):
         self.obeying = False
         if not self._armed:
             return np.zeros(3), None
-        nominal = np.clip(STIFFNESS * (self._goal - position), -DAMPING * CLIMB_SPEED,
-                          DAMPING * CLIMB_SPEED) - DAMPING * velocity
+        nominal = np.clip(POSITION_GAIN * (self._goal - position), -VELOCITY_GAIN * CLIMB_SPEED,
+                          VELOCITY_GAIN * CLIMB_SPEED) - VELOCITY_GAIN * velocity
         return nominal, self._yaw
 
     def fail(self, now: float) -> None:

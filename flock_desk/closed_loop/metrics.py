@@ -31,10 +31,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flock_desk.closed_loop.camera_views import CameraViews
 from flock_desk.closed_loop.follower import SimulatedFollower
-from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.world import World
-from flock_desk.scenarios.courses import STEP
+from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.flock import places
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
@@ -93,7 +93,7 @@ class Flights:
 class FlightsLog:
     """Records the flights in a world."""
 
-    def __init__(self, world: World, lookout: Lookout) -> None:
+    def __init__(self, world: World, lookout: CameraViews) -> None:
         self._world, self._lookout = world, lookout
         self._times: list[float] = []
         self._ticks: list[dict[str, Any]] = []
@@ -118,7 +118,7 @@ class FlightsLog:
         many = edges.sum(axis=1)
         # A follower without a vehicle to follow is out of the band.
         share = np.where(many > 0, out.sum(axis=1) / np.maximum(many, 1), 1.0)
-        last['outside'] = last['outside'] + STEP * share
+        last['outside'] = last['outside'] + COURSE_STEP * share
 
     def _along(self, distance: Array) -> tuple[Array, Any]:
         """Return the greatest distance (n,), and the edges (n, m), to those present."""

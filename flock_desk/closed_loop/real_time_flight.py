@@ -33,25 +33,25 @@ from numpy.typing import NDArray
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, second_print, Sensor, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import EmbeddedVehicle, FlownLeader, FlownVehicle
-from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
+from flock_desk.closed_loop.scenario_run import BEFORE_START, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
-from flock_desk.vehicles.embedded import STEP
+from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.geometry import (
     quaternion_from_yaw,
     quaternion_to_matrix,
     Transform,
 )
 
-STEP_NS = round(STEP * 1e9)
+STEP_NS = round(STEP_TIME * 1e9)
 IMAGE_RATE = 30  # Hz
 FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 #: An image that is due for longer than this is left out, ns: if the machine does not keep up,
 #: odometry and vehicle come first.
 LATEST_NS = 30_000_000
-SKIPPED = 0.02  # of the images: more that are left out show in the flight
-SENSOR = Sensor(sub_poses=2)
+MAX_SKIPPED_SHARE = 0.02  # of the images: more that are left out show in the flight
+CAMERA_SENSOR = Sensor(sub_poses=2)  # poses in an exposure
 
 
 class RenderedImage(NamedTuple):
@@ -92,7 +92,7 @@ class RealTimeFlight:
         self.follower = vehicle.step(0)
         """The follower's true motion at the last step."""
         self._vio = VioEstimator(self.follower, scenario.random(run, 'vio'), scenario.odometry,
-                                 STEP)
+                                 STEP_TIME)
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
             *scenario.odometry.latency))
@@ -144,7 +144,7 @@ class RealTimeFlight:
         """Return the next image, if its exposure is over; leave out images that are too late."""
         while True:
             stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
-            end_ns = stamp_ns + round(0.5e9 * SENSOR.exposure)
+            end_ns = stamp_ns + round(0.5e9 * CAMERA_SENSOR.exposure)
             in_time = now_ns - stamp_ns <= self._latest_ns
             if end_ns > self.time_ns or (in_time and not self._leader.knows(end_ns)):
                 return None  # the leader's next pose may be under way
@@ -154,7 +154,7 @@ class RealTimeFlight:
             self.skipped_images += 1
 
     def _frame(self, stamp_ns: int) -> RenderedImage:
-        moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
+        moments = [round(1e9 * t) for t in CAMERA_SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
         hidden = self.scenario.hides(time)
         leader = self._leader.motion(stamp_ns, time)
@@ -167,7 +167,7 @@ class RealTimeFlight:
                              self.vehicle.at(stamp_ns), leader, usable)
 
     def _scenario_time(self, time_ns: int) -> float:
-        return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
+        return BEFORE_START if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
 
 
 def _pose(state: Odometry) -> Transform:
@@ -178,12 +178,12 @@ def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
     """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
     placed = [([second_print()], Transform.from_quaternion(
         np.array(each.position), quaternion_from_yaw(each.yaw))) for each in prints]
-    return Renderer(Camera(), SENSOR, seed=seed, fineness=2, prints=placed)
+    return Renderer(Camera(), CAMERA_SENSOR, seed=seed, fineness=2, prints=placed)
 
 
 def calibration(camera: Camera) -> dict[str, Any]:
     """Return the calibration as the fields of a ``sensor_msgs/CameraInfo``."""
-    k = [camera.focal_x, 0.0, camera.centre_x, 0.0, camera.focal_y, camera.centre_y,
+    k = [camera.focal_x, 0.0, camera.center_x, 0.0, camera.focal_y, camera.center_y,
          0.0, 0.0, 1.0]
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
     return {'height': camera.height, 'width': camera.width, 'distortion_model': camera.model,

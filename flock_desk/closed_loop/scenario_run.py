@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
+from flock_desk.scenarios.courses import course, COURSE_STEP, turn_rate, wind_course
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.quadrotor import attitude
@@ -36,7 +36,7 @@ from flock_follower.geometry import (
 
 WIND_PERIOD = 0.05  # s between changes of the wind
 PROCESSING = 0.02  # s from an image's exposure to the planner if nothing delays it
-BEFORE = -1.0  # s: any time before the scenario begins
+BEFORE_START = -1.0  # s: any time before the scenario begins
 
 
 class ScenarioRun:
@@ -53,7 +53,7 @@ class ScenarioRun:
     def __init__(self, scenario: Scenario, run: int, in_place: bool = True) -> None:
         self.scenario, self._in_place = scenario, in_place
         self._course = course(scenario, run)
-        self._turning = BEFORE, 0.0, 0.0  # time, heading then, rate of it
+        self._turning = BEFORE_START, 0.0, 0.0  # time, heading then, rate of it
         #: The scenario's frame in the vehicle's; None before the leader appears.
         self._frame: Transform | None = Transform() if in_place else None
         count = round(scenario.duration / WIND_PERIOD) + 1
@@ -85,7 +85,7 @@ class ScenarioRun:
         """Return the leader's true motion; its covariances are zero. None before it appears."""
         if self._frame is None:
             return None
-        step = 0.5 * STEP
+        step = 0.5 * COURSE_STEP
         pose, before, after = (self._frame @ self._pose(t) for t in (
             time, time - step, time + step))
         rate = matrix_to_rotation_vector(before.rotation.T @ after.rotation) / (2.0 * step)

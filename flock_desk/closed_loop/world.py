@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The world around the followers of a scenario: leader, air, vehicles and odometry, stepped by STEP.
+Surroundings of a scenario's followers: leader, air, vehicles, odometry, stepped by COURSE_STEP.
 
 Nothing here plans or reads a clock; the caller passes in the setpoints. Every
 follower is a row: those of the first run by their numbers, then those of the second, and so on.
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
+from flock_desk.scenarios.courses import course, COURSE_STEP, turn_rate, wind_course
 from flock_desk.scenarios.flock import facing_ahead, places
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
@@ -37,8 +37,10 @@ from flock_desk.vehicles.quadrotor import attitude, Quadrotor
 from flock_follower.geometry import Array, GRAVITY
 from flock_follower.planner.inputs import OwnState
 
-ODOMETRY_STEPS, GATE_STEPS = 2, 6
-ATTITUDE_ERROR, ATTITUDE_MEMORY = 0.01, 10.0  # rad of tilt, constant and varying; s
+ODOMETRY_STEPS = 2  # of COURSE_STEP, between two messages of odometry
+GATE_STEPS = 6  # of COURSE_STEP, between two setpoints
+ATTITUDE_ERROR = 0.01  # rad of tilt, both constant and varying
+ATTITUDE_MEMORY = 10.0  # s, correlation time of the varying tilt
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
 
 
@@ -54,7 +56,7 @@ class World:
         """The vehicles around each follower, by number (m, m); 0 is the leader."""
         self.present: Any = np.ones(m + 1, dtype=bool)
         """Which vehicles are there (m + 1,), the leader first."""
-        count = round(scenario.duration / STEP) + 1
+        count = round(scenario.duration / COURSE_STEP) + 1
         courses = [course(scenario, run) for run in runs]
         self._leader, self._leader_velocity, up, self._leader_heading = (
             np.stack([getattr(c, name) for c in courses], axis=1)
@@ -65,7 +67,7 @@ class World:
         self._heading: Array = self._leader_heading[0]
         # Gusts change slowly: one value per gate tick is enough. A flock is in one air.
         self._wind = np.repeat(np.stack([wind_course(
-            scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
+            scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * COURSE_STEP,
             scenario.random(run, 'wind')) for run in runs], axis=1), m, axis=1)
         self.starts, self.yaws = self._starts(n)
         """Where each begins (rows, 3), m, and its yaw then (rows,), rad."""
@@ -73,16 +75,16 @@ class World:
         self._place(0)
         self._flown = np.zeros((n * m, 3)), self.yaws.copy()
         """The setpoints that are flown: accelerations (rows, 3), m/s^2, and yaws (rows,), rad."""
-        self._delays = [round(g.uniform(*scenario.response.delay) / STEP)
+        self._delays = [round(g.uniform(*scenario.response.delay) / COURSE_STEP)
                         for g in self.random('delay')]
         self._coming: deque[tuple[int, list[tuple[Array, float | None]]]] = deque(
             maxlen=max(self._delays) // GATE_STEPS + 2)
         """The setpoints on their way to the vehicles, and the step when they were sent."""
         self._thrust_error = GaussMarkov(
             self.random('thrust'), 1, scenario.response.thrust_error,
-            scenario.response.thrust_memory, GATE_STEPS * STEP)
+            scenario.response.thrust_memory, GATE_STEPS * COURSE_STEP)
         self.vio = Vio(self.vehicle.position, self.vehicle.velocity, self.random('vio'),
-                       scenario.odometry, ODOMETRY_STEPS * STEP)
+                       scenario.odometry, ODOMETRY_STEPS * COURSE_STEP)
         self.travel = self.vehicle.position.copy()
         """Integral of the velocity of ``vio`` (rows, 3), m."""
         self._due = Due(scenario.odometry.rate)
@@ -94,7 +96,7 @@ class World:
         self._drift: Array = np.zeros((n * m, 3))
         self._drift_rng = self.random('dead reckoning')
         self._tilt = GaussMarkov(self.random('attitude'), 2, ATTITUDE_ERROR, ATTITUDE_MEMORY,
-                                 ODOMETRY_STEPS * STEP, ATTITUDE_ERROR)
+                                 ODOMETRY_STEPS * COURSE_STEP, ATTITUDE_ERROR)
         self._barometer = Barometer(self.random('barometer'))
 
     def random(self, what: str) -> list[np.random.Generator]:
@@ -148,16 +150,16 @@ class World:
 
     def advance(self, k: int) -> None:
         """Advance from step k - 1 to step k."""
-        now, fails = k * STEP, self.scenario.company.fails
+        now, fails = k * COURSE_STEP, self.scenario.company.fails
         if fails is not None and now >= fails.at + fails.gone:
             self.present[fails.follower] = False
         if k % GATE_STEPS == 0:
             self.vehicle.thrust_error = self._thrust_error.step()[:, 0]
         self._take_setpoints(k)
-        self.vehicle.step(*self._flown, STEP, wind=self._wind[(k - 1) // GATE_STEPS])
+        self.vehicle.step(*self._flown, COURSE_STEP, wind=self._wind[(k - 1) // GATE_STEPS])
         self._place(k)
         if self.scenario.leader.heading == 'away':
-            self._heading = self._heading + STEP * turn_rate(
+            self._heading = self._heading + COURSE_STEP * turn_rate(
                 self._heading, self._leader[k] - self.positions[:, 1:][
                     :, self.present[1:]].mean(axis=1))
         else:
@@ -174,11 +176,13 @@ class World:
         before = self.vio.velocity
         self.vio.step(self.vehicle.position, self.vehicle.velocity)
         # As perception does: images are compared where own motion is smooth.
-        self.travel = self.travel + 0.5 * ODOMETRY_STEPS * STEP * (before + self.vio.velocity)
+        self.travel = self.travel + 0.5 * ODOMETRY_STEPS * COURSE_STEP * (
+            before + self.vio.velocity)
         self.odometry_lost = self.scenario.fails('vio', now)
         if self.odometry_lost:
             fresh = np.stack([g.standard_normal(3) for g in self._drift_rng])
-            self._drift = self._drift + DEAD_RECKONING * math.sqrt(ODOMETRY_STEPS * STEP) * fresh
+            self._drift = self._drift + DEAD_RECKONING * math.sqrt(
+                ODOMETRY_STEPS * COURSE_STEP) * fresh
             return
         self._drift = np.zeros_like(self._drift)
         if self._due.at(now):

@@ -55,7 +55,8 @@ Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mea
 Acceleration = Callable[[float, Array, Array], Array]
 State = tuple[Array, Array]
 
-VICSEK_STEP, VICSEK_RADIUS = 0.1, 1.0  # s, and m: how far an agent sees
+VICSEK_STEP = 0.1  # s
+VICSEK_RADIUS = 1.0  # m, within which an agent sees others
 _LOOK_PERIOD = 0.05  # s between searches for new edges
 _SKIN = 0.05  # m that agents may move before near pairs are searched again
 
@@ -69,7 +70,7 @@ class Simulation:
     velocities: Array
     params: FlockingParams
     graph: Graph | None = field(default=None, repr=False)
-    """The neighbour graph at the end, if there is one."""
+    """The neighbor graph at the end, if there is one."""
 
     @cached_property
     def metrics(self) -> Metrics:
@@ -108,7 +109,7 @@ def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: Flocking
                    duration: float = 20.0, dt: float = 0.005, sample_period: float = 0.05,
                    progress: Callable[[], object] = lambda: None) -> Simulation:
     """
-    Return how a flock moves on its neighbour graph; see ``simulate``.
+    Return how a flock moves on its neighbor graph; see ``simulate``.
 
     :param dt: s, the longest step.
     :param progress: called at each of the times returned.
@@ -126,7 +127,7 @@ def simulate_graph(positions: ArrayLike, velocities: ArrayLike, params: Flocking
 
 
 class _GrowingGraph:
-    """The neighbour graph of a flock, which grows with its motion, and the law on it."""
+    """The neighbor graph of a flock, which grows with its motion, and the law on it."""
 
     def __init__(self, positions: Array, params: FlockingParams) -> None:
         self.edges = pairs_within(positions, np.sqrt(params.d1))

@@ -27,7 +27,7 @@ from flock_follower.geometry import Array
 
 
 class Graph(NamedTuple):
-    """A neighbour graph at the end of a simulation; its edges only ever join."""
+    """A neighbor graph at the end of a simulation; its edges only ever join."""
 
     edges: Pairs
     joined: Array
@@ -39,7 +39,7 @@ class Metrics:
     """
     One value for each of m times.
 
-    On a neighbour graph ``max_r2`` is over the edges there are at the time, and ``lyapunov``,
+    On a neighbor graph ``max_r2`` is over the edges there are at the time, and ``lyapunov``,
     which is of the law between all pairs, NaN; everything else is over all pairs.
     """
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The law on a neighbour graph, for flocks larger than one band can hold.
+The law on a neighbor graph, for flocks larger than one band can hold.
 
 With every pair in the sum, every pair must stay inside (d0, d1): no more than a handful of agents
 fit, and one pair outside is drawn to r^2 = d1, where the law is singular. Here

@@ -24,7 +24,7 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 
-PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.5, theta=2.0, d0=1.0, d1=2.25)
+PAPER_PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.5, theta=2.0, d0=1.0, d1=2.25)
 FLIGHT_PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
 
 #: The leader's input switches sign at its step 125; a step is read as 0.01 s.
@@ -50,8 +50,11 @@ def _start(*agents: tuple[float, float, float, float]) -> InitialMotion:
     return InitialMotion(np.stack([x, y], axis=1), velocities.T)
 
 
-LEADERLESS = _start((0.0, 0.0, 45.0, 0.54), (1.25, 0.0, 135.0, 0.42), (0.63, 1.08, 270.0, 0.99))
-LEADER_FOLLOWER = _start((0.0, 1.32, 118.0, 0.88), (0.0, 0.0, 92.0, 0.50))
+#: Positions, m, headings, deg, and speeds, m/s, of the paper's leaderless case.
+LEADERLESS_START = _start((0.0, 0.0, 45.0, 0.54), (1.25, 0.0, 135.0, 0.42),
+                          (0.63, 1.08, 270.0, 0.99))
+#: The same of leader and follower.
+LEADER_FOLLOWER_START = _start((0.0, 1.32, 118.0, 0.88), (0.0, 0.0, 92.0, 0.50))
 
 
 def leader_input(t: float) -> Array:

@@ -30,7 +30,7 @@ from flock_follower.ranges import Range
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-WIDTH = 100  # characters of a line
+LINE_WIDTH = 100  # characters of a line
 
 
 def within(valid: Range) -> Callable[[str], float]:
@@ -91,6 +91,6 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> str:
 def progress(jobs: int) -> tqdm[None]:
     """Return a bar on stderr for a number of jobs, also in a pipe; ``desc`` names the present."""
     from tqdm import tqdm
-    return tqdm(total=jobs, file=sys.stderr, ncols=WIDTH,
+    return tqdm(total=jobs, file=sys.stderr, ncols=LINE_WIDTH,
                 mininterval=TERMINAL_PERIOD if sys.stderr.isatty() else LOG_PERIOD,
                 bar_format='{desc}: {percentage:3.0f} % |{bar}| {elapsed}<{remaining}')

@@ -44,7 +44,7 @@ from flock_follower.bags.schedule import Gaps
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.findings import Finding
 from flock_follower.checks.observations import OwnMotion
-from flock_follower.checks.recorded_system import LONGEST, RecordedSystem
+from flock_follower.checks.recorded_system import MAX_DURATION, RecordedSystem
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import AUTOPILOT
@@ -151,8 +151,8 @@ class Evaluation(Listener):
     ``setpoint_rows``: time, the acceleration sent (NaN: none), 1 for a command.
 
     :param values: the checked values of every parameter, by node, see ``TABLE``.
-    :raises ValueError: if values do not fit together, or the neighbours file is wrong.
-    :raises OSError: if the neighbours file cannot be read.
+    :raises ValueError: if values do not fit together, or the neighbors file is wrong.
+    :raises OSError: if the neighbors file cannot be read.
     """
 
     def __init__(self, bag: Bag, values: dict[str, dict[str, Any]], writer: BagWriter) -> None:
@@ -266,7 +266,7 @@ class Evaluation(Listener):
 
     @cached_property
     def tables(self) -> dict[str, Table]:
-        """Return the errors of each neighbour by its name, once all messages were taken."""
+        """Return the errors of each neighbor by its name, once all messages were taken."""
         return {each.name: self.errors.table(each.name) for each in self.neighbors}
 
     @property
@@ -293,7 +293,7 @@ class Evaluation(Listener):
     def odometry(self, state: OdometryState) -> None:
         """Take the own state, for the errors and for the rules of ``check``."""
         self.errors.odometry(self._moved(state))
-        if self.own is not None and state.stamp < self.bag.start_ns + LONGEST * NANOSECONDS:
+        if self.own is not None and state.stamp < self.bag.start_ns + MAX_DURATION * NANOSECONDS:
             self.own.states.append(state)
 
     def image(self, outcome: ImageOutcome) -> None:

@@ -59,7 +59,7 @@ MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a l
 #: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
-COUNTED = 1.2  # s in which every node publishes its counters once more
+COUNTER_PERIOD = 1.2  # s in which every node publishes its counters once more
 T = TypeVar('T')
 
 
@@ -165,7 +165,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             simulator = processes.children['simulator']
             wait_until(lambda: simulator.poll() is not None, LANDING_TIMEOUT,
                        'the vehicle to land and disarm')
-        time.sleep(COUNTED)
+        time.sleep(COUNTER_PERIOD)
         if any(simulator.returncode for simulator in simulators_of(processes)):
             raise RuntimeError('the simulator failed')
         exit_codes = processes.stop_all()

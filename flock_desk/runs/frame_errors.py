@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Errors of the estimates against the truth: one row per image and neighbour.
+Errors of the estimates against the truth: one row per image and neighbor.
 
-Errors are those of the neighbour's state relative to the follower, each in its follower's body
+Errors are those of the neighbor's state relative to the follower, each in its follower's body
 frame (FLU): estimate minus own odometry against truth minus truth, so that drift, which is common
 to leader and follower in odom, does not count. Their covariances follow from the published ones.
 
@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.neighbors_file import MarkedNeighbor, Marker
-from flock_follower.odometry.buffer import between, OdometrySample
+from flock_follower.odometry.buffer import interpolate, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import Estimate
 
@@ -57,9 +57,10 @@ Table = Mapping[str, Array]
 MAX_GAP = NANOSECONDS // 2
 #: A marker seen at a larger angle from its normal is not in view, cosine.
 GRAZING = float(np.cos(np.radians(80.0)))
-#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity; and of the
-#: result of an image: stage, position, velocity, rotation matrix, covariance (6, 6).
-_STATE, _SEEN = 14, 52
+#: Numbers of a state: time [ns], position, quaternion, velocity, angular velocity.
+_STATE_LENGTH = 14
+#: Numbers of an image's result: stage, position, velocity, rotation matrix, covariance (6, 6).
+_SIGHTING_LENGTH = 52
 
 
 class _States(NamedTuple):
@@ -74,7 +75,7 @@ class FrameErrors:
     """
     Collects images, odometry and truth as they arrive; :meth:`table` compares them.
 
-    An hour takes about 130 MB: 112 bytes for each state, 0.4 kB for each image and neighbour.
+    An hour takes about 130 MB: 112 bytes for each state, 0.4 kB for each image and neighbor.
 
     :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
@@ -85,7 +86,7 @@ class FrameErrors:
         self.models: dict[str, CameraModel | None] = {}
         """The calibration of each camera, '' of the only one, if known."""
         self.strangers: set[str] = set()
-        """Names in the truth that are no neighbour's."""
+        """Names in the truth that are no neighbor's."""
         self._neighbors = {n.name: n for n in neighbors}
         mounted = {'': cameras} if isinstance(cameras, Transform) else cameras
         self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
@@ -101,7 +102,7 @@ class FrameErrors:
         self._take(self._own, state)
 
     def truth(self, state: OdometryState, own: bool = False) -> None:
-        """Take the own true state, or that of the neighbour that the child frame names."""
+        """Take the own true state, or that of the neighbor that the child frame names."""
         name = '' if own else state.child
         if name in self._true:
             self._take(self._true[name], state)
@@ -115,20 +116,20 @@ class FrameErrors:
         self._cameras.append(camera)
         for name, seen in self._seen.items():
             estimate = estimates.get(name)
-            seen.extend((0.0, *[np.nan] * (_SEEN - 1)) if estimate is None else (
+            seen.extend((0.0, *[np.nan] * (_SIGHTING_LENGTH - 1)) if estimate is None else (
                 STAGES.index(stages.get(name, 'full')), *estimate.position, *estimate.velocity,
                 *estimate.rotation.ravel(), *estimate.covariance[:6, :6].ravel()))
 
     def _take(self, states: array[float], state: OdometryState) -> None:
         """Keep states in the order of their stamps: a late one is dropped."""
         time = state.stamp - self._start
-        if not states or time > states[-_STATE]:
+        if not states or time > states[-_STATE_LENGTH]:
             states.extend((time, *state.position, *state.quaternion, *state.velocity,
                            *state.angular_velocity))
 
     def table(self, name: str) -> dict[str, Array]:
         """
-        Return the columns of a neighbour by name, a row for each of n images; NaN is unknown.
+        Return the columns of a neighbor by name, a row for each of n images; NaN is unknown.
 
         (n,): ``time``, s; ``stage``, an index into STAGES; ``visible``, 1 if by the truth a marker
         is in view; ``distance`` and ``true_distance``, m; ``nees_position``, ``nees_velocity``;
@@ -140,7 +141,7 @@ class FrameErrors:
         stamps = np.array(self._stamps)
         own, true_own, true = (
             _at(states, stamps) for states in (self._own, self._true[''], self._true[name]))
-        seen = np.array(self._seen[name]).reshape(-1, _SEEN)
+        seen = np.array(self._seen[name]).reshape(-1, _SIGHTING_LENGTH)
         position, velocity, rotation = seen[:, 1:4], seen[:, 4:7], seen[:, 7:16]
         covariance = seen[:, 16:].reshape(-1, 6, 6)
         estimated = _relative(_States(position, velocity, rotation.reshape(-1, 3, 3)), own)
@@ -184,10 +185,10 @@ def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transfor
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0.0) & (pixels <= [camera.width - 1.0, camera.height - 1.0])
                   ).all(axis=(1, 2))
-        centre = in_camera.mean(axis=1)
+        center = in_camera.mean(axis=1)
         normal = np.cross(in_camera[:, 2] - in_camera[:, 3], in_camera[:, 0] - in_camera[:, 3])
-        facing = -np.einsum('ni,ni->n', normal, centre) > (
-            GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(centre, axis=1))
+        facing = -np.einsum('ni,ni->n', normal, center) > (
+            GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(center, axis=1))
     return np.asarray(inside & facing)
 
 
@@ -198,7 +199,7 @@ def _at(states: array[float], stamps: Array) -> _States:
     The states are interpolated as in perception, so that interpolation adds no error of its own.
     """
     result = _States(*(np.full((len(stamps), *shape), np.nan) for shape in ((3,), (3,), (3, 3))))
-    rows = np.array(states).reshape(-1, _STATE)
+    rows = np.array(states).reshape(-1, _STATE_LENGTH)
     if not len(rows):
         return result
     times = rows[:, 0]
@@ -210,7 +211,7 @@ def _at(states: array[float], stamps: Array) -> _States:
         begin = times[before[k]]
         state = _sample(rows[before[k]], begin)
         if before[k] != after[k]:
-            state = between(state, _sample(rows[after[k]], begin),
+            state = interpolate(state, _sample(rows[after[k]], begin),
                             float(stamps[k] - begin) / NANOSECONDS)
         result.position[k], result.velocity[k] = state.position, state.velocity
         result.rotation[k] = quaternion_to_matrix(state.quaternion)
@@ -222,7 +223,7 @@ def _sample(row: Array, since: float) -> OdometrySample:
 
 
 def _relative(neighbor: _States, own: _States) -> _States:
-    """Return a neighbour's states relative to the own ones, in the follower's body."""
+    """Return a neighbor's states relative to the own ones, in the follower's body."""
     to_body = own.rotation.transpose(0, 2, 1)
     return _States(np.einsum('nij,nj->ni', to_body, neighbor.position - own.position),
                    np.einsum('nij,nj->ni', to_body, neighbor.velocity - own.velocity),

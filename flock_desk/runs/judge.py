@@ -57,7 +57,7 @@ class FigureBound(NamedTuple):
             ('≥', self.least), ('≤', self.most)) if value is not None)
 
 
-class Judgement(NamedTuple):
+class Judgment(NamedTuple):
     """A bound, the figure found, and its fault, or ''; ``judged``: whether the bound counts."""
 
     bound: FigureBound
@@ -115,14 +115,14 @@ def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> 
 
 
 def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any],
-          busy: bool = False) -> list[Judgement]:
+          busy: bool = False) -> list[Judgment]:
     """
     Return the verdict on every bound; a figure that is None or not finite breaks its bound.
 
     :param busy: whether the machine was too busy. Then a broken bound is not judged if load can
         push the figure as far. A bound that holds does hold: load improves no figure.
     """
-    figures, judgements = dict(flat(summary)), []
+    figures, judgments = dict(flat(summary)), []
     for bound in bounds:
         key, least, most, load = bound
         excess = math.inf  # of an unknown figure
@@ -139,8 +139,8 @@ def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any],
             fault = f'{key} = {figure:.6g}: must be at most {most:g}'
             excess = figure - most
         judged = not (busy and fault and (excess <= load or figure is None))
-        judgements.append(Judgement(bound, figure, fault, judged))
-    return judgements
+        judgments.append(Judgment(bound, figure, fault, judged))
+    return judgments
 
 
 def flat(summary: Mapping[str, Any], prefix: str = '') -> Iterable[tuple[str, Any]]:

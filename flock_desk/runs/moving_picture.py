@@ -30,7 +30,8 @@ from flock_desk.runs.plots import draw_above, draw_distance, FOLLOWER, LEADER, T
 from flock_desk.runs.record import LiveFlight
 from flock_follower.geometry import Transform
 
-RATE, LONGEST = 8.0, 15.0  # pictures per s; s, the part of the flight that is shown
+PICTURE_RATE = 8.0  # pictures per s
+MAX_DURATION = 15.0  # s, the part of the flight that is shown
 
 
 def moving_picture(flight: LiveFlight) -> bytes:
@@ -40,7 +41,7 @@ def moving_picture(flight: LiveFlight) -> bytes:
     The camera's images are rendered again from the recorded true poses.
     """
     times, log = flight.table['time'], flight.log
-    ticks = np.arange(times[0], min(float(times[-1]), LONGEST), 1.0 / RATE)
+    ticks = np.arange(times[0], min(float(times[-1]), MAX_DURATION), 1.0 / PICTURE_RATE)
     camera = real_time_camera(0, flight.scenario.prints)
     figure = Figure(figsize=(9, 4.6), dpi=100, layout='constrained')
     axes: dict[str, Axes] = figure.subplot_mosaic(
@@ -53,8 +54,8 @@ def moving_picture(flight: LiveFlight) -> bytes:
     draw_distance(axes['distance'], flight)
     axes['distance'].set(xlim=(0.0, ticks[-1]), xlabel=TIME)
     now = axes['distance'].axvline(0.0, color='black', linewidth=1.2)
-    places = [(path, axes['above'].plot([], [], 'o', color=colour, markersize=9)[0])
-              for path, colour in zip(flight.paths.values(), (LEADER, FOLLOWER))]
+    places = [(path, axes['above'].plot([], [], 'o', color=color, markersize=9)[0])
+              for path, color in zip(flight.paths.values(), (LEADER, FOLLOWER))]
     canvas, pictures = FigureCanvasAgg(figure), []
     for row in np.minimum(np.searchsorted(times, ticks), len(times) - 1):
         follower, leader = (Transform.from_quaternion(
@@ -70,5 +71,5 @@ def moving_picture(flight: LiveFlight) -> bytes:
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
     buffer = io.BytesIO()
     pictures[0].save(buffer, format='WEBP', save_all=True, append_images=pictures[1:],
-                     duration=round(1e3 / RATE), loop=0, quality=55, method=2)
+                     duration=round(1e3 / PICTURE_RATE), loop=0, quality=55, method=2)
     return buffer.getvalue()

@@ -16,7 +16,7 @@
 """
 The figures for a paper: simulated flocks, a panel for each model; controllers compared.
 
-Each is one column wide and legible at that width; its lines are distinguishable in grey. The title
+Each is one column wide and legible at that width; its lines are distinguishable in gray. The title
 belongs to the caption.
 """
 
@@ -39,9 +39,9 @@ from flock_desk.flocks.agents import Simulation
 from flock_follower.flocking import FlockingParams
 from flock_follower.whole_file import whole_file
 
-WIDTH = 3.33  # in: a column of the paper's two
-# Okabe and Ito's palette, for the colour-blind, and a dash for each, for print without colour.
-COLOURS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
+COLUMN_WIDTH = 3.33  # in: a column of the paper's two
+# Okabe and Ito's palette, for the color-blind, and a dash for each, for print without color.
+COLORS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))
 INK, PALE = '#333333', '#BBBBBB'
 KINDS = ('png', 'svg', 'pdf')
 #: No names by chance and no dates: the same run gives the same bytes.
@@ -96,11 +96,11 @@ def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '')
         for n, line in ((0, ':'), (-1, '-')):
             loop = np.append(np.arange(x.shape[1]), 0)
             axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=line, zorder=1)
-        for i, (colour, dash) in enumerate(COLOURS[:x.shape[1]]):
-            axis.plot(*x[:, i].T, color=colour, linestyle=dash)
-            axis.plot(*x[0, i], 'o', color='white', markeredgecolor=colour, markersize=4,
+        for i, (color, dash) in enumerate(COLORS[:x.shape[1]]):
+            axis.plot(*x[:, i].T, color=color, linestyle=dash)
+            axis.plot(*x[0, i], 'o', color='white', markeredgecolor=color, markersize=4,
                       zorder=5)
-            axis.plot(*x[-1, i], 'o', color=colour, markersize=4)
+            axis.plot(*x[-1, i], 'o', color=color, markersize=4)
         spans = np.ptp(x, axis=(0, 1))
         axis.margins(0.12)
         if spans.max() > SLIM * spans.min():  # at one scale the panel would be empty
@@ -123,8 +123,8 @@ def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Fi
     top = 1.05 * max(np.linalg.norm(run.velocities, axis=2).max() for run in runs.values())
 
     def draw(axis: Axes, run: Simulation) -> None:
-        for i, (colour, dash) in enumerate(COLOURS[:run.positions.shape[1]]):
-            axis.plot(run.time, np.linalg.norm(run.velocities[:, i], axis=1), color=colour,
+        for i, (color, dash) in enumerate(COLORS[:run.positions.shape[1]]):
+            axis.plot(run.time, np.linalg.norm(run.velocities[:, i], axis=1), color=color,
                       linestyle=dash)
         axis.set(xlim=(0.0, end), ylim=(0.0, top))
 
@@ -140,17 +140,17 @@ def distances(runs: Runs, end: float, note: str = '') -> Figure:
         if run.positions.shape[1] > 2:
             few = slice(0, last + 1, max(1, last // 500))  # of an area a file keeps every point
             axis.fill_between(m.time[few], np.sqrt(m.min_r2[few]), np.sqrt(m.max_r2[few]),
-                              color=COLOURS[0][0], alpha=0.35, linewidth=0)
-        axis.plot(m.time, m.mean_distance, color=COLOURS[0][0], linewidth=1.1)
+                              color=COLORS[0][0], alpha=0.35, linewidth=0)
+        axis.plot(m.time, m.mean_distance, color=COLORS[0][0], linewidth=1.1)
         draw_bounds(axis, run.params)
         shown = np.sqrt(np.append(m.max_r2[:last + 1], run.params.d1))
         axis.set(xlim=(0.0, end), ylim=(0.0, 1.1 * float(shown.max())))
 
     several = next(iter(runs.values())).positions.shape[1] > 2
     label = 'mean of the pairs' if several else 'between the two'
-    handles: list[Handle] = [Line2D([], [], color=COLOURS[0][0], label=label)]
+    handles: list[Handle] = [Line2D([], [], color=COLORS[0][0], label=label)]
     if several:
-        handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
+        handles.append(Patch(color=COLORS[0][0], alpha=0.35, linewidth=0,
                              label='least to greatest'))
     handles.append(Line2D([], [], color=INK, linestyle='--', linewidth=0.9,
                           label='$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
@@ -164,17 +164,17 @@ def agreement(runs: Runs, end: float) -> Figure:
 
     A dot is where their disagreement has fallen below 1 % of the first for good.
     """
-    figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 3.6), layout='constrained')
     above, below = figure.subplots(2, 1, sharex=True)
     law = next(iter(runs.values())).metrics
     shown = law.time <= end
     above.plot(law.time[shown], law.lyapunov[shown], color=INK)
     above.set(ylabel='$W$ of the law [m/s]')
-    for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
+    for (name, run), (color, dash) in zip(runs.items(), ((INK, '-'), *COLORS[:2])):
         m = run.metrics
-        below.semilogy(m.time, m.disagreement / m.disagreement[0], color=colour,
+        below.semilogy(m.time, m.disagreement / m.disagreement[0], color=color,
                        linestyle=dash, label=name)
-        below.plot(m.time_to_agree(), 0.01, 'o', color=colour, markersize=4)
+        below.plot(m.time_to_agree(), 0.01, 'o', color=color, markersize=4)
     below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
     below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
                    ha='right')
@@ -189,30 +189,30 @@ def agreement(runs: Runs, end: float) -> Figure:
 @styled()
 def flock(run: Simulation) -> Figure:
     """Return paths from above, distances and agreement of a larger flock on a graph."""
-    figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 5.6), layout='constrained')
     paths, below, agreeing = figure.subplots(3, 1, height_ratios=(2.2, 1.0, 1.0))
     # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
     x = (run.positions - run.positions.mean(axis=1, keepdims=True))[:, :, :2]
     edges = np.empty((0, 2), dtype=int) if run.graph is None else run.graph.edges[:2000]
     paths.plot(*x[-1, edges].transpose(2, 1, 0), color=PALE, linewidth=0.5, zorder=1)
-    paths.plot(*x[:, :200].transpose(2, 0, 1), color=COLOURS[0][0], linewidth=0.6, alpha=0.7)
+    paths.plot(*x[:, :200].transpose(2, 0, 1), color=COLORS[0][0], linewidth=0.6, alpha=0.7)
     paths.plot(*x[-1].T, 'o', color=INK, markersize=2.5)
     paths.set(xlabel='x from the mean [m]', ylabel='y from the mean [m]')
     paths.set_aspect('equal', adjustable='datalim')
     paths.legend(handles=[
-        Line2D([], [], color=COLOURS[0][0], linewidth=0.6, label='paths'),
+        Line2D([], [], color=COLORS[0][0], linewidth=0.6, label='paths'),
         Line2D([], [], color=INK, marker='o', markersize=2.5, linestyle='',
                label=f'after {run.time[-1]:g} s'),
         Line2D([], [], color=PALE, linewidth=0.5, label='edges')], **_ABOVE)
     m = run.metrics
-    below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
+    below.plot(m.time, np.sqrt(m.max_r2), color=COLORS[1][0], linestyle=COLORS[1][1],
                label='longest edge')
-    below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
+    below.plot(m.time, np.sqrt(m.min_r2), color=COLORS[0][0], label='least of all pairs')
     draw_bounds(below, run.params)
     below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     agreeing.plot(m.time, m.order, color=INK, label='order parameter')
-    agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
-                  linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
+    agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLORS[2][0],
+                  linestyle=COLORS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
     agreeing.set(xlabel=_TIME, ylabel='agreement', xlim=(0.0, m.time[-1]), ylim=(0.0, None))
     for axis in (below, agreeing):
         axis.legend(**_ABOVE)
@@ -224,7 +224,7 @@ def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
             y_label: str, note: str, height: float = 4.3,
             share: tuple[Any, Any] = ('all', 'all')) -> Figure:
     """Return a panel for each of five runs, the legend in the second place, a note below."""
-    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
+    figure = Figure(figsize=(COLUMN_WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
     axes = figure.subplots(3, 2, sharex=share[0], sharey=share[1])
     for letter, axis, (name, run) in zip('abcde', axes.flat[[0, 2, 3, 4, 5]], runs.items()):
         axis.set_title(f'({letter}) {name}'.replace(', ', ',\n'))
@@ -244,8 +244,8 @@ def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
 
 
 def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
-    return [Line2D([], [], color=colour, linestyle=dash, label=name)
-            for name, (colour, dash) in zip(names, COLOURS)]
+    return [Line2D([], [], color=color, linestyle=dash, label=name)
+            for name, (color, dash) in zip(names, COLORS)]
 
 
 @styled()
@@ -255,12 +255,12 @@ def controllers(results: Mapping[float, Mapping[str, tuple[float, float]]]) -> F
 
     :param results: by ``v_max``, the jerk, m/s^3, and the share of each controller.
     """
-    figure = Figure(figsize=(WIDTH, 2.4), layout='constrained')
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.4), layout='constrained')
     axes: list[Axes] = list(figure.subplots(1, len(results), sharey=True, squeeze=False)[0])
     for axis, (v_max, points) in zip(axes, results.items()):
         for (name, (jerk, share)), marker in zip(points.items(), 'os^Dv'):
             axis.plot(jerk, 100.0 * share, marker, markersize=5, label=name,
-                      color=COLOURS[1][0] if name == 'law and guard' else INK,
+                      color=COLORS[1][0] if name == 'law and guard' else INK,
                       markerfacecolor=None if name == 'law and guard' else 'white')
         axis.set(title=f'$v_{{max}}$ = {v_max:g} m/s', xlabel='jerk [m/s$^3$]', ylim=(-5, 105))
         axis.set_xlim(left=0.0)

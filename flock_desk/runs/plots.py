@@ -38,19 +38,20 @@ matplotlib.rcParams.update({
     'axes.grid': True, 'grid.alpha': 0.25, 'grid.linewidth': 0.6, 'axes.spines.top': False,
     'axes.spines.right': False, 'axes.titlelocation': 'left', 'axes.titlesize': 11})
 
-# Okabe and Ito's palette: colour-blind people distinguish the colours; in grey they differ, too.
+# Okabe and Ito's palette: color-blind people distinguish the colors; in gray they differ, too.
 LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
 _SHADE = '#CC79A7'
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'RELATIVE', 'TRACK')  # from bottom to top
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
-PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
+PAIR_PERIOD = 5.0  # s between the lines from follower to leader
+MAX_PAIRS = 24  # lines from follower to leader
 NARROWEST = 0.35  # of its length, of a map
 TIME = 'time [s]'
 
 
 def evaluation_chapters(evaluation: Evaluation) -> list[Chapter]:
-    """Return the chapters of ``evaluate``: flight and errors of each neighbour."""
+    """Return the chapters of ``evaluate``: flight and errors of each neighbor."""
     ticks, setpoints = evaluation.ticks, evaluation.setpoints
     return [chapter for name, table in evaluation.tables.items() for chapter in chapters(Flight(
         name=name, duration=evaluation.duration, params=evaluation.params,
@@ -75,7 +76,7 @@ def scenario_chapters(flight: LiveFlight) -> list[Chapter]:
 
 
 def chapters(flight: Flight, note: str = '') -> list[Chapter]:
-    """Return the chapters of a flight behind a neighbour: the flight and, with truth, errors."""
+    """Return the chapters of a flight behind a neighbor: the flight and, with truth, errors."""
     result = [Chapter(f'Flight: {flight.name}', note, [_flight_picture(flight)])]
     if np.isfinite(flight.table['true_distance']).any():
         result.append(Chapter(
@@ -105,10 +106,10 @@ def _flight_picture(flight: Flight) -> Illustration:
     _draw_setpoints(axes['setpoint'], flight)
     v_max = flight.params.v_max
     _draw_limit(axes['speed'], v_max, f'v_max\n{v_max:g} m/s')
-    colours = {'leader': LEADER, REPLAYED: VEHICLE}
+    colors = {'leader': LEADER, REPLAYED: VEHICLE}
     for label, (times, speeds) in flight.speeds.items():
         axes['speed'].plot(times, speeds, linewidth=1.1, label=label,
-                           color=colours.get(label, FOLLOWER))
+                           color=colors.get(label, FOLLOWER))
     axes['speed'].set(ylabel='speed [m/s]', ylim=(0.0, None))
     _draw_states(axes['state'], flight)
     for name in names:
@@ -176,12 +177,12 @@ def draw_above(axis: Axes, flight: Flight) -> None:
     Both axes have one scale, and a box as narrow as the data, within ``NARROWEST``.
     """
     times, paths = flight.table['time'], [path[:, :2] for path in flight.paths.values()]
-    period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)
-    for label, path, colour in zip(flight.paths, paths, (LEADER, FOLLOWER)):
-        axis.plot(*path.T, color=colour, linewidth=1.7, label=label)
+    period = max(PAIR_PERIOD, flight.duration / MAX_PAIRS)
+    for label, path, color in zip(flight.paths, paths, (LEADER, FOLLOWER)):
+        axis.plot(*path.T, color=color, linewidth=1.7, label=label)
         known = path[np.isfinite(path).all(axis=1)]
         for end, marker in zip((known[:1], known[-1:]), 'os'):
-            axis.plot(*end.T, marker, color=colour, markersize=6)
+            axis.plot(*end.T, marker, color=color, markersize=6)
     for k in np.searchsorted(times, np.arange(0.0, times[-1], period)):
         pair = np.transpose([path[k] for path in paths])
         axis.plot(*pair, color=LIMIT, linewidth=0.6, alpha=0.5)
@@ -198,8 +199,8 @@ def _draw_setpoints(axis: Axes, flight: Flight) -> None:
     """Draw the setpoints by axis of odom, and their norm, which a_max limits."""
     times, setpoints, a_max = flight.setpoint_times, flight.setpoints, flight.params.a_max
     _draw_limit(axis, a_max, f'a_max\n{a_max:g} m/s²')
-    for values, colour, label in zip(setpoints.T, (LEADER, FOLLOWER, VEHICLE), 'xyz'):
-        axis.plot(times, values, color=colour, linewidth=0.8, label=label)
+    for values, color, label in zip(setpoints.T, (LEADER, FOLLOWER, VEHICLE), 'xyz'):
+        axis.plot(times, values, color=color, linewidth=0.8, label=label)
     axis.plot(times, norms(setpoints), color=LIMIT, linewidth=1.2, label='norm')
     if flight.commanded is not None and not flight.commanded.all():
         idle = ~flight.commanded

@@ -40,9 +40,9 @@ from typing import TypeVar
 
 from flock_follower.checks.processor import (
     Load,
+    LOAD_PERIOD,
     LoadMeter,
     longest_wait,
-    PERIOD,
     stopped,
     threads_of,
 )
@@ -334,7 +334,7 @@ class Processes:
 
     def _measure(self) -> None:
         """Measure the load until the block is left."""
-        while not self._left.wait(PERIOD):
+        while not self._left.wait(LOAD_PERIOD):
             self.load.sample(time.monotonic())
 
 

@@ -57,7 +57,7 @@ _FILES = (_RECORD, 'autopilot.npz', 'flight.npz', 'report.html', 'summary.json')
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Flight:
     """
-    A flight behind one neighbour; times in s from its beginning, vectors in odom.
+    A flight behind one neighbor; times in s from its beginning, vectors in odom.
 
     ``table`` is that of ``frame_errors``, n images; ``paths`` (n, 2) or (n, 3), m, are the
     leader's and the follower's at these, ``speeds`` times (m,) and speeds (m,), m/s, each by its

@@ -30,9 +30,9 @@ import sys
 import textwrap
 from typing import Any, NamedTuple
 
-from flock_desk.runs.console import WIDTH
+from flock_desk.runs.console import LINE_WIDTH
 from flock_desk.runs.figure_table import parts_of, shown, words
-from flock_desk.runs.judge import FigureBound, flat, judge, Judgement
+from flock_desk.runs.judge import FigureBound, flat, judge, Judgment
 from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE
 from flock_desk.runs.summary import consistency, write_summary
 from flock_follower.checks.processor import Load
@@ -76,9 +76,9 @@ class Chapter(NamedTuple):
     illustrations: Sequence[Illustration] = ()
 
 
-def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[str]:
+def table(summary: Mapping[str, Any], judgments: Sequence[Judgment]) -> list[str]:
     """Return the lines of the figures shown, bounds and verdicts beside those that have one."""
-    judged = {judgement.bound.key: judgement for judgement in judgements}
+    judged = {judgment.bound.key: judgment for judgment in judgments}
     figures = {key: value for key, value in flat(summary)
                if key in judged or (value is not None and shown(key))}
     figures |= {key: each.figure for key, each in judged.items() if key not in figures}
@@ -88,12 +88,12 @@ def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[s
         line = f'  {key:<{width}}  {text(value):>10}  {_verdict(key, value)}'
         if key in judged:
             line += f'{judged[key].bound!s:<16}  {judged[key].verdict}'
-        lines += textwrap.wrap(line, WIDTH, drop_whitespace=False,
+        lines += textwrap.wrap(line, LINE_WIDTH, drop_whitespace=False,
                                subsequent_indent=' ' * (width + 4))
     return [line.rstrip() for line in lines]
 
 
-def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
+def announce(summary: Mapping[str, Any], judgments: Sequence[Judgment],
              pages: Sequence[Path], logs: Path | None = None, load: Load | None = None) -> int:
     """
     Print the table, the broken bounds and the files to look at; return the exit code.
@@ -101,29 +101,29 @@ def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
     :param logs: the folder to look at if something failed.
     :param load: why bounds were not judged.
     """
-    print('\n'.join([*table(summary, judgements), *(f'report: {page}' for page in pages)]),
+    print('\n'.join([*table(summary, judgments), *(f'report: {page}' for page in pages)]),
           flush=True)
-    faults = [f'FAILED: {each.fault}' for each in judgements if each.verdict == 'FAILED']
+    faults = [f'FAILED: {each.fault}' for each in judgments if each.verdict == 'FAILED']
     if faults and logs is not None:
         faults.append(f'the logs of every process are in {logs}')
-    busy = too_busy(judgements, load)
+    busy = too_busy(judgments, load)
     for line in filter(None, [*faults, busy and f'too busy: {busy}']):
         print(line, file=sys.stderr)
     return 1 if faults else TOO_BUSY_EXIT_CODE if busy else 0
 
 
-def too_busy(judgements: Sequence[Judgement], load: Load | None) -> str:
+def too_busy(judgments: Sequence[Judgment], load: Load | None) -> str:
     """Return why bounds were not judged, and which, in one line; '' if all were."""
-    unjudged = ', '.join(each.bound.key for each in judgements if not each.judged)
+    unjudged = ', '.join(each.bound.key for each in judgments if not each.judged)
     return f'{load}; close other programs; not judged: {unjudged}' if unjudged else ''
 
 
 def report(folder: Path, title: str, introduction: str, summary: Mapping[str, Any],
            bounds: Sequence[FigureBound], chapters: Sequence[Chapter],
            warnings: Sequence[str] = (), parts: Mapping[str, Any] | None = None,
-           load: Load | None = None) -> list[Judgement]:
+           load: Load | None = None) -> list[Judgment]:
     """
-    Judge a summary, write summary.json and report.html to a folder, and return the judgements.
+    Judge a summary, write summary.json and report.html to a folder, and return the judgments.
 
     :param warnings: shown at the top of the report.
     :param load: of the machine meanwhile; None if it is unknown, or irrelevant.
@@ -131,16 +131,16 @@ def report(folder: Path, title: str, introduction: str, summary: Mapping[str, An
     :raises OSError: if a file cannot be written.
     """
     whole = {**summary, **(parts or {})}
-    judgements = judge(bounds, whole, load is not None and load.busy)
-    busy = too_busy(judgements, load)
+    judgments = judge(bounds, whole, load is not None and load.busy)
+    busy = too_busy(judgments, load)
     write_summary(whole, folder / 'summary.json')
-    write_report(folder / 'report.html', title, introduction, summary, judgements, chapters,
+    write_report(folder / 'report.html', title, introduction, summary, judgments, chapters,
                  [*([f'too busy: {busy}'] if busy else []), *warnings])
-    return judgements
+    return judgments
 
 
 def write_report(path: Path, title: str, introduction: str, summary: Mapping[str, Any],
-                 judgements: Sequence[Judgement], chapters: Sequence[Chapter] = (),
+                 judgments: Sequence[Judgment], chapters: Sequence[Chapter] = (),
                  warnings: Sequence[str] = ()) -> None:
     """
     Write the page.
@@ -151,7 +151,7 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
     body = ''.join([
         f'<h1>{escape(title)}</h1><p>{escape(introduction)}</p>',
         *(f'<p class="warning">{escape(warning[:1].upper() + warning[1:])}.</p>'
-          for warning in warnings), _bounds(judgements),
+          for warning in warnings), _bounds(judgments),
         *map(_chapter, chapters), '<h2>All figures</h2>',
         '<p>The tooltip of a figure shows its key in summary.json.</p><div class="figures">',
         _group('', {key: value for key, value in summary.items()
@@ -176,9 +176,9 @@ def _label(key: str, depth: int = 0) -> str:
     return escape(': '.join(words('.'.join(parts[:n + 1])) for n in range(depth, len(parts))))
 
 
-def _bounds(judgements: Sequence[Judgement]) -> str:
+def _bounds(judgments: Sequence[Judgment]) -> str:
     rows = []
-    for each in judgements:
+    for each in judgments:
         rows.append(f'<tr><td>{_label(each.bound.key)} <code>{escape(each.bound.key)}</code></td>'
                     f'<td>{escape(text(each.figure))}</td><td>{each.bound}</td>'
                     f'<td class="{each.verdict}">{each.verdict}</td></tr>')

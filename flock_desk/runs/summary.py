@@ -56,9 +56,9 @@ OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a by
 
 def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str, Any]:
     """
-    Return how often and how well neighbours were measured, from the tables of ``frame_errors``.
+    Return how often and how well neighbors were measured, from the tables of ``frame_errors``.
 
-    Images count once for each neighbour. ``recall`` is the share with an estimate, of those in
+    Images count once for each neighbor. ``recall`` is the share with an estimate, of those in
     which the truth has a marker in view, or of all without a truth. Errors are over all
     images with an estimate and truth; ``velocity_rms_m_s`` and ``velocity_bias_m_s`` leave out
     estimates whose velocity is more uncertain than ``max_velocity_std``, m/s, as the first one of

@@ -37,15 +37,16 @@ import numpy as np
 from flock_desk.scenarios.scenario import LeaderMotion, Scenario, Wind
 from flock_follower.geometry import Array
 
-STEP = 1.0 / 120.0  # s
-TURN_GAIN, TURN_RATE = 2.0, 1.0  # 1/s and rad/s, of a leader that faces away from the follower
+COURSE_STEP = 1.0 / 120.0  # s
+TURN_GAIN = 2.0  # 1/s, of the yaw of a leader that faces away from the follower
+TURN_RATE = 1.0  # rad/s, of that yaw, at most
 Stretch = tuple[float, float, float, float]  # duration, s; forward, left and up, m/s
 _SLACK = 1.02  # factor on the bound on the acceleration: sampling adds to it
 
 
 @dataclass(frozen=True)
 class Course:
-    """Position, velocity, acceleration (n, 3) in ENU and heading (n,), every STEP from 0 on."""
+    """Position, velocity, acceleration (n, 3) in ENU, heading (n,), each COURSE_STEP from 0 on."""
 
     positions: Array
     velocities: Array
@@ -59,7 +60,7 @@ class Course:
         Beyond the end they are those of the end.
         """
         last = len(self.positions) - 1
-        share, whole = math.modf(min(max(time / STEP, 0.0), float(last)))
+        share, whole = math.modf(min(max(time / COURSE_STEP, 0.0), float(last)))
         i, k = int(whole), min(int(whole) + 1, last)
         position, velocity, acceleration = (
             (1.0 - share) * a[i] + share * a[k]
@@ -89,20 +90,20 @@ def course(scenario: Scenario, run: int) -> Course:
     motion, rng = scenario.leader, scenario.random(run, 'leader')
     distance = rng.uniform(*scenario.start.distance)
     bearing = rng.uniform(*scenario.start.bearing)
-    count = round(scenario.duration / STEP) + 1
-    times = np.maximum(np.arange(count) * STEP - motion.wait, 0.0)
+    count = round(scenario.duration / COURSE_STEP) + 1
+    times = np.maximum(np.arange(count) * COURSE_STEP - motion.wait, 0.0)
     speed = motion.speed[0] if motion.speed[0] == motion.speed[1] else float(
         scenario.random(run, 'leader speed').uniform(*motion.speed))
     v = _MOTIONS[motion.motion](motion, speed, times, rng)
     c, s = math.cos(bearing), math.sin(bearing)
     v[:, :2] = v[:, :2] @ np.array([[c, s], [-s, c]])
-    a = np.gradient(v, STEP, axis=0)
+    a = np.gradient(v, COURSE_STEP, axis=0)
     greatest = float(np.sqrt(np.max(np.sum(a * a, axis=1))))
     if greatest > _SLACK * motion.acceleration:
         raise ValueError(f'leader: needs {greatest:.2f} m/s^2: must be at most acceleration = '
                          f'{motion.acceleration:g} m/s^2 (slower, or a larger size)')
     p = np.zeros_like(v)
-    p[1:] = np.cumsum(0.5 * STEP * (v[1:] + v[:-1]), axis=0)
+    p[1:] = np.cumsum(0.5 * COURSE_STEP * (v[1:] + v[:-1]), axis=0)
     headings: Array = np.zeros(count)  # 'away' is turned by the simulation
     if motion.heading == 'course':
         moving = np.hypot(v[:, 0], v[:, 1]) > 0.05
@@ -121,7 +122,7 @@ def _smoothed(values: Array, step: float, motion: LeaderMotion) -> Array:
 
 def _averaged(values: Array, window: float) -> Array:
     """Return values (n, ...), each averaged with those before it in a window, s."""
-    width = max(round(window / STEP), 1)
+    width = max(round(window / COURSE_STEP), 1)
     total = np.cumsum(np.concatenate([np.repeat(values[:1], width, axis=0), values]), axis=0)
     averaged: Array = (total[width:] - total[:-width]) / width
     return averaged
@@ -147,7 +148,7 @@ def _speed(motion: LeaderMotion, speed: float, times: Array) -> Array:
 def _circle(motion: LeaderMotion, speed: float, times: Array,
             rng: np.random.Generator) -> Array:
     speeds = _speed(motion, speed, times)
-    angle = rng.choice([-1.0, 1.0]) * np.cumsum(speeds) * STEP / motion.size
+    angle = rng.choice([-1.0, 1.0]) * np.cumsum(speeds) * COURSE_STEP / motion.size
     return speeds[:, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
 
 
@@ -155,7 +156,7 @@ def _figure_eight(motion: LeaderMotion, speed: float, times: Array,
                   rng: np.random.Generator) -> Array:
     # Gerono's lemniscate x = A sin u, y = A sin u cos u is fastest in its middle: A u' sqrt(2).
     rate = _speed(motion, speed, times) / (math.sqrt(2.0) * motion.size)
-    u = np.cumsum(rate) * STEP
+    u = np.cumsum(rate) * COURSE_STEP
     along = motion.size * rate * np.cos(u)
     across = motion.size * rate * np.cos(2.0 * u) * rng.choice([-1.0, 1.0])
     return np.stack([along, across, np.zeros_like(u)], axis=1)

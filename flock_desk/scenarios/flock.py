@@ -112,7 +112,7 @@ class Place(NamedTuple):
     offset: Array
     """(3,), from the leader, which faces along x, m."""
     ahead: int
-    """Number of the vehicle that it faces, its neighbour; 0 is the leader."""
+    """Number of the vehicle that it faces, its neighbor; 0 is the leader."""
 
 
 def places(flock: Flock) -> list[Place]:

@@ -34,11 +34,11 @@ from flock_follower.settings import refuse
 
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
-SEEDS = Range(0, 2**31 - 1, whole=True)
+SEED_RANGE = Range(0, 2**31 - 1, whole=True)
 #: For which a scenario is flown; 0: its own duration.
 DURATIONS = Range(0.0, 3600.0, 's')
 OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
-ENGAGED = 1.0  # s: when the planner is engaged, unless an operation does it
+ENGAGE_TIME = 1.0  # s: when the planner is engaged, unless an operation does it
 _ALONE = Flock(followers=1)
 MOTIONS = ('legs', 'circle', 'figure_eight', 'wander', 'spline', 'random_walk', 'stairs',
            'approach')
@@ -282,7 +282,7 @@ class FlightParams(Part):
     v_max: float = 0.5
     altitude_min: float = parameter(
         0.0, None,
-        'm above the ground by the odometry, whose height drifts by half a metre in ten minutes.')
+        'm above the ground by the odometry, whose height drifts by half a meter in ten minutes.')
     altitude_max: float = parameter(
         PlannerParams.altitude_max, None, 'm above the same.')
     relative_flight: bool = parameter(
@@ -319,7 +319,7 @@ class Scenario(Part):
     outages: tuple[Outage, ...] = ()
     prints: tuple[Print, ...] = ()
     operations: tuple[Operation, ...] = parameter(
-        (), None, 'None: in the air and in offboard mode from the start, engaged at ENGAGED.')
+        (), None, 'None: in the air and in offboard mode from the start, engaged at ENGAGE_TIME.')
     flock: Flock | None = parameter(None, None, 'None: one follower.')
 
     def __post_init__(self) -> None:

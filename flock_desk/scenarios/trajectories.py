@@ -48,20 +48,21 @@ from flock_follower.geometry import (
 from flock_follower.planner.limits import limit_command
 
 #: Time between samples of a track, s.
-STEP = 0.005
+TRACK_STEP = 0.005
 #: Height of both vehicles above the ground at the start, m.
-HEIGHT = 1.6
+START_HEIGHT = 1.6
 
 _GRAVITY = 9.81
 _DRAG = 0.25  # specific drag of a small quadrotor, 1/s: it leans forward to keep its speed
 _PERIOD = 20  # steps between commands: 10 Hz
 _FLIGHT = FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
-_A_MAX, _V_MAX = 2.5, 2.0
+_A_MAX = 2.5  # m/s^2
+_V_MAX = 2.0  # m/s
 
 
 @dataclass(frozen=True)
 class Track:
-    """The motion of one vehicle, sampled every STEP from time 0 on."""
+    """The motion of one vehicle, sampled every TRACK_STEP from time 0 on."""
 
     positions: Array
     """(N, 3), m, odom frame."""
@@ -77,7 +78,7 @@ class Track:
     def pose(self, time: float) -> Transform:
         """Return base_link in odom at a time within the track, s: cubic Hermite and slerp."""
         i, f = self._locate(time)
-        p, v = self.positions[i:i + 2], self.velocities[i:i + 2] * STEP
+        p, v = self.positions[i:i + 2], self.velocities[i:i + 2] * TRACK_STEP
         position = (p[0] + f * v[0] + f**2 * (3 * (p[1] - p[0]) - 2 * v[0] - v[1])
                     + f**3 * (2 * (p[0] - p[1]) + v[0] + v[1]))
         return Transform.from_quaternion(
@@ -96,8 +97,8 @@ class Track:
         return (1.0 - f) * values[i] + f * values[i + 1]
 
     def _locate(self, time: float) -> tuple[int, float]:
-        i = min(int(time / STEP), len(self.positions) - 2)
-        return i, time / STEP - i
+        i = min(int(time / TRACK_STEP), len(self.positions) - 2)
+        return i, time / TRACK_STEP - i
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> tuple[Tra
     :param seed: of the buffeting of their attitudes.
     :param swing: the distance that the follower keeps, instead of obeying the flocking law.
     """
-    times, rng = np.arange(round(duration / STEP) + 1) * STEP, np.random.default_rng(seed)
+    times = np.arange(round(duration / TRACK_STEP) + 1) * TRACK_STEP
+    rng = np.random.default_rng(seed)
     p, v, a, heading = leader_course(times)
     return (_track(p, v, a, heading, _buffeting(times, rng)),
             _track(*_follow(p, v, heading, swing), _buffeting(times, rng)))
@@ -156,14 +158,14 @@ def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:
     step = times[1] - times[0]
     p = np.zeros_like(v)
     p[1:] = np.cumsum(0.5 * step * (v[1:] + v[:-1]) - step**2 / 12 * (a[1:] - a[:-1]), axis=0)
-    start = [1.96 * c[0], 1.96 * s[0], HEIGHT]
+    start = [1.96 * c[0], 1.96 * s[0], START_HEIGHT]
     return _rounded(p + start), _rounded(v), _rounded(a), _rounded(heading)
 
 
 def _follow(leader_p: Array, leader_v: Array, headings: Array,
             swing: Swing | None) -> tuple[Array, Array, Array, Array]:
     """Return the follower's positions, velocities, accelerations and yaws."""
-    p: Array = np.array([0.0, 0.0, HEIGHT])
+    p: Array = np.array([0.0, 0.0, START_HEIGHT])
     v, a, jerk = (_rounded(np.zeros(3)) for _ in range(3))
     yaw, yaw_rate = float(headings[0]), 0.0
     states = []
@@ -172,19 +174,20 @@ def _follow(leader_p: Array, leader_v: Array, headings: Array,
         if i % _PERIOD == 0:
             offset, difference = target_p - p, target_v - v
             wanted = (acceleration([offset], [difference], _FLIGHT) if swing is None else
-                      _keeping(offset, difference, *swing.at(i * STEP)))
+                      _keeping(offset, difference, *swing.at(i * TRACK_STEP)))
             # The law does not mind where around its leader it flies; the marker is on the tail.
             left = np.array([-np.sin(heading), np.cos(heading), 0.0])
             wanted += left * (left @ (0.3 * offset + 0.2 * difference))
-            wanted[2] = 4.0 * (HEIGHT - p[2]) - 4.0 * v[2]
-            command = limit_command(wanted, v, _A_MAX, _V_MAX, _PERIOD * STEP).acceleration
+            wanted[2] = 4.0 * (START_HEIGHT - p[2]) - 4.0 * v[2]
+            command = limit_command(wanted, v, _A_MAX, _V_MAX, _PERIOD * TRACK_STEP).acceleration
             bearing = float(np.arctan2(offset[1], offset[0]))
         # Attitude loops: acceleration follows like a 2nd-order lag of 10 rad/s, yaw of 5 rad/s.
-        jerk = jerk + STEP * (100.0 * (command - a) - 18.0 * jerk)
-        yaw_rate += STEP * (25.0 * wrap_angle(bearing - yaw) - 9.0 * yaw_rate)
-        a, v, p = (_rounded(a + STEP * jerk), _rounded(v + STEP * a),
-                   _rounded(p + STEP * v + 0.5 * STEP**2 * a))
-        jerk, yaw_rate, yaw = _rounded(jerk), round(yaw_rate, 7), round(yaw + STEP * yaw_rate, 7)
+        jerk = jerk + TRACK_STEP * (100.0 * (command - a) - 18.0 * jerk)
+        yaw_rate += TRACK_STEP * (25.0 * wrap_angle(bearing - yaw) - 9.0 * yaw_rate)
+        a, v, p = (_rounded(a + TRACK_STEP * jerk), _rounded(v + TRACK_STEP * a),
+                   _rounded(p + TRACK_STEP * v + 0.5 * TRACK_STEP**2 * a))
+        jerk, yaw_rate, yaw = _rounded(jerk), round(yaw_rate,
+                                                    7), round(yaw + TRACK_STEP * yaw_rate, 7)
     columns = [np.array(column) for column in zip(*states)]
     return columns[0], columns[1], columns[2], columns[3]
 
@@ -232,8 +235,8 @@ def _buffeting(times: Array, rng: np.random.Generator) -> Array:
 def _angular_velocities(quaternions: Array) -> Array:
     """Return the body rates (N, 3), rad/s, by central differences."""
     padded = np.concatenate([quaternions[:1], quaternions, quaternions[-1:]])
-    steps = np.full(len(quaternions), 2.0 * STEP)
-    steps[[0, -1]] = STEP
+    steps = np.full(len(quaternions), 2.0 * TRACK_STEP)
+    steps[[0, -1]] = TRACK_STEP
     return np.array([quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before), after)) / step
         for before, after, step in zip(padded[:-2], padded[2:], steps)])

@@ -35,14 +35,14 @@ from flock_desk.vehicles.flight_controller import (
     ACCEPTED,
     decode_setpoint,
     FlightController,
-    IDLE,
+    IDLE_ACCELERATION,
     POSITION_GAIN,
 )
 from flock_desk.vehicles.profiles import ARDUCOPTER, LAND
 from flock_follower.geometry import Array
 
 _CHECK_TIME: Final[float] = 0.8
-_LANDED: Final[float] = 1.0  # s on the ground that count as a landing
+_LANDING_TIME: Final[float] = 1.0  # s on the ground that count as a landing
 _STOP_ACCELERATION: Final[float] = 2.5  # m/s^2, WPNAV_ACCEL
 
 
@@ -103,9 +103,9 @@ class ArduCopter(FlightController):
             self.in_failsafe = False
 
     def _control(self, now: float, dt: float) -> Array:
-        if self.vehicle.landed and now - self._landed_since >= _LANDED:
+        if self.vehicle.landed and now - self._landed_since >= _LANDING_TIME:
             self._flown = False
-        return super()._control(now, dt) if self._flown or self.taking_off else IDLE
+        return super()._control(now, dt) if self._flown or self.taking_off else IDLE_ACCELERATION
 
     def _detect_ground(self, wanted: Array, dt: float) -> None:
         self.on_ground = not self._flown
@@ -121,12 +121,12 @@ class ArduCopter(FlightController):
         self._velocity = self._velocity + forward * dt
         self._position = self._position + self._velocity * dt
         if not np.all(np.isfinite([self._velocity, self._position])):
-            # A real one does not refuse NaN; its behaviour then is undefined. This one lets the
+            # A real one does not refuse NaN; its behavior then is undefined. This one lets the
             # motors idle and falls, so that no test overlooks it.
-            return IDLE
+            return IDLE_ACCELERATION
         towards = POSITION_GAIN * (self._position - self.estimator.position)
         return forward + self._track(self._velocity + towards)
 
     @property
     def _disarms_after(self) -> float:
-        return _LANDED if self._flies == LAND else self.parameters['DISARM_DELAY']
+        return _LANDING_TIME if self._flies == LAND else self.parameters['DISARM_DELAY']

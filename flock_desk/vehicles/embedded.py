@@ -19,7 +19,7 @@ Fly it in simulated time beside a bridge, in one process::
 
     autopilot = EmbeddedAutopilot('arducopter', now=0.0, start='landed', ready_after=0.5)
     autopilot.receive(data, now)
-    for data in autopilot.step(now): ...   # every STEP
+    for data in autopilot.step(now): ...   # every STEP_TIME
 """
 
 from __future__ import annotations
@@ -46,14 +46,15 @@ from flock_follower.geometry import (
     quaternion_enu_flu_to_ned_frd,
 )
 
-STEP: Final[float] = 0.01  # s
+STEP_TIME: Final[float] = 0.01  # s
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')
 #: PX4 sends CURRENT_MODE at the most every so many seconds while the mode stays.
 CURRENT_MODE_PERIOD: Final[float] = 0.5
 CURRENT = 18.0  # A
 _LONGEST_WAY: Final[int] = 1_000_000_000  # ns from a TIMESYNC question to its answer
 _CELLS = 4
-LATITUDE, LONGITUDE = 47.397742, 8.545594  # degrees, of the local origin
+ORIGIN_LATITUDE = 47.397742  # degrees, of the local origin
+ORIGIN_LONGITUDE = 8.545594  # degrees, of the local origin
 DEGREE: Final[float] = 111_320.0  # m along a meridian
 _NO_PARAMETERS: Final[Mapping[str, float]] = MappingProxyType({})
 _NAMES: Final[Mapping[int, str]] = {
@@ -107,7 +108,7 @@ class EmbeddedAutopilot:
     @property
     def next_step(self) -> float:
         """Return the time, s, of the next step."""
-        return self._start + self._steps * STEP
+        return self._start + self._steps * STEP_TIME
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
         """Take bytes that have arrived, and return the datagrams to send at once."""
@@ -119,12 +120,12 @@ class EmbeddedAutopilot:
         return answers
 
     def step(self, now: float) -> list[bytes]:
-        """Fly on to ``now``, a STEP after the last, and return the datagrams to send."""
+        """Fly on to ``now``, a STEP_TIME after the last, and return the datagrams to send."""
         self._steps += 1
         messages = []
         vehicle, controller = self.vehicle, self.controller
         if now < self._silent_until:
-            vehicle.step((0.0, 0.0, 0.0), vehicle.yaw, STEP, powered=False)
+            vehicle.step((0.0, 0.0, 0.0), vehicle.yaw, STEP_TIME, powered=False)
         else:
             controller.step(now)
             messages = self._due_messages(now)
@@ -169,7 +170,7 @@ class EmbeddedAutopilot:
             case 'SET_POSITION_TARGET_LOCAL_NED':
                 controller.on_setpoint(message, now)
             case 'ODOMETRY':
-                # Before the sender's clock is learnt it is new.
+                # Before the sender's clock is learned it is new.
                 controller.estimator.on_odometry(
                     message, now, 0.0 if self._clock_offset is None else
                     now - self._booted - message.time_usec * 1e-6 - self._clock_offset)
@@ -187,7 +188,8 @@ class EmbeddedAutopilot:
 
     def _origin(self, now: float) -> Any:
         return mavlink.MAVLink_gps_global_origin_message(
-            round(LATITUDE * 1e7), round(LONGITUDE * 1e7), 0, self._boot_ms(now) * 1000)
+            round(ORIGIN_LATITUDE * 1e7), round(ORIGIN_LONGITUDE * 1e7), 0,
+            self._boot_ms(now) * 1000)
 
     def _answer_timesync(self, message: Any, now: float) -> list[Any]:
         # Zero would turn an answer into a request, and both ends would answer for ever.
@@ -207,7 +209,7 @@ class EmbeddedAutopilot:
             delay = self._intervals[shown_by] if self._profile.px4 else 0.0
             self._due[shown_by] = min(self._due[shown_by], now + delay)
         for message_id, due in self._due.items():
-            if now >= due - 0.5 * STEP:
+            if now >= due - 0.5 * STEP_TIME:
                 name = _NAMES[message_id]
                 if fields := self._status(name, now) or self._motion(name, now):
                     messages.append(mavlink.mavlink_map[message_id](*fields))
@@ -265,7 +267,7 @@ class EmbeddedAutopilot:
         fixed = self._profile.px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         if message_id not in self._intervals or not microseconds > 0.0 or fixed:
             return self._profile.unknown_message
-        self._intervals[int(message_id)] = max(microseconds * 1e-6, STEP)
+        self._intervals[int(message_id)] = max(microseconds * 1e-6, STEP_TIME)
         self._due[int(message_id)] = now
         return ACCEPTED
 
@@ -338,6 +340,7 @@ class EmbeddedAutopilot:
 def global_position(position: Array) -> tuple[int, int, int]:
     """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a local position (3,)."""
     east, north, up = position.tolist()
-    across = DEGREE * math.cos(math.radians(LATITUDE))
-    return (round((LATITUDE + north / DEGREE) * 1e7), round((LONGITUDE + east / across) * 1e7),
+    across = DEGREE * math.cos(math.radians(ORIGIN_LATITUDE))
+    return (round((ORIGIN_LATITUDE + north / DEGREE) * 1e7),
+            round((ORIGIN_LONGITUDE + east / across) * 1e7),
             round((up + GROUND_AMSL) * 1e3))

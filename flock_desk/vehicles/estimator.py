@@ -139,9 +139,12 @@ SEA_LEVEL: Final[float] = 1013.25
 _TEMPERATURE: Final[float] = 288.15  # K at the mean sea level ...
 _LAPSE: Final[float] = 0.0065  # ... and how much less 1 m higher
 _EXPONENT: Final[float] = 5.25588  # of the international standard atmosphere below 11 km
-#: Of a barometer: standard deviations, m, of the white noise of its height and of its drift,
-#: which is zero at the start, and the time constant of that, s.
-NOISE, DRIFT, DRIFT_TIME = 0.05, 0.1, 300.0
+#: Standard deviation of the white noise of a barometer's height, m.
+BAROMETER_NOISE = 0.05
+#: Standard deviation of its drift, m, which is zero at the start.
+BAROMETER_DRIFT = 0.1
+#: Time constant of its drift, s.
+BAROMETER_DRIFT_TIME = 300.0
 
 
 class Barometer:
@@ -159,10 +162,11 @@ class Barometer:
     def heights(self, true: Array, now: float) -> Array:
         """Return the heights, (n,), m, measured at a time, s, of true ones (n,), m."""
         drawn = np.stack([g.standard_normal(2) for g in self._generators])
-        keep = 1.0 if self._time is None else math.exp(-(now - self._time) / DRIFT_TIME)
+        keep = 1.0 if self._time is None else math.exp(-(now - self._time) / BAROMETER_DRIFT_TIME)
         self._time = now
-        self._drift = keep * self._drift + DRIFT * math.sqrt(1.0 - keep ** 2) * drawn[:, 0]
-        measured: Array = true + self._drift + NOISE * drawn[:, 1]
+        self._drift = keep * self._drift + BAROMETER_DRIFT * math.sqrt(1.0 - keep ** 2) * drawn[:,
+                                                                                                0]
+        measured: Array = true + self._drift + BAROMETER_NOISE * drawn[:, 1]
         return measured
 
 

@@ -50,11 +50,12 @@ _VISION_HEALTHY: Final[float] = 0.3
 _AIDED: Final[float] = 0.55  # s without vision until PX4 compares its estimate with none
 ARRIVED: Final[float] = 0.1  # m below the take-off altitude
 #: The acceleration, m/s^2, for which motors idle.
-IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
+IDLE_ACCELERATION: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
-#: Of a type mask: the bits of position, velocity, acceleration and force, and those that ignore
-#: all but the acceleration.
-_WHICH, _ACCELERATION = 0x3FF, 0x03F
+#: Bits of a type mask for position, velocity, acceleration and force.
+_QUANTITY_BITS = 0x3FF
+#: Those of them that ignore all but the acceleration.
+_IGNORED_BITS = 0x03F
 #: ArduCopter's text for a condition that is not met.
 _REASONS: Final = {'permission': '{denial}', 'vision': 'VisOdom: not healthy',
                    'armable': '{mode} mode not armable', 'position': 'Need Position Estimate'}
@@ -74,7 +75,8 @@ def decode_setpoint(message: Any) -> FlownSetpoint | None:
     Setpoints of position, velocity and yaw rate, which the bridge never sends, are not simulated.
     """
     mask = message.type_mask
-    if message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED or mask & _WHICH != _ACCELERATION:
+    if (message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED
+            or mask & _QUANTITY_BITS != _IGNORED_BITS):
         return None
     yaw = not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE and math.isfinite(message.yaw)
     return FlownSetpoint(ned_to_enu([message.afx, message.afy, message.afz]),

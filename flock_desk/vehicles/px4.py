@@ -41,7 +41,7 @@ from flock_desk.vehicles.flight_controller import (
     ACCEPTED,
     decode_setpoint,
     FlightController,
-    IDLE,
+    IDLE_ACCELERATION,
 )
 from flock_desk.vehicles.profiles import LAND, PX4
 from flock_follower.geometry import Array, GRAVITY
@@ -151,7 +151,7 @@ class Px4(FlightController):
     def _control(self, now: float, dt: float) -> Array:
         self._step_takeoff(now, dt)
         self._climb_limit = _RAMP_START + max(self._ramp, 0.0) * (_CLIMB_MAX - _RAMP_START)
-        return super()._control(now, dt) if self._ramp >= 0.0 else IDLE
+        return super()._control(now, dt) if self._ramp >= 0.0 else IDLE_ACCELERATION
 
     def _step_takeoff(self, now: float, dt: float) -> None:
         self._armed_for = self._armed_for + dt if self.armed else 0.0

@@ -29,14 +29,16 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, GRAVITY, matrix_to_quaternion, matrix_to_rotation_vector
 
-_UP: Final[Array] = np.array([0.0, 0.0, 1.0])
+_UP_ENU: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 
 # Dynamics of a 250 mm to 450 mm quadrotor on PX4.
-ATTITUDE_TIME, THRUST_TIME = 0.15, 0.05  # s, time constants of tilting and of the thrust
-TILT_MAX = math.radians(45.0)
+ATTITUDE_TIME = 0.15  # s, time constant of tilting
+THRUST_TIME = 0.05  # s, time constant of the thrust
+TILT_MAX = math.radians(45.0)  # rad
 THRUST_MAX = 2.0 * GRAVITY  # m/s^2, specific
-YAW_GAIN, YAW_RATE_MAX = 2.8, math.radians(60.0)  # yaw rate for a yaw error, 1/s, and its limit
+YAW_GAIN = 2.8  # 1/s, yaw rate for a yaw error
+YAW_RATE_MAX = math.radians(60.0)  # rad/s
 DRAG = 0.1  # 1/s, deceleration for a speed through the air
 THRUST_ERROR = 0.008  # m/s^2, of the hover thrust: without height control it climbs 0.9 m in 15 s
 
@@ -58,7 +60,7 @@ class Quadrotor:
         self.velocity: Array = np.zeros_like(self.position)
         self.acceleration: Array = np.zeros_like(self.position)
         self.yaw: Any = _wrapped(np.asarray(yaw, dtype=float))
-        self.axis: Array = np.zeros_like(self.position) + _UP
+        self.axis: Array = np.zeros_like(self.position) + _UP_ENU
         """The body's z axis in ENU."""
         self.thrust: Any = np.where(self.position[..., 2] > 0.0, GRAVITY, 0.0)
         self.thrust_error: Any = THRUST_ERROR
@@ -101,7 +103,7 @@ class Quadrotor:
         thrust, tilt = self._nominal(np.asarray(acceleration, dtype=float))
         if not powered:
             thrust = np.zeros_like(thrust)
-        tilt = np.where(landed[..., None], _UP, tilt)
+        tilt = np.where(landed[..., None], _UP_ENU, tilt)
         self.thrust = self.thrust + (thrust - self.thrust) * -math.expm1(
             -dt / THRUST_TIME)
         self.axis = _turn(self.axis, tilt, -math.expm1(-dt / ATTITUDE_TIME))
@@ -112,7 +114,7 @@ class Quadrotor:
         self._move(dt, powered, landed, np.asarray(wind, dtype=float))
 
     def _nominal(self, acceleration: Array) -> tuple[Array, Array]:
-        force: Array = acceleration + GRAVITY * _UP
+        force: Array = acceleration + GRAVITY * _UP_ENU
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = np.maximum(force[..., 2], 0.1 * GRAVITY)
         level = np.hypot(force[..., 0], force[..., 1])
@@ -125,7 +127,7 @@ class Quadrotor:
     def _move(self, dt: float, powered: bool, landed: Any, wind: Array) -> None:
         force = self.thrust[..., None] * self.axis
         error = np.asarray(self.thrust_error if powered else 0.0)
-        acceleration = (force + (error - GRAVITY)[..., None] * _UP
+        acceleration = (force + (error - GRAVITY)[..., None] * _UP_ENU
                         - DRAG * (self.velocity - wind))
         # On the ground it stays until the thrust clearly exceeds its weight.
         flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]

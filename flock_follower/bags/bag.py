@@ -15,7 +15,7 @@
 """
 Read bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
 
-Whatever the format, a reader gets ROS 2 Jazzy types serialised as CDR. ROS 2 messages pass
+Whatever the format, a reader gets ROS 2 Jazzy types serialized as CDR. ROS 2 messages pass
 through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
 to ``builtin_interfaces``, fields in lower case, as ``CameraInfo``'s D, K, R, P).
 Every failure is a :class:`BagError` whose message is one line. Damage inside a message shows only
@@ -50,7 +50,7 @@ class BagError(ValueError):
 
 
 class BagMessage(NamedTuple):
-    """One message: its topic, ROS 2 type, recording time [ns] and serialised CDR bytes."""
+    """One message: its topic, ROS 2 type, recording time [ns] and serialized CDR bytes."""
 
     topic: str
     msgtype: str
@@ -316,7 +316,7 @@ def _unreadable(connections: list[Connection]) -> str | None:
     for connection in connections:
         if not isinstance(connection.ext, ConnectionExtRosbag1):
             if connection.ext.serialization_format != 'cdr':
-                return f'serialised as {connection.ext.serialization_format!r}, not CDR'
+                return f'serialized as {connection.ext.serialization_format!r}, not CDR'
         elif reason := migration_obstacle(connection.msgtype, connection.msgdef.data):
             return reason
     return None

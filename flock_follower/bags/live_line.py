@@ -21,7 +21,8 @@ import shutil
 import sys
 from typing import TextIO
 
-TERMINAL_PERIOD, LOG_PERIOD = 0.1, 5.0  # s between lines
+TERMINAL_PERIOD = 0.1  # s between lines on a terminal
+LOG_PERIOD = 5.0  # s between lines in a log
 
 
 class LiveLine:

@@ -42,8 +42,16 @@ from flock_follower.whole_file import whole_file
 
 #: The first and the last bytes of every MCAP file.
 MCAP_MAGIC = b'\x89MCAP0\r\n'
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
-_MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 0x07, 0x08, 0x0B, 0x0F
+_OP_HEADER = 0x01
+_OP_FOOTER = 0x02
+_OP_SCHEMA = 0x03
+_OP_CHANNEL = 0x04
+_OP_MESSAGE = 0x05
+_OP_CHUNK = 0x06
+_OP_MESSAGE_INDEX = 0x07
+_OP_CHUNK_INDEX = 0x08
+_OP_STATISTICS = 0x0B
+_OP_DATA_END = 0x0F
 #: The file in a bag's folder until the bag is finished.
 MARK = 'INCOMPLETE.txt'
 METADATA = 'metadata.yaml'
@@ -96,10 +104,11 @@ class McapFile:
         self.start_ns = self.end_ns = 0
         self._channels: dict[RecordedTopic, int] = {}
         # What the summary repeats, in the order in which it does.
-        self._summary: dict[int, list[bytes]] = {_SCHEMA: [], _CHANNEL: [], _CHUNK_INDEX: []}
+        self._summary: dict[int, list[bytes]] = {_OP_SCHEMA: [], _OP_CHANNEL: [],
+                                                 _OP_CHUNK_INDEX: []}
         self._file = path.open('xb', buffering=0)
         try:
-            self._append(MCAP_MAGIC + _record(_HEADER, _text('ros2'), _text('flock_follower')))
+            self._append(MCAP_MAGIC + _record(_OP_HEADER, _text('ros2'), _text('flock_follower')))
         except OSError:
             self._file.close()
             path.unlink()
@@ -122,19 +131,19 @@ class McapFile:
             channel = self._channels.get(topic) or self._introduce(topic, content)
             entries.setdefault(channel, bytearray()).extend(
                 struct.pack('<QQ', stamp, len(content)))
-            content += _record(_MESSAGE, struct.pack('<HIQQ', channel, 0, stamp, stamp), data)
+            content += _record(_OP_MESSAGE, struct.pack('<HIQQ', channel, 0, stamp, stamp), data)
         span, size = struct.pack('<QQ', first, last), struct.pack('<Q', len(content))
-        chunk = _record(_CHUNK, span, size, struct.pack('<I', zlib.crc32(content)), _text(''),
+        chunk = _record(_OP_CHUNK, span, size, struct.pack('<I', zlib.crc32(content)), _text(''),
                         size, content)
         places, index = bytearray(), bytearray()
         for channel, entry in entries.items():
             places += struct.pack('<HQ', channel, self.size + len(chunk) + len(index))
-            index += _record(_MESSAGE_INDEX, struct.pack('<H', channel), _sized(entry))
+            index += _record(_OP_MESSAGE_INDEX, struct.pack('<H', channel), _sized(entry))
         chunk_index = _record(
-            _CHUNK_INDEX, span, struct.pack('<QQ', self.size, len(chunk)), _sized(places),
+            _OP_CHUNK_INDEX, span, struct.pack('<QQ', self.size, len(chunk)), _sized(places),
             struct.pack('<Q', len(index)), _text(''), size, size)
         self._append(chunk + index)
-        self._summary[_CHUNK_INDEX].append(chunk_index)
+        self._summary[_OP_CHUNK_INDEX].append(chunk_index)
         self.start_ns = min(self.start_ns, first) if self.counts else first
         self.end_ns = max(self.end_ns, last)
         self.counts.update(message.topic for message in messages)
@@ -169,25 +178,25 @@ class McapFile:
         qos = _text('offered_qos_profiles') + _text(json.dumps(topic.qos))
         source = _text('source') + _text(topic.source) if topic.source else b''
         for kind, record in (
-                (_SCHEMA, _record(_SCHEMA, struct.pack('<H', number), _text(topic.msgtype),
+                (_OP_SCHEMA, _record(_OP_SCHEMA, struct.pack('<H', number), _text(topic.msgtype),
                                   _text('ros2msg'), _text(definition(topic.msgtype)))),
-                (_CHANNEL, _record(_CHANNEL, struct.pack('<HH', number, number),
+                (_OP_CHANNEL, _record(_OP_CHANNEL, struct.pack('<HH', number, number),
                                    _text(topic.name), _text('cdr'), _sized(qos + source)))):
             self._summary[kind].append(record)
             content += record
         return number
 
     def _end(self) -> bytes:
-        end = _record(_DATA_END, struct.pack('<I', 0))
+        end = _record(_OP_DATA_END, struct.pack('<I', 0))
         start = self.size + len(end)
         counts = b''.join(struct.pack('<HQ', self._channels[topic], count)
                           for topic, count in self.counts.items())
         statistics = _record(
-            _STATISTICS, struct.pack(
+            _OP_STATISTICS, struct.pack(
                 '<QHIIIIQQ', self.counts.total(), len(self._channels), len(self._channels), 0, 0,
-                len(self._summary[_CHUNK_INDEX]), self.start_ns, self.end_ns), _sized(counts))
+                len(self._summary[_OP_CHUNK_INDEX]), self.start_ns, self.end_ns), _sized(counts))
         summary = b''.join(record for records in self._summary.values() for record in records)
-        footer = _record(_FOOTER, struct.pack('<QQI', start, 0, 0))
+        footer = _record(_OP_FOOTER, struct.pack('<QQI', start, 0, 0))
         return end + summary + statistics + footer + MCAP_MAGIC
 
 

@@ -29,7 +29,7 @@ BLACK_BOX = [
          'folder of the recordings, each in its own subfolder; empty: flock_follower/black_box in '
          '$ROS_HOME (~/.ros), with a subfolder for the namespace'),
     Spec('record_images', 'compressed',
-         'compressed: grey JPEG images, or those of the camera if it compresses itself; none: no '
+         'compressed: gray JPEG images, or those of the camera if it compresses itself; none: no '
          'images, so evaluate cannot use the recording', ('compressed', 'none')),
     Spec('image_transport', 'raw', 'the same as for relative_pose', ('raw', 'compressed')),
     Spec('disk_used', 8000.0,

@@ -40,14 +40,15 @@ from flock_follower.bags.mcap_file import (
     RecordedTopic,
     TakenMessage,
 )
-from flock_follower.bags.schedule import NANOSECONDS
+from flock_follower.bags.schedule import NS_PER_S
 from flock_follower.whole_file import whole_file
 
 #: The name of the folder of a recording; the group is its number.
 NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
 _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
 _CLOCK_STEP = 5.0  # s by which a clock may be set, back or ahead, within a recording
-_MEGABYTE = 1_000_000
+
+_BYTES_PER_MB = 1_000_000
 FILE_SIZE = 64.0  # MB, from which on the next file begins
 KEPT = 15  # the newest files, which are never deleted: at 1.5 MB/s the last 10 minutes
 
@@ -97,7 +98,7 @@ class FlightRecording:
         if not messages:
             return
         first = min(message.stamp_ns for message in messages)
-        before, self._ahead = self._ahead, first / NANOSECONDS - now
+        before, self._ahead = self._ahead, first / NS_PER_S - now
         if before is not None and abs(self._ahead - before) > _CLOCK_STEP:
             self._end()
         if now - self._looked >= _LOOK_PERIOD:
@@ -116,7 +117,7 @@ class FlightRecording:
             self._close_file()
             raise
         self._last = file.end_ns
-        if file.size >= FILE_SIZE * _MEGABYTE:
+        if file.size >= FILE_SIZE * _BYTES_PER_MB:
             self._close_file()
 
     def close(self) -> None:
@@ -143,7 +144,7 @@ class FlightRecording:
         """Return the file to write to."""
         if self.path is None:
             numbers = [int(path.name.partition('_')[0]) for path in self._recordings()]
-            began = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(stamp_ns // NANOSECONDS))
+            began = time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(stamp_ns // NS_PER_S))
             path = self.folder / f'{max(numbers, default=0) + 1:04d}_{began}'
             path.mkdir()
             mark_incomplete(path)
@@ -177,9 +178,9 @@ class FlightRecording:
         """
         files = [file for path in self._recordings() for file in mcap_files(path)]
         sizes = [file.stat().st_size for file in files]
-        used, least = sum(sizes), self._disk_free * _MEGABYTE
+        used, least = sum(sizes), self._disk_free * _BYTES_PER_MB
         for file, size in list(zip(files, sizes))[:-KEPT]:
-            if used <= self._disk_used * _MEGABYTE and _free(self.folder) >= least:
+            if used <= self._disk_used * _BYTES_PER_MB and _free(self.folder) >= least:
                 break
             with suppress(OSError):  # of another owner: the next one, then
                 self._delete(file)

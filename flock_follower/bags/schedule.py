@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from flock_follower.ranges import MAX_GAP
 
-NANOSECONDS = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
 class Section(NamedTuple):
@@ -42,11 +42,11 @@ def section(bag_start_ns: int, bag_end_ns: int, start: float, duration: float) -
 
     :raises ValueError: the bag ends before the part begins.
     """
-    length = (bag_end_ns - bag_start_ns) / NANOSECONDS
+    length = (bag_end_ns - bag_start_ns) / NS_PER_S
     if not 0.0 <= start <= length:
         raise ValueError(f'start = {start:g}: must be in [0, {length:g}] s, the length of the bag')
-    start_ns = bag_start_ns + round(start * NANOSECONDS)
-    last_ns = start_ns + round(duration * NANOSECONDS)
+    start_ns = bag_start_ns + round(start * NS_PER_S)
+    last_ns = start_ns + round(duration * NS_PER_S)
     return Section(start_ns, min(bag_end_ns + 1, last_ns) if duration else bag_end_ns + 1)
 
 
@@ -62,10 +62,10 @@ class Gaps:
         """Return the step before a message, s, negative if the clock went back; 0: no gap."""
         step_ns = 0 if self._last_ns is None else stamp_ns - self._last_ns
         self._last_ns = stamp_ns
-        if abs(step_ns) <= MAX_GAP * NANOSECONDS:
+        if abs(step_ns) <= MAX_GAP * NS_PER_S:
             return 0.0
         self.skipped_ns += step_ns
-        return step_ns / NANOSECONDS
+        return step_ns / NS_PER_S
 
 
 class Timeline:
@@ -87,13 +87,13 @@ class Timeline:
         """Return the bag time [ns] reached at ``now``."""
         if self.paused or now <= self._wall:
             return self._bag_ns
-        return self._bag_ns + int((now - self._wall) * self.rate * NANOSECONDS)
+        return self._bag_ns + int((now - self._wall) * self.rate * NS_PER_S)
 
     def due(self, stamp_ns: int) -> float:
         """Return the wall time [s] at which a stamp falls due; infinity while paused."""
         if self.paused:
             return math.inf
-        return self._wall + (stamp_ns - self._bag_ns) / (self.rate * NANOSECONDS)
+        return self._wall + (stamp_ns - self._bag_ns) / (self.rate * NS_PER_S)
 
     def change(self, now: float, rate: float, paused: bool) -> None:
         """Go on from the position of ``now``, at another rate, or pause there."""

@@ -24,7 +24,7 @@ WARNING: Final = 'warning'
 ERROR: Final = 'error'
 UNMEASURED: Final = 'not measured'
 #: A measured error counts if it exceeds so many of its deviations.
-SURE: Final = 3.0
+SIGNIFICANT_SIGMAS: Final = 3.0
 #: The system is not ready while one of these is unmeasured. All others may be measured later.
 ESSENTIAL: Final = frozenset({
     'images rate', 'odom rate', 'relative_pose status', 'planner status', 'mavlink_bridge status',

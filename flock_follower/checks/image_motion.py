@@ -45,16 +45,22 @@ from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 
-#: Width, px, to which images are scaled for the comparison; rows and columns of parts.
-WIDTH = 192
-ROWS, COLUMNS = 2, 3  # PARTS in all
+#: Width, px, to which images are scaled for the comparison.
+COMPARED_WIDTH = 192
+#: Rows of parts that an image is divided into.
+PART_ROWS = 2
+#: Columns of parts that an image is divided into.
+PART_COLUMNS = 3
 #: Least quality of a match, 0 to 1.
-RESPONSE = 0.05
-#: Number of pairs, and their RMS shift as a share of the focal length, needed for a result.
-FEW = 12
-LEAST = 0.003
-#: Largest time offset that is tried, and the step, s.
-FURTHEST, STEP = 0.2, 0.01
+MIN_RESPONSE = 0.05
+#: Number of pairs that a result needs.
+MIN_PAIRS = 12
+#: RMS shift of the pairs that a result needs, as a share of the focal length.
+MIN_SHIFT = 0.003
+#: Largest time offset that is tried, s.
+MAX_OFFSET = 0.2
+#: Step of the time offsets that are tried, s.
+OFFSET_STEP = 0.01
 #: The 24 rotations that lay axes onto axes, the identity first.
 _QUARTER_TURNS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
@@ -62,14 +68,20 @@ _QUARTER_TURNS = [matrix for p in permutations(range(3))
 
 #: Prior deviations of the mounting, rad, of the ratio of the shifts, and of 1 / depth of each
 #: part, 1/m.
-PRIOR = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (ROWS * COLUMNS)])
-#: Measured errors were up to so many times the deviations. The least deviation of the ratio. The
-#: deviation of 1 / depth, as a share of it. Turned by hand, the camera moves on an arc, which
-#: near walls looks like a longer focal length, unless it pitches by this share of its yaw.
-WIDENED, ZOOM_ERROR, DEPTHS, BOTH = 2.0, 0.03, 1.0, 0.2
-_PASSES, _FAR = 8, 2.0
+PRIOR_DEVIATIONS = np.array([0.5, 0.5, 0.5, 1.0, *[0.5] * (PART_ROWS * PART_COLUMNS)])
+#: Measured errors were up to this many times the deviations.
+ERROR_FACTOR = 2.0
+#: Least deviation of the ratio of focal lengths.
+ZOOM_ERROR = 0.03
+#: Deviation of 1 / depth, as a share of it.
+DEPTH_DEVIATION = 1.0
+#: Least pitch as a share of yaw: turned by hand, the camera moves on an arc, which looks like a
+#: longer focal length near walls, unless it pitches, too.
+MIN_PITCH_SHARE = 0.2
+_FIT_PASSES = 8  # reweighted fits
+_OUTLIER_SIGMAS = 2.0  # scale of the weights, in medians of the residuals
 #: s: between attitudes farther apart the rotation is unknown.
-LONGEST = 0.3
+MAX_GAP = 0.3
 
 
 class OwnPath:
@@ -93,7 +105,7 @@ class OwnPath:
         part = (times - stamps[after - 1]) / np.where(span > 0.0, span, 1.0)
         mixed = ((1.0 - part)[:, None] * self._quaternions[after - 1]
                  + part[:, None] * self._quaternions[after])
-        known = (part >= 0.0) & (part <= 1.0) & (span <= LONGEST)
+        known = (part >= 0.0) & (part <= 1.0) & (span <= MAX_GAP)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), known
 
     def motion(self, times: Array) -> tuple[Array, Array]:
@@ -104,11 +116,11 @@ class OwnPath:
 
 
 def small(image: GrayImage) -> Array:
-    """Return an image reduced to ``WIDTH`` px, the input of :func:`shift`."""
-    while image.shape[1] >= 2 * WIDTH:  # halving is the fastest
+    """Return an image reduced to ``COMPARED_WIDTH`` px, the input of :func:`shift`."""
+    while image.shape[1] >= 2 * COMPARED_WIDTH:  # halving is the fastest
         image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     height, width = image.shape
-    size = WIDTH, max(round(height * WIDTH / width), 16)
+    size = COMPARED_WIDTH, max(round(height * COMPARED_WIDTH / width), 16)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
@@ -119,13 +131,13 @@ def shift(before: Array, after: Array, width: int) -> Array:
     (PARTS, 3), the last column is the quality. A large shift of two windows at the same place is
     measured too small, so they are compared again with windows that are that far apart.
     """
-    found = np.zeros((ROWS * COLUMNS, 3))
+    found = np.zeros((PART_ROWS * PART_COLUMNS, 3))
     if before.shape != after.shape:
         return found
-    height, columns = before.shape[0] // ROWS, WIDTH // COLUMNS
+    height, columns = before.shape[0] // PART_ROWS, COMPARED_WIDTH // PART_COLUMNS
     window = cv2.createHanningWindow((columns, height), cv2.CV_32F)
-    last = np.array([WIDTH - columns, before.shape[0] - height])
-    for n, (row, column) in enumerate(product(range(ROWS), range(COLUMNS))):
+    last = np.array([COMPARED_WIDTH - columns, before.shape[0] - height])
+    for n, (row, column) in enumerate(product(range(PART_ROWS), range(PART_COLUMNS))):
         first = np.array([column * columns, row * height])
         for _ in range(2):
             second = np.clip(first + np.rint(found[n, :2]).astype(int), 0, last)
@@ -134,7 +146,7 @@ def shift(before: Array, after: Array, width: int) -> Array:
                         for image, (x, y) in ((before, first), (after, second)))
             more, quality = cv2.phaseCorrelate(old - old.mean(), new - new.mean(), window)
             found[n] = *(second - first + more), quality
-    return found * [width / WIDTH, width / WIDTH, 1.0]
+    return found * [width / COMPARED_WIDTH, width / COMPARED_WIDTH, 1.0]
 
 
 class AxesFit(NamedTuple):
@@ -170,17 +182,17 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
     :param up: (3,), the upward direction in base_link as configured: besides the identity only
         rotations that make it z are tried. None: it is z already, and all rotations are tried.
     """
-    every = np.array(shifts).reshape(-1, 2 + 3 * ROWS * COLUMNS)
+    every = np.array(shifts).reshape(-1, 2 + 3 * PART_ROWS * PART_COLUMNS)
     # The leader may fill one part, so the median stands for the image.
-    median = np.median(every[:, 2:].reshape(-1, ROWS * COLUMNS, 3), axis=1)
+    median = np.median(every[:, 2:].reshape(-1, PART_ROWS * PART_COLUMNS, 3), axis=1)
     rows = np.column_stack([every[:, :2], median[:, :2] / camera.matrix[0, 0], every[:, 2:]])[
-        median[:, 2] >= RESPONSE]
-    if len(rows) < FEW or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < LEAST:
+        median[:, 2] >= MIN_RESPONSE]
+    if len(rows) < MIN_PAIRS or np.sqrt(np.mean(np.sum(rows[:, 2:4]**2, axis=1))) < MIN_SHIFT:
         return None
     turns = np.array([turn for n, turn in enumerate(_QUARTER_TURNS)
                       if n == 0 or up is None or turn[2].dot(up) > 0.5])
     to_optical = turns.transpose(0, 2, 1) @ R_base_optical
-    offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
+    offsets = np.arange(-MAX_OFFSET, MAX_OFFSET + 1e-9, OFFSET_STEP)
     moves = [_turned(rows, path, offset) for offset in offsets.tolist()]
     shares = _shares(moves, to_optical)
     if shares.max() < 0.0:
@@ -193,15 +205,15 @@ def fit_axes(shifts: Sequence[Sequence[float]], path: OwnPath, camera: CameraMod
         turned, known = _turned(rows, path, offset)
         moved = np.diff(known[:, :2]) * path.motion(known[:, :2].mean(axis=1) - offset)[1]
         solution, covariance = _refined(
-            turned @ R, moved @ R, known[:, 4:].reshape(-1, ROWS * COLUMNS, 3), camera)
+            turned @ R, moved @ R, known[:, 4:].reshape(-1, PART_ROWS * PART_COLUMNS, 3), camera)
         curve = _shares(moves, R @ rotation_vector_to_matrix(solution[:3]))
     rates = np.sqrt(np.mean((turned @ R)[:, :2]**2, axis=0))
-    error = ZOOM_ERROR if rates.min() > BOTH * rates.max() else 1.0
+    error = ZOOM_ERROR if rates.min() > MIN_PITCH_SHARE * rates.max() else 1.0
     return AxesFit(
         float(shares[:, 0].max()), float(shares.max()), turns[best], offset, float(curve.max()),
         float(curve[len(offsets) // 2]), R @ solution[:3],
-        WIDENED * np.sqrt((R @ covariance[:3, :3] @ R.T).diagonal()), float(solution[3]),
-        math.hypot(WIDENED * math.sqrt(covariance[3, 3]), error))
+        ERROR_FACTOR * np.sqrt((R @ covariance[:3, :3] @ R.T).diagonal()), float(solution[3]),
+        math.hypot(ERROR_FACTOR * math.sqrt(covariance[3, 3]), error))
 
 
 def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
@@ -213,16 +225,16 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
         optical axes as configured. :param parts: their shifts (n, PARTS, 3).
     """
     x, y = ((np.arange(count) + 0.5) * size / count
-            for count, size in ((COLUMNS, camera.width), (ROWS, camera.height)))
+            for count, size in ((PART_COLUMNS, camera.width), (PART_ROWS, camera.height)))
     middles = camera.undistort(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     rays = np.column_stack([middles, np.ones(len(middles))])
     by_point = camera.linearize(rays)[1] / camera.matrix[0, 0]
     by_turn = by_point @ np.array([skew(ray) for ray in rays])
-    seen, good = parts[:, :, :2] / camera.matrix[0, 0], parts[:, :, 2] >= RESPONSE
-    start = solution = (np.arange(len(PRIOR)) == 3).astype(float)
-    prior = np.diag(PRIOR**-2)
+    seen, good = parts[:, :, :2] / camera.matrix[0, 0], parts[:, :, 2] >= MIN_RESPONSE
+    start = solution = (np.arange(len(PRIOR_DEVIATIONS)) == 3).astype(float)
+    prior = np.diag(PRIOR_DEVIATIONS**-2)
     by_depth = (by_point @ moved[:, None, :, None]) * -np.eye(len(rays))[:, None]
-    for _ in range(_PASSES):
+    for _ in range(_FIT_PASSES):
         vectors = turned @ rotation_vector_to_matrix(solution[:3])
         by_mounting = np.array([skew(vector) for vector in vectors])
         design = np.concatenate([  # (n, PARTS, 2, 4 + PARTS)
@@ -231,13 +243,14 @@ def _refined(turned: Array, moved: Array, parts: Array, camera: CameraModel
         off = seen - design[..., 3:] @ solution[3:]
         length = np.linalg.norm(off, axis=2)
         # A part that shows the leader has no weight.
-        weights = good / (1.0 + (length / (_FAR * np.median(length[good]) + 1e-5))**2)**2
+        scale = _OUTLIER_SIGMAS * np.median(length[good]) + 1e-5
+        weights = good / (1.0 + (length / scale)**2)**2
         weights *= 2.0 * weights.sum() / max(float(np.sum(weights * length**2)), 1e-9)
         information = np.einsum('nkim,nk,nkil->ml', design, weights, design) + prior
         moment = np.einsum('nkim,nk,nki->m', design, weights, off + design @ solution)
         solution = np.linalg.solve(information, moment + prior @ start)
     # In a room the depths change as the camera turns: the effect on the rest of all alike.
-    effect = DEPTHS * float(np.sqrt(np.mean(solution[4:]**2))) * np.linalg.solve(
+    effect = DEPTH_DEVIATION * float(np.sqrt(np.mean(solution[4:]**2))) * np.linalg.solve(
         information[:4, :4], information[:4, 4:]).sum(axis=1)
     return solution, np.linalg.inv(information)[:4, :4] + np.outer(effect, effect)
 
@@ -261,7 +274,7 @@ def _shares(moves: Sequence[tuple[Array, Array]], R_base_optical: Array) -> Arra
     """
     shares = np.full((len(moves), *R_base_optical.shape[:-2]), -1.0)
     for n, (turned, known) in enumerate(moves):
-        if len(known) >= FEW:
+        if len(known) >= MIN_PAIRS:
             expected = (turned @ R_base_optical)[..., 1::-1] * [-1.0, 1.0]
             together = np.sum(expected * known[:, 2:4], axis=(-2, -1))
             squares = np.sum(expected**2, axis=(-2, -1)) * np.sum(known[:, 2:4]**2)
@@ -274,4 +287,4 @@ def _summit(offsets: Array, curve: Array) -> float:
     peak = min(max(int(curve.argmax()), 1), len(curve) - 2)
     before, top, after = curve[peak - 1:peak + 2].tolist()
     bend = min(before - 2.0 * top + after, -1e-12)
-    return float(offsets[peak] + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * STEP)
+    return float(offsets[peak] + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * OFFSET_STEP)

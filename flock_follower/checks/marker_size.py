@@ -31,7 +31,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import ERROR, Finding, first, OK, SURE, UNMEASURED, WARNING
+from flock_follower.checks.findings import (
+    ERROR,
+    Finding,
+    first,
+    OK,
+    SIGNIFICANT_SIGMAS,
+    UNMEASURED,
+    WARNING,
+)
 from flock_follower.checks.image_motion import OwnPath
 from flock_follower.checks.observations import Observations
 from flock_follower.geometry import (
@@ -41,16 +49,22 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
 )
 
-#: Least number of sightings; least RMS way of the camera along the line of sight, m.
-FEW, MOVED = 12, 0.1
-#: A marker is at rest if this share of the changes is left at most. Ratios of a marker.
-LEFT, RATIOS = 0.15, (0.4, 2.5)
+#: Least number of sightings.
+MIN_SIGHTINGS = 12
+#: Least RMS way of the camera along the line of sight, m.
+MIN_WAY = 0.1
+#: A marker is at rest if at most this share of the changes of range is unexplained.
+MAX_UNEXPLAINED = 0.15
+#: Least and largest ratio of the true size to the configured one that is tried.
+RATIO_BOUNDS = (0.4, 2.5)
 #: Lasting errors of odometry are partly fitted as motion: errors of the size of tags on walls, in
 #: 34 visits, were up to 6.3 plain deviations.
-WIDENED: Final = 3.0
-_CORRELATED = 0.9  # of neighbouring residuals, at most
-#: Relative errors of the size: of a warning, of an error.
-SIZE, BAD_SIZE = 0.05, 0.1
+ERROR_FACTOR: Final = 3.0
+_MAX_CORRELATION = 0.9  # of neighboring residuals, at most
+#: Relative error of the size from which on there is a warning.
+SIZE_WARNING = 0.05
+#: Relative error of the size from which on there is an error.
+SIZE_ERROR = 0.1
 HOW: Final = 'stand the leader on the ground, and carry the camera towards it by 1 m, to and fro'
 
 
@@ -69,12 +83,12 @@ class Ratio(NamedTuple):
     @property
     def at_rest(self) -> bool:
         """Return whether the marker was at rest, and the camera moved."""
-        return (self.moved >= MOVED and RATIOS[0] <= self.ratio <= RATIOS[1]
-                and self.left <= LEFT * min(self.ratio, 1.0) * self.moved)
+        return (self.moved >= MIN_WAY and RATIO_BOUNDS[0] <= self.ratio <= RATIO_BOUNDS[1]
+                and self.left <= MAX_UNEXPLAINED * min(self.ratio, 1.0) * self.moved)
 
 
 def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
-    """Check the size of the neighbour's marker that was seen most often."""
+    """Check the size of the neighbor's marker that was seen most often."""
     what, wanted = 'marker size', 'as far as odometry moves'
     number, _ = Counter(int(row[1]) for row in seen.sightings).most_common(1)[0]
     rows = np.array(sorted(row for row in seen.sightings if row[1] == number))
@@ -85,17 +99,18 @@ def check_marker_size(seen: Observations, path: OwnPath) -> Finding:
     found = distance_ratio(
         rows[known, 2:] @ R_base_optical.T, path.motion(rows[known, 0])[0], rotations,
         np.array(seen.value('relative_pose', 'camera_position', [0.0, 0.0, 0.0])))
-    if found is None or not found.at_rest or SURE * found.deviation > 3.0 * SIZE:
-        moves = found is not None and found.moved >= MOVED and not found.at_rest
+    if (found is None or not found.at_rest
+            or SIGNIFICANT_SIGMAS * found.deviation > 3.0 * SIZE_WARNING):
+        moves = found is not None and found.moved >= MIN_WAY and not found.at_rest
         return Finding(UNMEASURED, what, 'the leader moves' if moves else HOW, wanted)
     off, side = abs(found.ratio - 1.0), seen.marker_sides.get(number, 0.0)
-    wrong = off > max(SIZE, SURE * found.deviation)
+    wrong = off > max(SIZE_WARNING, SIGNIFICANT_SIGMAS * found.deviation)
     measured = f'moves {found.ratio:.2f} ± {found.deviation:.2f} times as far'
     advice = (
         f'measure marker {number}, its black square from edge to edge: {side / found.ratio:.3f} m '
         f'would fit, config/neighbors.yaml has {side:g}. If that is right: is the calibration '
         'of this lens, and the scale of the odometry right?')
-    return first(what, wanted, (wrong and off > BAD_SIZE, ERROR, measured, advice),
+    return first(what, wanted, (wrong and off > SIZE_ERROR, ERROR, measured, advice),
                  (wrong, WARNING, measured, advice), (True, OK, measured, ''))
 
 
@@ -108,7 +123,7 @@ def distance_ratio(arms: Array, positions: Array, rotations: Array, camera: Arra
     :param positions: (n, 3), m, and :param rotations: (n, 3, 3) of base_link in odom.
     :param camera: (3,), m, position of the camera on base_link.
     """
-    if len(arms) < FEW:
+    if len(arms) < MIN_SIGHTINGS:
         return None
     seen = (rotations @ arms[:, :, None])[:, :, 0]
     sight = seen.mean(axis=0) / max(float(np.linalg.norm(seen.mean(axis=0))), 1e-9)
@@ -118,7 +133,7 @@ def distance_ratio(arms: Array, positions: Array, rotations: Array, camera: Arra
     ratio = float(distance @ way) / squares
     left = distance - ratio * way
     lasting = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-12)
-    lasting = min(max(lasting, 0.0), _CORRELATED)
+    lasting = min(max(lasting, 0.0), _MAX_CORRELATION)
     variance = float(left @ left) / (len(left) - 2) * (1.0 + lasting) / (1.0 - lasting)
-    return Ratio(ratio, WIDENED * float(np.sqrt(variance / squares)),
+    return Ratio(ratio, ERROR_FACTOR * float(np.sqrt(variance / squares)),
                  float(np.sqrt(np.mean(way**2))), float(np.sqrt(np.mean(left**2))))

@@ -63,8 +63,8 @@ class Picture:
     """
     An image that was searched for markers.
 
-    ``brightness`` and ``contrast`` are mean and deviation of its grey levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px: of a neighbour's only those that
+    ``brightness`` and ``contrast`` are mean and deviation of its gray levels; ``markers`` maps the
+    ids of the markers found to the length of their sides, px: of a neighbor's only those that
     gave a measurement. ``outlines`` are the ids of the others, ``misprints`` why they were
     refused. ``fault`` is the reason if the image cannot be decoded.
     """
@@ -166,7 +166,7 @@ class Observations:
     calibration: Any = None
     dictionary: str = ''
     marker_sides: dict[int, float] = field(default_factory=dict)
-    """The configured length of the sides of each neighbour's marker, m, by its id."""
+    """The configured length of the sides of each neighbor's marker, m, by its id."""
     pictures: list[Picture] = field(default_factory=list)
     shifts: list[list[float]] = field(default_factory=list)
     sightings: list[list[float]] = field(default_factory=list)

@@ -29,7 +29,7 @@ from flock_follower.checks.findings import (
     first,
     judged,
     OK,
-    SURE,
+    SIGNIFICANT_SIGMAS,
     UNMEASURED,
     WARNING,
 )
@@ -51,37 +51,51 @@ from flock_follower.parameters.files import COMMON
 
 #: Largest share of unusable messages that permits a flight.
 LOST: Final = 0.02
-#: deg: mean lean of base_link from which on there is a warning, and an error.
-LEAN, LYING = 20.0, 40.0
-#: The image motion is conclusive if rotation explains this share of it. Other axes, or an offset
-#: of stamps, are reported if they reduce the rest by these factors.
-EXPLAINED: Final = 0.6
-TURNED, SHIFTED = 0.4, 0.8
-#: s: offset of the camera's stamps from which on there is a warning, and an error. At 20, 30 and
-#: 50 ms the squared errors of a neighbour's position are 10, 30 and 350 times its covariance.
-OFFSET, BAD_OFFSET = 0.010, 0.030
+#: Mean lean of base_link, deg, from which on there is a warning.
+LEAN_WARNING = 20.0
+#: Mean lean of base_link, deg, from which on there is an error.
+LEAN_ERROR = 40.0
+#: The image motion is conclusive if rotation explains this share of it.
+MIN_EXPLAINED: Final = 0.6
+#: Other axes are reported if they reduce the unexplained image motion to this share.
+AXES_REDUCTION = 0.4
+#: An offset of stamps is reported if it reduces the unexplained image motion to this share.
+OFFSET_REDUCTION = 0.8
+#: Offset of the camera's stamps, s, from which on there is a warning. At 20, 30 and 50 ms the
+#: squared errors of a neighbor's position are 10, 30 and 350 times its covariance.
+OFFSET_WARNING = 0.010
+#: Offset of the camera's stamps, s, from which on there is an error.
+OFFSET_ERROR = 0.030
 #: s: between attitudes farther apart the rotation is not known well enough to find an offset.
 SLOW: Final = 0.06
 #: Relative error of a focal length that is an error: 0.965 was measured with the right one.
 ZOOM: Final = 0.1
-#: Axes of the positions: least number of windows; least error of the velocity, m/s; the squared
-#: errors must fall by so many variances; smaller turns are those of an estimator. A vehicle that
-#: is lower than this, m, was started higher up, or z points down.
-FEW, STILL, EVIDENT, SIN_TURNED, BELOW = 6, 0.02, 60.0, 0.4, -0.5
+#: Least number of windows for a judgment of the axes of the positions.
+MIN_WINDOWS = 6
+#: Least error of the velocity, m/s, that is assumed.
+MIN_VELOCITY_ERROR = 0.02
+#: Variances by which other axes must reduce the squared errors to be reported.
+MIN_VARIANCES = 60.0
+#: Sine of the least turn of the axes that is reported; an estimator turns them by less.
+MIN_SIN_TURN = 0.4
+#: Height, m, below which the vehicle started higher up, or z points down.
+LOWEST_HEIGHT = -0.5
 #: Events of the reader: the property, the level and the action.
 EVENTS: Final = (
     ('odom jumped', 'odom jumps', WARNING,
-     'turn off loop closure and relocalisation, or take the frame without them'),
+     'turn off loop closure and relocalization, or take the frame without them'),
     ('odom changed its frames', 'odom frames', ERROR,
      'is it published by two sources? Every change starts perception anew'))
-#: Errors of the mounting, rad, of a warning and of an error.
-LOOKS, BAD_LOOKS = math.radians(4.0), math.radians(8.0)
-MOUNTED: Final = f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
+#: Error of the mounting, rad, from which on there is a warning.
+MOUNTING_WARNING = math.radians(4.0)
+#: Error of the mounting, rad, from which on there is an error.
+MOUNTING_ERROR = math.radians(8.0)
+MOUNTED: Final = f'within {math.degrees(MOUNTING_WARNING):.0f} deg of camera_rpy'
 _AXES: Final = ('roll', 'pitch', 'yaw')
 _WAYS: Final = (('rolled left', 'rolled right'), ('looks higher', 'looks lower'),
                 ('looks further right', 'looks further left'))
 TURN_MOVES: Final = 'images move as odometry turns'
-IN_TIME: Final = f'within {1e3 * OFFSET:.0f} ms of the odometry'
+IN_TIME: Final = f'within {1e3 * OFFSET_WARNING:.0f} ms of the odometry'
 DERIVED: Final = 'works: derived from the positions, which is noisier'
 
 
@@ -94,7 +108,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if motion.lost:
         yield judged(motion.lost > LOST * count, True, 'odom',
                      f'{motion.lost} of {count} are invalid: {motion.last_error}',
-                     'position and attitude', 'wait until its source is initialised; more '
+                     'position and attitude', 'wait until its source is initialized; more '
                      'texture, light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return
@@ -117,9 +131,9 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     with suppress(ValueError):  # reported with the calibration
         fit = fit_axes(seen.shifts, path, camera_model(seen),
                        quaternion_to_matrix(quaternion_from_rpy(*rpy)) @ R_FLU_OPTICAL,
-                       up if lean >= LYING else None)
+                       up if lean >= LEAN_ERROR else None)
     yield from _axes(seen, motion, up, lean, fit)
-    sure = fit if fit is not None and fit.best >= EXPLAINED else None
+    sure = fit if fit is not None and fit.best >= MIN_EXPLAINED else None
     yield _focal(sure, sure is not None and seen.calibration.distortion_model == 'equidistant')
     if seen.sightings:
         yield check_marker_size(seen, path)
@@ -149,33 +163,35 @@ def _positions(twist: TwistFrame, height: float) -> Iterator[Finding]:
     They have others if a rotation, or a reflection, of the velocity explains them, and neither
     reading of the velocity does without it (Kabsch's method).
     """
-    if twist.wanted == NONE or len(twist.windows) < FEW or not np.any(
+    if twist.wanted == NONE or len(twist.windows) < MIN_WINDOWS or not np.any(
             np.array(twist.windows)[:, 1]):
         return  # without a velocity there is nothing to compare
     moved, *readings = np.swapaxes(twist.windows, 0, 1)
     same = min(readings, key=lambda velocity: float(np.sum((moved - velocity)**2)))
     turned = []
     for velocity in readings:
-        u, _, vt = np.linalg.svd(moved.T @ velocity + STILL**2 * len(moved) * np.eye(3))
+        u, _, vt = np.linalg.svd(
+            moved.T @ velocity + MIN_VELOCITY_ERROR**2 * len(moved) * np.eye(3))
         turned.append((np.sum((moved - velocity @ (u @ vt).T)**2, axis=0), u @ vt))
     least, A = min(turned, key=lambda each: float(each[0].sum()))
-    variance = float(least.sum()) / moved.size + STILL**2
-    other = np.abs(A - np.eye(3)).max(axis=1) > SIN_TURNED
+    variance = float(least.sum()) / moved.size + MIN_VELOCITY_ERROR**2
+    other = np.abs(A - np.eye(3)).max(axis=1) > MIN_SIN_TURN
     before = float(np.sum((moved - same)**2, axis=0)[other].sum())
     after = float(least[other].sum())
     # An axis whose reversal would show is known.
     still = ', '.join(axis for axis, gain in zip('xyz', 4.0 * np.sum(moved * same, axis=0))
-                      if gain < EVIDENT * variance)
+                      if gain < MIN_VARIANCES * variance)
     axes = ', '.join(f'{"-" if row[k] < 0.0 else ""}{"xyz"[k]}'
                      for row in A for k in [int(np.abs(row).argmax())])
     turn = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(A)) - 1.0)))))
     yield first(
         'odom positions', 'along the axes of the velocity',
-        (before - after > max(EVIDENT * variance, 3.0 * after), ERROR,
+        (before - after > max(MIN_VARIANCES * variance, 3.0 * after), ERROR,
          f'x, y, z move as {axes} of the velocity, turned by {turn:.0f} deg',
          'set up its source to send position, attitude and velocity in the axes of REP-103 '
          '(ENU, FLU)'),
-        ('z' in still and height <= BELOW, WARNING, f'z moved too little, and is {height:.1f} m',
+        ('z' in still and height <= LOWEST_HEIGHT, WARNING,
+         f'z moved too little, and is {height:.1f} m',
          'if it was not started higher up, z points down: set up its source to send ENU '
          '(REP-103)'),
         (still, UNMEASURED, f'{still} moved too little: carry it, and lift it', ''),
@@ -204,9 +220,9 @@ def _axes(seen: Observations, motion: OwnMotion, up: Array, lean: float, fit: Ax
 
     :param up: (3,), the mean upward direction in base_link; :param lean: that of its z, deg.
     """
-    turned = fit is not None and fit.best >= EXPLAINED and (
-        1.0 - fit.best < TURNED * (1.0 - fit.configured))
-    down = fit is not None and turned and lean < LYING and fit.turn[2, 2] < -0.5
+    turned = fit is not None and fit.best >= MIN_EXPLAINED and (
+        1.0 - fit.best < AXES_REDUCTION * (1.0 - fit.configured))
+    down = fit is not None and turned and lean < LEAN_ERROR and fit.turn[2, 2] < -0.5
     R = (np.eye(3) if fit is None else fit.turn) @ quaternion_to_matrix(quaternion_from_rpy(
         *seen.value('relative_pose', 'odom_child_rpy', [0.0, 0.0, 0.0])))
     rpy = f'[{",".join(str(round(angle, 4) + 0.0) for angle in rpy_from_matrix(R).tolist())}]'
@@ -214,14 +230,14 @@ def _axes(seen: Observations, motion: OwnMotion, up: Array, lean: float, fit: Ax
     axis = f'{"-" if up[largest] < 0.0 else "+"}{"xyz"[largest]}'
     yield first(
         'odom up', "base_link's z up",
-        (lean >= LYING, ERROR, f'{axis} of base_link is up (leans {lean:.0f} deg)',
+        (lean >= LEAN_ERROR, ERROR, f'{axis} of base_link is up (leans {lean:.0f} deg)',
          f'odom_child_rpy:=[-1.5708,0.0,-1.5708] for the axes of a camera (x right, y down), else '
          f'its attitude on the body{f": {rpy} fits the images" if turned else ""}; see '
          'docs/sensors.md'),
         (down, ERROR, 'images turn the other way round: z of base_link is down',
          'let the odometry source send ENU and FLU (REP-103) instead of NED and FRD; or is the '
          'camera upside down (camera_rpy)?'),
-        (lean >= LEAN, WARNING, f'leans {lean:.0f} deg on average',
+        (lean >= LEAN_WARNING, WARNING, f'leans {lean:.0f} deg on average',
          'hold the vehicle level; else set the pose of the IMU on the body (odom_child_rpy)'),
         (True, OK, f'leans {lean:.0f} deg on average', ''))
     if down:
@@ -232,12 +248,12 @@ def _axes(seen: Observations, motion: OwnMotion, up: Array, lean: float, fit: Ax
         yield Finding(UNMEASURED, 'camera time offset', 'turned too little', IN_TIME)
         return
     share = f'turning explains {max(fit.configured, 0.0):.0%} of it'
-    if not turned or lean < LYING:
+    if not turned or lean < LEAN_ERROR:
         yield first(
             'odom ahead', TURN_MOVES,
             (turned, ERROR, f'{share}; with other axes {fit.best:.0%}',
              f'check camera_rpy; if that is right, set odom_child_rpy:={rpy}'),
-            (fit.configured >= EXPLAINED, OK, share, ''),
+            (fit.configured >= MIN_EXPLAINED, OK, share, ''),
             (True, UNMEASURED, f'{share}; turn the vehicle by hand', ''))
     yield _offset(fit, share, motion.source.period,
                   float(seen.value('relative_pose', 'time_offset', 0.0)))
@@ -251,10 +267,11 @@ def _offset(fit: AxesFit, share: str, period: float, known: float) -> Finding:
     return first(
         'camera time offset', IN_TIME,
         (period > SLOW, UNMEASURED, f'odometry comes only every {period:.2f} s', ''),
-        (fit.best < EXPLAINED, UNMEASURED, share, ''),
-        (abs(fit.offset) <= OFFSET or 1.0 - fit.explained >= SHIFTED * (1.0 - fit.together), OK,
+        (fit.best < MIN_EXPLAINED, UNMEASURED, share, ''),
+        (abs(fit.offset) <= OFFSET_WARNING
+         or 1.0 - fit.explained >= OFFSET_REDUCTION * (1.0 - fit.together), OK,
          off, ''),
-        (rest > OFFSET, ERROR if rest > BAD_OFFSET else WARNING,
+        (rest > OFFSET_WARNING, ERROR if rest > OFFSET_ERROR else WARNING,
          f'images are stamped {off} {side} than odometry', 'have the driver stamp the middle of '
          f'the exposure, by one clock; else set time_offset:={-fit.offset:.3f} of relative_pose'),
         (True, OK, f'{off} {side}, corrected by time_offset', ''))
@@ -263,10 +280,10 @@ def _offset(fit: AxesFit, share: str, period: float, known: float) -> Finding:
 def _focal(fit: AxesFit | None, fisheye: bool) -> Finding:
     """Check the focal length; in a fisheye image the flow changes too much within a part."""
     what, wanted = 'focal length', 'images move as far as it predicts'
-    if fit is None or fisheye or SURE * fit.zoom_deviation > 2.0 * ZOOM:
+    if fit is None or fisheye or SIGNIFICANT_SIGMAS * fit.zoom_deviation > 2.0 * ZOOM:
         return Finding(UNMEASURED, what, 'a fisheye lens' if fisheye else
                        'turned too little: pitch and yaw it by hand', wanted)
-    wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SURE * fit.zoom_deviation)
+    wrong = abs(math.log(max(fit.zoom, 1e-3))) > max(ZOOM, SIGNIFICANT_SIGMAS * fit.zoom_deviation)
     return judged(
         wrong, False, what, f'images move {fit.zoom:.2f} ± {fit.zoom_deviation:.2f} times as far',
         wanted, 'is the calibration of this lens, and for this size of images?')
@@ -280,10 +297,10 @@ def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Find
         mounted otherwise than configured; :param deviations: (3,) of it.
     :param rpy: the configured ``camera_rpy``, rad.
     """
-    margin = SURE * deviations
-    wrong = np.abs(turn) > np.maximum(LOOKS, margin)
+    margin = SIGNIFICANT_SIGMAS * deviations
+    wrong = np.abs(turn) > np.maximum(MOUNTING_WARNING, margin)
     unknown = ', '.join(axis for axis, bad, by in zip(_AXES, wrong, margin)
-                        if not bad and by > LOOKS)
+                        if not bad and by > MOUNTING_WARNING)
     looks = ', '.join(f'{way[angle > 0.0]} by {abs(math.degrees(angle)):.0f} deg'
                       for way, angle, bad in zip(_WAYS, turn.tolist(), wrong) if bad)
     fitting = ','.join(str(round(angle, 3) + 0.0) for angle in rpy_from_matrix(
@@ -294,7 +311,7 @@ def check_mounting(turn: Array, deviations: Array, rpy: Sequence[float]) -> Find
               'of the odometry on the body (odom_child_rpy) wrong?')
     return first(
         'camera mounting', MOUNTED,
-        (np.any(wrong & (np.abs(turn) > BAD_LOOKS)), ERROR, measured, advice),
+        (np.any(wrong & (np.abs(turn) > MOUNTING_ERROR)), ERROR, measured, advice),
         (wrong.any(), WARNING, measured, advice),
         (unknown, UNMEASURED, f'{unknown} unknown: roll, pitch and yaw it by hand, 30 deg', ''),
         (True, OK, f'off by {math.degrees(np.abs(turn).max()):.0f} deg', ''))

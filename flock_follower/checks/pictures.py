@@ -28,8 +28,12 @@ from flock_follower.settings import MARKER_LOST_WIDTH
 
 #: Side of a marker, px, below which its range is noisy.
 NOISY_MARKER_WIDTH = 18.0
-#: Mean grey levels of images that are too dark, too bright; deviation of one that shows nothing.
-DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
+#: Mean gray level, 0 to 255, below which an image is too dark.
+MEAN_TOO_DARK = 12.0
+#: Mean gray level, 0 to 255, above which an image is too bright.
+MEAN_TOO_BRIGHT = 243.0
+#: Standard deviation of the gray levels below which an image shows nothing.
+DEVIATION_TOO_FLAT = 3.0
 #: Share of the images below which a marker is hardly in sight.
 SELDOM: Final = 0.5
 
@@ -91,15 +95,16 @@ def _exposure(pictures: list[Picture]) -> Finding:
     newest = pictures[-1]
     brightness = float(np.median([picture.brightness for picture in pictures]))
     contrast = float(np.median([picture.contrast for picture in pictures]))
-    measured = (f'{newest.width}x{newest.height} {newest.encoding}, grey level {brightness:.0f} '
+    measured = (f'{newest.width}x{newest.height} {newest.encoding}, gray level {brightness:.0f} '
                 f'± {contrast:.0f}')
     return first(
-        'images', f'grey level {DARK:.0f} to {BRIGHT:.0f}',
-        (brightness < DARK, ERROR, f'{measured}: black',
+        'images', f'gray level {MEAN_TOO_DARK:.0f} to {MEAN_TOO_BRIGHT:.0f}',
+        (brightness < MEAN_TOO_DARK, ERROR, f'{measured}: black',
          'take off the cap; more light, or a longer exposure'),
-        (brightness > BRIGHT, ERROR, f'{measured}: white',
+        (brightness > MEAN_TOO_BRIGHT, ERROR, f'{measured}: white',
          'expose less (automatic exposure on)'),
-        (contrast < FLAT, WARNING, f'{measured}: one grey', 'is something before the lens?'),
+        (contrast < DEVIATION_TOO_FLAT, WARNING, f'{measured}: one gray',
+         'is something before the lens?'),
         (True, OK, measured, ''))
 
 

@@ -31,11 +31,11 @@ import os
 from pathlib import Path
 from typing import Final, NamedTuple
 
-#: Share of WINDOW for which processes wait for a processor that others have: busy from there on.
+#: Share of LOAD_WINDOW for which processes wait for a processor that others have; busy above it.
 #: Of `demo` and `fly` on two processors: 0.01 to 0.09 alone, 0.2 beside two busy programs.
-BUSY: Final = 0.1
-WINDOW: Final = 2.0  # s: a shorter burst breaks no bound, or shows in it
-PERIOD: Final = 0.5  # s between two readings, at least
+BUSY_SHARE: Final = 0.1
+LOAD_WINDOW: Final = 2.0  # s: a shorter burst breaks no bound, or shows in it
+LOAD_PERIOD: Final = 0.5  # s between two readings, at least
 PROC: Final = Path('/proc')
 _TICK: Final = 1.0 / os.sysconf('SC_CLK_TCK')  # s
 
@@ -62,11 +62,11 @@ class Load(NamedTuple):
     @property
     def busy(self) -> bool:
         """Return whether times measured meanwhile say nothing about these processes."""
-        return self.share > BUSY
+        return self.share > BUSY_SHARE
 
     def __str__(self) -> str:
         """Return the cause and the share, in words."""
-        return (f'for {self.share:.0%} of the worst {WINDOW:g} s the processes waited for a '
+        return (f'for {self.share:.0%} of the worst {LOAD_WINDOW:g} s the processes waited for a '
                 f'processor that other programs had ({self.others:.1f} of {self.processors} '
                 'processors)')
 
@@ -155,16 +155,16 @@ class LoadMeter:
         self._windows: list[tuple[float, Load]] = []
 
     def sample(self, now: float) -> None:
-        """Read the counters at a time, s; more often than every PERIOD is in vain."""
-        if self._recent and now - self._recent[-1].time < PERIOD:
+        """Read the counters at a time, s; more often than every LOAD_PERIOD is in vain."""
+        if self._recent and now - self._recent[-1].time < LOAD_PERIOD:
             return
         counters = read_counters(self._processes(), now, self._proc, self._usable)
         if counters is None:
             return
         self._recent.append(counters)
-        while len(self._recent) > 1 and now - self._recent[1].time >= WINDOW:
+        while len(self._recent) > 1 and now - self._recent[1].time >= LOAD_WINDOW:
             self._recent.popleft()
-        if now - self._recent[0].time >= WINDOW:
+        if now - self._recent[0].time >= LOAD_WINDOW:
             self._windows.append((now, load_between(
                 self._recent[0], counters, len(self._usable))))
 

@@ -48,7 +48,7 @@ from flock_follower.topic_names import (
 )
 
 #: s: of a longer bag only the beginning is checked.
-LONGEST: Final = 300.0
+MAX_DURATION: Final = 300.0
 DIAGNOSTICS: Final = '/diagnostics'
 _IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 #: The topics to take, and their types.
@@ -78,8 +78,8 @@ class RecordedSystem:
     :param camera: the one of several to check; '': the first.
     :param remaps: names of topics in the bag, by ours, if they differ.
     :param own: filled by the caller, who reads the odometry anyway; None: it is read here.
-    :raises ValueError: for a camera that does not exist, or a neighbours file that is wrong.
-    :raises OSError: if the neighbours file cannot be read.
+    :raises ValueError: for a camera that does not exist, or a neighbors file that is wrong.
+    :raises OSError: if the neighbors file cannot be read.
     """
 
     def __init__(self, bag: Bag, values: Mapping[str, dict[str, Any]], camera: str = '',
@@ -100,7 +100,7 @@ class RecordedSystem:
                 name: TopicSeen([TopicEnd('', topic.msgtype)])
                 for name, topic in bag.topics.items() if topic.count})
         self._neighbors = load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
-        self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
+        self._collector = Collector(self.seen, min(self.seen.duration, MAX_DURATION))
         self._gaps = Gaps()
         self._start_ns = bag.start_ns
         if bag.set_back_ns > MAX_GAP * NANOSECONDS:
@@ -114,7 +114,7 @@ class RecordedSystem:
 
     def is_long_enough(self, time_ns: int) -> bool:
         """Return whether what comes at a time, ns, is not checked any more."""
-        return time_ns - self._start_ns - self._gaps.skipped_ns >= LONGEST * NANOSECONDS
+        return time_ns - self._start_ns - self._gaps.skipped_ns >= MAX_DURATION * NANOSECONDS
 
     def take(self, topic: str, msgtype: str, time_ns: int, data: bytes
              ) -> tuple[Any, GrayImage | None]:

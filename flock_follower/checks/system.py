@@ -40,13 +40,13 @@ from flock_follower.checks.findings import (
     WARNING,
 )
 from flock_follower.checks.observations import Machine, Observations
-from flock_follower.checks.processor import BUSY
+from flock_follower.checks.processor import BUSY_SHARE
 from flock_follower.fast_dds import PROFILE_VARIABLES, UNDELIVERED
 from flock_follower.topic_names import full_name, OURS
 
-STARVED = 0.5  # share of the load (processor.py) from which on nothing may fly
+STARVED_SHARE = 0.5  # share of the load (processor.py) from which on nothing may fly
 #: MB free in /dev/shm.
-ROOM = 32.0
+MIN_SHARED_MEMORY = 32.0
 #: Segments of killed processes from which on there is a warning: 180 raised the latency of the
 #: demonstration from image to setpoint, 95 %, from 90 ms to 239 ms.
 DEAD_SEGMENTS = 20
@@ -73,9 +73,9 @@ ADVICE: Final[Mapping[str, str]] = {
 def check_machine(seen: Observations) -> Iterator[Finding]:
     """Check the computer."""
     machine = seen.machine
-    load, wanted = machine.load, f'at most {BUSY:.0%}, never {STARVED:.0%}'
+    load, wanted = machine.load, f'at most {BUSY_SHARE:.0%}, never {STARVED_SHARE:.0%}'
     if load is not None:
-        yield judged(load.share > STARVED, load.busy, 'processor', str(load), wanted,
+        yield judged(load.share > STARVED_SHARE, load.busy, 'processor', str(load), wanted,
                      'end programs that are not needed (rviz, recordings), or reduce the load of '
                      'the odometry')
     elif seen.live:
@@ -89,8 +89,10 @@ def _shared_memory(machine: Machine, image: int) -> Finding:
     """Check the shared memory; ``image`` is the size of the largest image, bytes."""
     free = machine.shared_memory_free
     return first(
-        'shared memory', f'{ROOM:.0f} MB, images that fit into {machine.segment // 1024} kB',
-        (free is not None and free < ROOM, ERROR, f'{free or 0.0:.0f} MB free in /dev/shm',
+        'shared memory',
+        f'{MIN_SHARED_MEMORY:.0f} MB, images that fit into {machine.segment // 1024} kB',
+        (free is not None and free < MIN_SHARED_MEMORY, ERROR,
+         f'{free or 0.0:.0f} MB free in /dev/shm',
          'delete /dev/shm/fastrtps_* and fastdds_* of processes that are gone; in a container, '
          '--shm-size'),
         (machine.dead_segments >= DEAD_SEGMENTS, WARNING,

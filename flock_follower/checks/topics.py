@@ -62,7 +62,7 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
         yield Finding(
             ERROR, 'bag clock', f'the clock was set back by {seen.set_back:.1f} s while the bag '
             'was recorded: its messages are mixed', 'one clock',
-            'record again, and synchronise the clock before')
+            'record again, and synchronize the clock before')
     elif seen.gaps:
         yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
@@ -71,7 +71,7 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     yield from _stream(
         seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
         faster='raise the frame rate of the camera; reduce the exposure time in the dark',
-        sooner='send smaller images, or grey ones; have the camera on this computer')
+        sooner='send smaller images, or gray ones; have the camera on this computer')
     yield from _stream(
         seen, 'odom', seen.topic('odom'), rates=(18.0, 8.0), latencies=(0.5 * late, 0.8 * late),
         faster='raise the output rate of the odometry (IMU rate, if its driver offers that)',
@@ -134,7 +134,7 @@ def _gaps(seen: Observations) -> Finding:
         ERROR if interrupts else WARNING, 'bag clock',
         f'times jump by {step:+.1f} s after {after:.1f} s{others}: the clock was set, or nothing '
         'was recorded', f'one clock, gaps below {MAX_GAP:g} s',
-        'cut the bag there (ros2 bag convert) and use each part; synchronise the clock before '
+        'cut the bag there (ros2 bag convert) and use each part; synchronize the clock before '
         'recording')
 
 
@@ -157,7 +157,7 @@ def _needed(seen: Observations, name: str) -> Finding:
         (msgtype not in topic.types, ERROR, f'{full} holds {", ".join(topic.types)}',
          connect or f'have its source send {msgtype}'),
         (not topic.arrivals, ERROR, f'{nodes} publishes {full}, and sends nothing',
-         "see the node's log; is the sensor connected, calibrated and initialised?"),
+         "see the node's log; is the sensor connected, calibrated and initialized?"),
         (True, OK, f'{full}, {len(topic.arrivals)} messages', ''))
 
 
@@ -197,14 +197,14 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
     jump, since = ((-steps[jumps[0]], np.array(topic.arrivals)[stamped][jumps[0]]
                     - topic.arrivals[0]) if jumps.size else (0.0, 0.0))
     ahead = f'stamped {-1e3 * middle:.0f} ms in the future'
-    synchronise = 'synchronise the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
+    synchronize = 'synchronize the clocks (chrony, PTP); have the driver stamp by the clock of ROS'
     measured = f'median {1e3 * middle:.0f} ms, 95 % within {1e3 * most:.0f} ms'
     repeated = int(np.count_nonzero(np.diff(np.array(topic.stamps)[stamped]) == 0.0))
     yield first(
         f'{name} latency', f'below {latencies[0]:g} s after its stamp',
         (jumps.size, ERROR,
          f'stamps jump by {jump:+.1f} s against the time they came, after {since:.1f} s',
-         'a clock was set meanwhile: synchronise all clocks before the flight (chrony, PTP), and '
+         'a clock was set meanwhile: synchronize all clocks before the flight (chrony, PTP), and '
          'have the driver stamp by the clock of ROS'),
         (repeated > REPEATED * len(topic.stamps), ERROR,
          f'{repeated} of {len(topic.stamps)} have the stamp of the message before',
@@ -215,8 +215,8 @@ def _stream(seen: Observations, name: str, topic: TopicSeen, *, rates: tuple[flo
          'or another clock', 'set use_sim_time alike in all nodes, and the clocks of all '
          'computers; have the driver stamp by the clock of ROS (a replayed bag: ros2 bag record '
          '--use-sim-time)'),
-        (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronise),
-        (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronise),
+        (middle < -CLOCK_AHEAD[1], ERROR, ahead, synchronize),
+        (middle < -CLOCK_AHEAD[0], WARNING, ahead, synchronize),
         (seen.busy and (middle > latencies[0] or most > latencies[1]), UNMEASURED,
          busy + measured, ''),
         (middle > latencies[1], ERROR, measured, sooner),

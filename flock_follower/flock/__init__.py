@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Several followers: their neighbour graph and their messages.
+Several followers: their neighbor graph and their messages.
 
 Every vehicle's odometry has its own frame. The transform between two frames is estimated from
 vehicles seen by both at one time, or that report their own position. Nothing here reads a clock.

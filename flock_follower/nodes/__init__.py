@@ -22,11 +22,11 @@ import threading
 
 from flock_follower.signals import AS_A_PROGRAM, ending, hang_up_as_terminate
 
-#: A signalled process has ended after this, s; the bridge has braked and ended its stream before.
+#: A signaled process has ended after this, s; the bridge has braked and ended its stream before.
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None
-_unhurried = False
+_no_exit_deadline = False
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
@@ -42,19 +42,19 @@ def set_deadline() -> None:
     Once in some thousand times Fast DDS spins for ever while it destroys a node, and holds the
     GIL: no thread and no handler of Python can end that.
     """
-    if AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
+    if AS_A_PROGRAM and not _no_exit_deadline and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
 
 
 @contextlib.contextmanager
-def unhurried() -> Iterator[None]:
+def no_exit_deadline() -> Iterator[None]:
     """Set no deadline inside the block, which may take long to finish its files."""
-    global _unhurried
-    _unhurried = True
+    global _no_exit_deadline
+    _no_exit_deadline = True
     try:
         yield
     finally:
-        _unhurried = False
+        _no_exit_deadline = False
 
 
 def ignore_signals() -> None:

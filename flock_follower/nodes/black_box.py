@@ -46,7 +46,7 @@ from flock_follower.bags.parameter_table import recordings_folder
 from flock_follower.bags.recording import FlightRecording
 from flock_follower.files import resource
 from flock_follower.messages import MOTION_TOPIC
-from flock_follower.nodes import unhurried
+from flock_follower.nodes import no_exit_deadline
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY
 from flock_follower.nodes.support.image_middleware import (
@@ -140,7 +140,7 @@ class BlackBox(FlockNode):
         try:
             spin(self)
         finally:
-            with unhurried():  # to finish it takes as long as the disk takes
+            with no_exit_deadline():  # to finish it takes as long as the disk takes
                 self._ending.set()
                 for thread in threads:
                     thread.join()
@@ -164,7 +164,7 @@ class BlackBox(FlockNode):
                 self._unasked.discard(name)
 
     def _note(self, _: dict[str, Any]) -> None:
-        """Note the parameters flown as a file for ``evaluate``, and the neighbours beside them."""
+        """Note the parameters flown as a file for ``evaluate``, and the neighbors beside them."""
         flown = {}
         for name, node in zip(OURS, self._nodes.values()):
             if node.values is None:
@@ -264,7 +264,7 @@ class BlackBox(FlockNode):
 
 
 def _compressed(data: bytes) -> bytes:
-    """Return a serialised image as a serialised compressed one; ValueError if it is corrupt."""
+    """Return a serialized image as a serialized compressed one; ValueError if it is corrupt."""
     image = deserialize(data, IMAGE)
     compressed = empty(COMPRESSED)
     compressed.header, compressed.format = image.header, 'jpeg'

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The flock node: followers exchange their own states and the states of the neighbours they see.
+The flock node: followers exchange their own states and the states of the neighbors they see.
 
 Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share. Publishes
-on the latter, at 10 Hz, the own state and the neighbours in sight, and on ``neighbors/heard`` the
-neighbours that others reported and that are out of sight, in the own odometry frame. The
+on the latter, at 10 Hz, the own state and the neighbors in sight, and on ``neighbors/heard`` the
+neighbors that others reported and that are out of sight, in the own odometry frame. The
 mathematics is in ``flock_follower.flock``.
 """
 

@@ -37,7 +37,7 @@ from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
 from flock_follower.checks.observations import Machine, Observations, TopicEnd, TopicSeen
-from flock_follower.checks.processor import Load, LoadMeter, PERIOD
+from flock_follower.checks.processor import Load, LOAD_PERIOD, LoadMeter
 from flock_follower.checks.reach import find_reach, Reach
 from flock_follower.checks.single_camera import alone
 from flock_follower.fast_dds import dead_segments
@@ -109,7 +109,7 @@ class Observer(Node):
         try:
             while rclpy.ok() and (now := time.monotonic()) < end:
                 meter.sample(now)
-                executor.spin_once(timeout_sec=min(end - now, PERIOD))
+                executor.spin_once(timeout_sec=min(end - now, LOAD_PERIOD))
         finally:
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():

@@ -13,16 +13,16 @@
 # limitations under the License.
 
 """
-The planner node: odometry and neighbours in, one acceleration command per tick out.
+The planner node: odometry and neighbors in, one acceleration command per tick out.
 
 Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and if published ``camera_info``,
-``neighbors/acceleration``, ``neighbors/heard`` (neighbour states received from other vehicles)
+``neighbors/acceleration``, ``neighbors/heard`` (neighbor states received from other vehicles)
 and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
 steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
-the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
+the neighbor that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge reports on ``mavlink_bridge/state`` that it
 flies them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
-disengages it. After ``resume_timeout`` without a neighbour the commands end. Both last until
+disengages it. After ``resume_timeout`` without a neighbor the commands end. Both last until
 ``planner/engage`` is called again. The decisions are made in
 ``flock_follower.planner.step``.
 """
@@ -84,8 +84,8 @@ class Planner(FlockNode):
         self._start: PlannerParams | None = None
         self._settings = self.declare(SPECS, self._build, self._flying)
         values = self._settings.values
-        for judgement in judge(values):
-            self.get_logger().warning(str(judgement))
+        for judgment in judge(values):
+            self.get_logger().warning(str(judgment))
         self._loop = PlannerLoop(values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
@@ -273,7 +273,7 @@ class Planner(FlockNode):
             'state': decision.state.value, 'reason': decision.reason,
             'engaged': self._loop.engaged, 'bridge': self._bridge or 'not received',
             'missed_ticks': self._loop.missed, 'limits': decision.limits,
-            # The band about a neighbour, to its hull.
+            # The band about a neighbor, to its hull.
             'nearest_m': f'{math.sqrt(values["d0"]) + values["radius"]:.3f}',
             'farthest_m': f'{math.sqrt(values["d1"]) + values["radius"]:.3f}',
             'warnings': '; '.join(decision.warnings), 'edges': ', '.join(decision.edges),

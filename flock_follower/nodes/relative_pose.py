@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-The perception node: images and own odometry in, the neighbours' states out.
+The perception node: images and own odometry in, the neighbors' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
-one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
+one ``neighbors`` and one ``neighbors/acceleration`` message per neighbor measured in an image,
 stamped like the image, the same as NAME/duplicate for another object with the marker of NAME,
-``neighbors/frames`` for every image processed, with or without a neighbour,
+``neighbors/frames`` for every image processed, with or without a neighbor,
 and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
 several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
 """
@@ -64,7 +64,7 @@ from flock_follower.perception.range_tracking import Ranged
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes
-UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
+UNSEEN_TIMEOUT = 2.0  # s without a neighbor, or without an image processed, that is reported
 
 
 class _Camera:
@@ -134,7 +134,7 @@ class RelativePose(FlockNode):
             AccelWithCovarianceStamped, 'neighbors/acceleration', QoSProfile(depth=10))
         self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
         self.diagnostics.checks += [self._sight_problem, self._duplicate_problem]
-        self.diagnostics.sources.append(self._learnt)
+        self.diagnostics.sources.append(self._learned)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=STEADY)
@@ -187,7 +187,7 @@ class RelativePose(FlockNode):
         self._use_ranges()
 
     def _use_ranges(self) -> None:
-        """Publish the states of neighbours out of sight, from the ranges."""
+        """Publish the states of neighbors out of sight, from the ranges."""
         for outcome in self._tracker.ranging.due():
             if isinstance(outcome, Ranged):
                 state, acceleration = self._perceiver.messages(
@@ -249,7 +249,7 @@ class RelativePose(FlockNode):
                 header=image.message.header, height=height, width=width, encoding='bgr8',
                 step=3 * width, data=array('B', drawn.tobytes())))
 
-    def _learnt(self, now: float) -> dict[str, object]:
+    def _learned(self, now: float) -> dict[str, object]:
         """Return the estimates of clock offsets, noise and range errors for /diagnostics."""
         values: dict[str, object] = {'images_processed': self.diagnostics.rate('processed').count}
         for name, camera in self._tracker.cameras.items():

@@ -41,7 +41,7 @@ from std_srvs.srv import SetBool
 
 from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
 from flock_follower.bags.live_line import bar, LiveLine
-from flock_follower.bags.schedule import Gaps, NANOSECONDS, section, Timeline
+from flock_follower.bags.schedule import Gaps, NS_PER_S, section, Timeline
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import percentiles
 from flock_follower.nodes.support.runtime import FlockNode, run
@@ -199,7 +199,7 @@ class Replay(FlockNode):
 
     def _play_over(self, step: float, stamp_ns: int) -> None:
         """Go to a message after a gap in the bag's times, s, without waiting for it."""
-        before = stamp_ns / NANOSECONDS - step - self.bag.start_ns / NANOSECONDS
+        before = stamp_ns / NS_PER_S - step - self.bag.start_ns / NS_PER_S
         self._line.print_above(
             f'warning: the times in the bag jump by {step:+.1f} s at {before:.1f} s: the clock '
             'was set, or nothing was recorded; played without this gap')
@@ -252,11 +252,11 @@ class Replay(FlockNode):
     def _seconds(self, now: float) -> float:
         """Return the bag time reached, s from the start of the bag."""
         position = min(self._timeline.position(now), self._section.stop_ns - 1)
-        return (position - self.bag.start_ns) / NANOSECONDS
+        return (position - self.bag.start_ns) / NS_PER_S
 
     def _show_progress(self, now: float) -> None:
         start_ns, stop_ns = self._section
-        end = (stop_ns - 1 - self.bag.start_ns) / NANOSECONDS
+        end = (stop_ns - 1 - self.bag.start_ns) / NS_PER_S
         share = (self._timeline.position(now) - start_ns) / (stop_ns - start_ns)
         self._line.show(
             f'{bar(share) + " " if self._line.on_terminal else ""}{self._seconds(now):.1f} of '
@@ -265,7 +265,7 @@ class Replay(FlockNode):
 
     def _values(self, now: float) -> dict[str, Any]:
         return {'position_s': f'{self._seconds(now):.2f}', 'paused': self._timeline.paused,
-                'duration_s': f'{self.bag.duration_ns / NANOSECONDS:.2f}'}
+                'duration_s': f'{self.bag.duration_ns / NS_PER_S:.2f}'}
 
 
 def bag_argument(args: list[str]) -> str:

@@ -16,7 +16,7 @@
 The visualizer node: the flight as markers for RViz and Foxglove.
 
 Publishes ``visualizer/markers`` in the frame of ``odom`` while a viewer subscribes: the follower
-with its state and command, and each neighbour with its velocity, the ellipsoid of its position and
+with its state and command, and each neighbor with its velocity, the ellipsoid of its position and
 the planner's band about it. No other node waits for it.
 """
 
@@ -61,7 +61,7 @@ DEGENERATE = 1e-3  # m: the shortest length drawn, viewers refuse sizes of zero
 DEVIATIONS = 2.0  # of the ellipsoids
 VELOCITY_TIME = 1.0  # s: an arrow of velocity ends where it leads in this time
 ACCELERATION_SCALE = 0.5  # m of arrow per m/s^2
-UNSEEN = 0.25  # s without an image of it after which a neighbour is drawn in grey
+UNSEEN = 0.25  # s without an image of it after which a neighbor is drawn in gray
 FORGOTTEN = 10.0  # s after which it is drawn no more
 SILENT = 0.5  # s after which a command is drawn no more
 ABOVE = np.array([0.0, 0.0, 0.3])  # m: the place of a label
@@ -74,7 +74,7 @@ RING = np.array([[math.cos(a), math.sin(a), 0.0] for a in np.linspace(0.0, math.
 Color = tuple[float, float, float, float]
 """Red, green, blue and opacity, each in [0, 1]."""
 
-SEEN, GREY, ELLIPSOID = (0.2, 0.5, 1.0, 0.9), (0.7, 0.7, 0.7, 0.9), (0.2, 0.5, 1.0, 0.25)
+SEEN, GRAY, ELLIPSOID = (0.2, 0.5, 1.0, 0.9), (0.7, 0.7, 0.7, 0.9), (0.2, 0.5, 1.0, 0.25)
 EDGE, INNER, OUTER = (1.0, 1.0, 1.0, 0.6), (0.95, 0.3, 0.2, 0.7), (0.2, 0.8, 0.9, 0.7)
 COMMAND, GUARDED = (0.3, 0.9, 0.3, 1.0), (1.0, 0.55, 0.0, 1.0)
 STATES = {'TRACK': (0.3, 0.9, 0.3, 0.9), 'COAST': (0.95, 0.85, 0.2, 0.9),
@@ -146,13 +146,13 @@ class Visualizer(FlockNode):
         return [reason for reason in REASONS if reason in self._report.get('limits', '')]
 
     def _neighbor(self, state: OdometryState, now: int) -> list[Marker]:
-        """Return a neighbour, its velocity, ellipsoid, edge of the graph, and band."""
+        """Return a neighbor, its velocity, ellipsoid, edge of the graph, and band."""
         name, at, velocity = state.child, state.position, VELOCITY_TIME * state.velocity
         age = (now - state.stamp) / NANOSECONDS
         if age > FORGOTTEN:
             return []
         color, label = (SEEN, name) if age <= UNSEEN else (
-            GREY, f'{name}, not seen for {age:.1f} s')
+            GRAY, f'{name}, not seen for {age:.1f} s')
         drawn = [shape(name, Marker.CUBE, color, BODY_SIZE, at, state.quaternion),
                  shape(f'{name} name', Marker.TEXT_VIEW_FACING, color, TEXT_SIZE, at + ABOVE,
                        text=label)]
@@ -176,7 +176,7 @@ class Visualizer(FlockNode):
     def _follower(self, own: OdometryState, now: int) -> list[Marker]:
         """Return the follower with its state and its command."""
         guarded, state = self._guarded(), self._report.get('state', 'no planner')
-        color, at, command = STATES.get(state, GREY), own.position, self._command
+        color, at, command = STATES.get(state, GRAY), own.position, self._command
         label = [state, *(f'guard: {reason}' for reason in guarded)]
         if state != 'TRACK':
             label.append(self._report.get('reason', ''))
@@ -190,13 +190,13 @@ class Visualizer(FlockNode):
         return drawn
 
 
-def ellipsoid(name: str, centre: Array, covariance: Array) -> Marker:
+def ellipsoid(name: str, center: Array, covariance: Array) -> Marker:
     """Return the ellipsoid of a finite covariance (3, 3), m^2, at ``DEVIATIONS`` sigma."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]
     size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), DEGENERATE)
-    return shape(name, Marker.SPHERE, ELLIPSOID, size, centre, matrix_to_quaternion(axes))
+    return shape(name, Marker.SPHERE, ELLIPSOID, size, center, matrix_to_quaternion(axes))
 
 
 def shape(name: str, kind: int, color: Color, size: ArrayLike, position: ArrayLike = (0, 0, 0),

@@ -47,12 +47,12 @@ from flock_follower.messages import FASTEST, MAX_JUMP
 #: Columns of a row, after the stamp.
 _POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))
 _ATTITUDE = slice(13, 17)
-LONG = 0.012  # s between two samples, beyond which they are interpolated by curves
-SUITING = 0.3  # rad/s: angular velocities that differ more from the turn do not bend it
+CUBIC_BEYOND = 0.012  # s between two samples, beyond which the interpolation is cubic
+MAX_RATE_MISMATCH = 0.3  # rad/s, of measured rates and the turn, for a cubic
 
 
 _NO_TRAVEL: Array = np.zeros(3)
-_ONES = np.ones(3)
+_ONES_3 = np.ones(3)
 
 
 class OdometrySample(NamedTuple):
@@ -119,19 +119,18 @@ class OdometryBuffer:
     AVERAGED = 20
     #: Samples that disagree by more, rad, do not count.
     AGREEMENT = 0.005
-    #: Squared distances are watched over so many looks, later at every third image. Averaged,
-    #: attitudes that drift apart by d in STEADY err by about d / 2, and by their noise /
-    #: sqrt(AVERAGED): better than the noise alone, whose square neighbours have twice, while
-    #: d^2 is less than this times that.
-    LOOKS = 30
-    DRIFT = 2.5
+    #: Comparisons over which squared distances of attitudes are averaged.
+    COMPARISONS = 30
+    #: Attitudes are averaged while drift^2 < this * (step of successive attitudes)^2, which is 2
+    #: noise^2: the average errs by drift / 2 and noise / sqrt(AVERAGED), one attitude by noise.
+    MAX_DRIFT_RATIO = 2.5
     #: If the velocity is derived, a position farther from where it led, m, is a correction.
     STEP = 0.03
 
     def __init__(self) -> None:
         self._rows: Array = np.empty((0, 17))
         self._near = self._far = self._rough = 0.0
-        self._looks = 0
+        self._comparisons = 0
 
     def __len__(self) -> int:
         """Return how many samples are held."""
@@ -190,10 +189,10 @@ class OdometryBuffer:
         if isinstance(after, Missing):
             return after
         if after == len(self):
-            return _extrapolated(OdometrySample.of_row(self._rows[-1].copy()), stamp)
+            return _extrapolate(OdometrySample.of_row(self._rows[-1].copy()), stamp)
         if self._rows[after, 0] == stamp:
             return OdometrySample.of_row(self._rows[after].copy())
-        return _interpolated(self._rows[after - 1], self._rows[after], stamp)
+        return _interpolate(self._rows[after - 1], self._rows[after], stamp)
 
     def places(self, stamps: Array, points: Array) -> Array | None:
         """
@@ -268,7 +267,7 @@ class OdometryBuffer:
         apart = np.copysign(2.0, off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
         if not self._agree(apart, recent[:, _VELOCITY]):
             return state
-        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
+        agreeing = (apart * apart).dot(_ONES_3) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
@@ -287,43 +286,43 @@ class OdometryBuffer:
 
         The noise of the velocities (n, 3) is updated on the way.
 
-        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
+        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbors as far
         apart as first and last. If angular velocities are missing or late, the latter are
         farther apart, and more so than averaging would gain.
         """
-        self._looks += 1
-        if self._looks > self.LOOKS and self._looks % 3:  # it changes slowly
-            return self._far < self.DRIFT * self._near
+        self._comparisons += 1
+        if self._comparisons > self.COMPARISONS and self._comparisons % 3:  # it changes slowly
+            return self._far < self.MAX_DRIFT_RATIO * self._near
         step = apart[1:] - apart[:-1]
         some = max(1, len(apart) // 4)
         way = apart[-some:] - apart[:some]
         near, far = float(np.vdot(step, step)) / len(step), float(np.vdot(way, way)) / some
-        over = min(self._looks, self.LOOKS)
+        over = min(self._comparisons, self.COMPARISONS)
         if len(velocities) > 3:
             third = velocities[3:] - velocities[:-3] - 3.0 * (velocities[2:-1] - velocities[1:-2])
             self._rough += (float(np.vdot(third, third)) / len(third) - self._rough) / over
         self._near += (near - self._near) / over
         self._far += (far - self._far) / over
-        return self._far < self.DRIFT * self._near
+        return self._far < self.MAX_DRIFT_RATIO * self._near
 
 
-def between(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
+def interpolate(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
     """Return the state at a stamp, s, between two samples: as :class:`OdometryBuffer` has it."""
-    return _interpolated(a.row(a.position), b.row(b.position), stamp)
+    return _interpolate(a.row(a.position), b.row(b.position), stamp)
 
 
-def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
+def _interpolate(a: Array, b: Array, stamp: float) -> OdometrySample:
     """Return the sample between two rows."""
     span = float(b[0] - a[0])
     part = float((stamp - a[0]) / span)
     row = (1.0 - part) * a + part * b
     row[0] = stamp
-    if span > LONG:
+    if span > CUBIC_BEYOND:
         # The velocity changes evenly: the way between is a parabola, not a line.
         bend = 0.5 * span * part * (part - 1.0) * (b[_VELOCITY] - a[_VELOCITY])
         row[_POSITION] += bend
         row[_TRAVEL] += bend
-        row[_ATTITUDE] = _turned(a, b, span, part)
+        row[_ATTITUDE] = _cubic_attitude(a, b, span, part)
     elif float(a[_ATTITUDE].dot(b[_ATTITUDE])) > 0.999999:
         # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
         row[_ATTITUDE] = normalize_quaternion(row[_ATTITUDE])
@@ -332,19 +331,19 @@ def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
     return OdometrySample.of_row(row)
 
 
-def _turned(a: Array, b: Array, span: float, part: float) -> Array:
+def _cubic_attitude(a: Array, b: Array, span: float, part: float) -> Array:
     """Return the attitude a part of the way between two rows, a cubic if the rates suit it."""
     turn = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(a[_ATTITUDE]), b[_ATTITUDE]))
     start, end = span * a[_RATE] - turn, span * b[_RATE] - turn
     way = part * turn
-    if float(np.abs(start + end).max()) < SUITING * span:
+    if float(np.abs(start + end).max()) < MAX_RATE_MISMATCH * span:
         # Hermite's cubic with the rates as slopes, as what it adds to the even turn.
         way = way + part * (1.0 - part) * ((1.0 - part) * start - part * end)
     return quaternion_multiply(a[_ATTITUDE], rotation_vector_to_quaternion(way))
 
 
-def _extrapolated(a: OdometrySample, stamp: float) -> OdometrySample:
+def _extrapolate(a: OdometrySample, stamp: float) -> OdometrySample:
     ahead = stamp - a.stamp
     turn = rotation_vector_to_quaternion(a.angular_velocity * ahead)
     step = ahead * a.velocity

@@ -17,19 +17,19 @@ Velocities derived from positions, and angular velocities from attitudes.
 
 The same Kalman filter serves both: value, rate and acceleration along each axis, driven by white
 jerk (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-section 6.2). The measurement noise is learnt from the innovations.
+section 6.2). The measurement noise is learned from the innovations.
 
 Frame of a source's velocity, found by a comparison with the motion of its positions.
 
 REP-105 specifies the child frame. Some sources use the header's frame, others send no velocity, or
 a wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
 the displacement. The evidence for one reading adds up, window by window, if the readings differ
-(with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING`` windows in a row, at
-first or later, the velocity is dropped. The velocity is used again once it agrees in as
-many windows in motion, or in ``EXPIRES`` windows at rest.
+(with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING_WINDOWS`` in a row, at
+first or later, the velocity is dropped. The velocity is used again once it agrees in as many
+windows in motion, or in ``EXPIRES`` windows at rest.
 
 Before the frame is found, REP-105's child frame is used while both readings are the same, and the
-likelier reading once the evidence favours one. Otherwise the velocity is derived from the
+likelier reading once the evidence favors one. Otherwise the velocity is derived from the
 positions, as it is while the last window contradicts both readings, and after a contradiction
 until a frame is found again. A velocity of exactly 0 counts as missing. The covariance of the
 twist includes the probability that the reading is wrong.
@@ -124,8 +124,8 @@ class DerivedVelocity(_WhiteJerk):
 
     #: Positions closer together than this, s, add no information: filter errors are not white.
     SHORTEST = 0.018
-    #: So often they are: measured errors of the velocity, squared, are several times the filter's.
-    CORRELATED = 4.0
+    #: Position errors are correlated: the measured velocity variance is 4 times the filter's.
+    VARIANCE_FACTOR = 4.0
     #: A position this many deviations from where it was expected is a step, not motion: a filter
     #: that corrects itself makes them. After some in a row it is motion after all.
     STEP = 4.0
@@ -143,7 +143,7 @@ class DerivedVelocity(_WhiteJerk):
     @property
     def variance_of_velocity(self) -> float:
         """Return the variance of the velocity along an axis, (m/s)^2."""
-        return self.CORRELATED * self._covariance[3]
+        return self.VARIANCE_FACTOR * self._covariance[3]
 
     def velocity_at(self, stamp: float) -> Array:
         """Return the velocity (3,), m/s, at a stamp, s, soon after the newest position."""
@@ -214,30 +214,33 @@ AUTO: Final = 'auto'
 CHOICES: Final = (AUTO, CHILD, ODOM, NONE)
 #: s over which velocities and positions are compared.
 WINDOW: Final[float] = 0.5
-#: A window has pieces of so many s, at least this many. A filter that corrects itself makes steps
-#: in single pieces (0.29 m in a real flight), a velocity read wrongly is wrong in all.
+#: Length of a piece of a window, s. A filter that corrects itself makes steps in single pieces
+#: (0.29 m in a real flight); a velocity read wrongly is wrong in all.
 PIECE: Final[float] = 0.095
-FEWEST: Final[int] = 3
+#: Least number of pieces of a window.
+MIN_PIECES: Final[int] = 3
 #: Windows in a row in which no frame of the twist fits, after which the twist is not used.
-AGREEING: Final[int] = 2
+AGREEING_WINDOWS: Final[int] = 2
 #: Windows in a row that fit, at any speed, after which a frame that was found before is used
 #: again: 4 s.
 EXPIRES: Final[int] = 8
 #: Log of the likelihood ratio that decides for one frame: frames that differ by three deviations
-#: give 4.5. One window counts for less, so that a single window decides nothing.
-SURE: Final[float] = 6.0
-MOST_OF_ONE: Final[float] = 4.0
+#: give 4.5.
+DECIDING_EVIDENCE: Final[float] = 6.0
+#: Largest log of the likelihood ratio of one window, so that a single window decides nothing.
+MAX_WINDOW_EVIDENCE: Final[float] = 4.0
 #: Log of the likelihood ratio from which on a reading is used before one is found: 3 to 1.
-LIKELY: Final[float] = 1.0
+LIKELY_EVIDENCE: Final[float] = 1.0
 #: Readings that differ by less, m/s along any axis: REP-105's is used before the evidence decides.
-SAME: Final[float] = 0.1
-#: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
-#: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
-DEVIATION: Final[float] = 0.05
-SHARE: Final[float] = 0.03
+SAME_VELOCITY: Final[float] = 0.1
+#: Standard deviation of a sound velocity from the way covered in a window, m/s (real sources: 0.02
+#: to 0.05).
+VELOCITY_DEVIATION: Final[float] = 0.05
+#: The same as a share of the speed, which adds to it.
+SPEED_DEVIATION: Final[float] = 0.03
 #: A piece: time, s, then m: way (3,), and how much longer it is by either reading (2, 3). In plain
 #: numbers: arrays so small would take several times as long, for every message.
-_NOTHING: Final = (0.0,) * 10
+_EMPTY_PIECE: Final = (0.0,) * 10
 _Numbers = tuple[float, ...]
 
 
@@ -275,7 +278,8 @@ class TwistFrame:
             return self.frame
         if self._failing or self.contradiction or not child.any():
             return NONE
-        if abs(self._evidence) < LIKELY and float(np.abs(child - odom).max()) > SAME:
+        differ = float(np.abs(child - odom).max()) > SAME_VELOCITY
+        if abs(self._evidence) < LIKELY_EVIDENCE and differ:
             return NONE
         return CHILD if self._evidence >= 0.0 else ODOM
 
@@ -299,7 +303,7 @@ class TwistFrame:
 
     def _begin(self) -> None:
         self._pieces: list[_Numbers] = []
-        self._piece: _Numbers = _NOTHING
+        self._piece: _Numbers = _EMPTY_PIECE
 
     def take(self, stamp: float, position: Array, child: Array, odom: Array) -> None:
         """Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways."""
@@ -316,8 +320,8 @@ class TwistFrame:
         if self._piece[0] < PIECE:
             return
         self._pieces.append(self._piece)
-        self._piece = _NOTHING
-        if len(self._pieces) >= FEWEST:
+        self._piece = _EMPTY_PIECE
+        if len(self._pieces) >= MIN_PIECES:
             pieces = np.array(self._pieces)
             if pieces[:, 0].sum() > WINDOW - 0.5 * PIECE:
                 self._judge(pieces[:, 0], pieces[:, 1:4], pieces[:, 4:].reshape(-1, 2, 3))
@@ -334,7 +338,7 @@ class TwistFrame:
         time = float(times.sum())
         way, mean = ways.sum(axis=0), offs.sum(axis=0) / time
         speed = float(np.linalg.norm(way)) / time
-        tolerance = 3.0 * (DEVIATION + SHARE * speed)
+        tolerance = 3.0 * (VELOCITY_DEVIATION + SPEED_DEVIATION * speed)
         self.windows.append(np.array([way / time, *(way / time + mean)]))
         means = np.linalg.norm(mean, axis=1)
         # Noise of the positions is least in the mean, and single steps do not show in the median.
@@ -346,16 +350,16 @@ class TwistFrame:
             return
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
-        if self._failing >= AGREEING:
+        if self._failing >= AGREEING_WINDOWS:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self._before, self._agreeing, self._moving = self.found, 0, 0
             self.found, self.contradiction = NONE, float(off[used])
             return
-        if float(np.linalg.norm(mean[0] - mean[1])) < DEVIATION:
+        if float(np.linalg.norm(mean[0] - mean[1])) < VELOCITY_DEVIATION:
             return  # errors would decide
-        likelier = float(means[1]**2 - means[0]**2) / (2.0 * DEVIATION**2)
-        self._evidence += min(max(likelier, -MOST_OF_ONE), MOST_OF_ONE)
-        if not self.found and abs(self._evidence) >= SURE and fits:
+        likelier = float(means[1]**2 - means[0]**2) / (2.0 * VELOCITY_DEVIATION**2)
+        self._evidence += min(max(likelier, -MAX_WINDOW_EVIDENCE), MAX_WINDOW_EVIDENCE)
+        if not self.found and abs(self._evidence) >= DECIDING_EVIDENCE and fits:
             self.found = CHILD if self._evidence > 0.0 else ODOM
 
     def _recover(self, fitting: list[str], moving: bool) -> None:
@@ -363,7 +367,7 @@ class TwistFrame:
         self._agreeing = self._agreeing + 1 if fitting else 0
         self._moving = self._moving + moving if fitting else 0
         known = self._before in fitting
-        if self._moving >= AGREEING or (known and self._agreeing >= EXPIRES):
+        if self._moving >= AGREEING_WINDOWS or (known and self._agreeing >= EXPIRES):
             self.found, self._failing = self._before if known else '', 0
             if not known:
                 self._evidence = 0.0  # another frame, or none was known: it is sought anew

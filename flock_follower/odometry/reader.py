@@ -69,15 +69,15 @@ from flock_follower.odometry.derivation import (
 from flock_follower.ranges import Checked, parameter, Range
 
 #: If the reading of the velocity changes, the step is faded out with this time constant, s.
-FADING = 0.5
+FADE_TIME = 0.5
 #: Messages over which latency and rate are reported.
-REMEMBERED = 50
+MAX_REPORTED = 50
 #: Number of attitudes kept, to derive angular rates if the messages have none.
-ATTITUDES = 100
+MAX_ATTITUDES = 100
 #: A velocity of this variance, (m/s)^2, is invalid: rtabmap sends zeros with 9999 without one.
-NO_VELOCITY = 1e3
+INVALID_VARIANCE = 1e3
 _ORDERS: Final = {b'\x00\x00': '>', b'\x00\x01': '<'}
-_BEGIN: Final[int] = 4  # bytes before the first that counts for alignment
+_ALIGNMENT_START: Final[int] = 4  # bytes before the first that counts for alignment
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ class OdometrySource:
         self._covariances_before: dict[str, tuple[bytes, Array]] = {}  # as given, as used
         self.missing: dict[str, str] = {}
         """What the messages lack, and its replacement."""
-        self._latencies: deque[float] = deque(maxlen=REMEMBERED)
-        self._gaps: deque[float] = deque(maxlen=REMEMBERED)
+        self._latencies: deque[float] = deque(maxlen=MAX_REPORTED)
+        self._gaps: deque[float] = deque(maxlen=MAX_REPORTED)
         self._frames: tuple[str, str] | None = None
         self.place_child(Transform.from_quaternion(
             self.params.child_position, quaternion_from_rpy(*self.params.child_rpy)))
@@ -150,7 +150,7 @@ class OdometrySource:
         self._doubt: Array = np.zeros(3)  # by how much the two readings differ, in odom
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
-        self._attitudes: deque[tuple[float, Array]] = deque(maxlen=ATTITUDES)
+        self._attitudes: deque[tuple[float, Array]] = deque(maxlen=MAX_ATTITUDES)
         self.twist.restart()
         self._latencies.clear()
         self._gaps.clear()
@@ -265,7 +265,7 @@ class OdometrySource:
                 # The step that another reading would be is faded out.
                 self._fading = (self._fading + self._as_read(before, time, child, odom)) - velocity
         if self._fading.any():
-            self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
+            self._fading = self._fading * math.exp(-self._gaps[-1] / FADE_TIME)
             velocity = velocity + self._fading
         return velocity
 
@@ -340,9 +340,9 @@ def read_odometry(data: bytes) -> Any:
     if order is None:
         raise ValueError('not an Odometry message: it has no valid CDR header')
     try:
-        seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, _BEGIN)
-        frame = str(data[_BEGIN + 12:_BEGIN + 11 + length], 'utf-8')
-        at = _aligned(_BEGIN + 12 + length, 4)
+        seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, _ALIGNMENT_START)
+        frame = str(data[_ALIGNMENT_START + 12:_ALIGNMENT_START + 11 + length], 'utf-8')
+        at = _aligned(_ALIGNMENT_START + 12 + length, 4)
         length, = struct.unpack_from(f'{order}I', data, at)
         child = str(data[at + 4:at + 3 + length], 'utf-8')
         at = _aligned(at + 4 + length, 8)
@@ -362,7 +362,7 @@ def read_odometry(data: bytes) -> Any:
 
 
 def _aligned(at: int, size: int) -> int:
-    return at + (_BEGIN - at) % size
+    return at + (_ALIGNMENT_START - at) % size
 
 
 def _pose(message: Any) -> tuple[Array, Array]:
@@ -393,5 +393,5 @@ def _twist(message: Any) -> tuple[Array | None, Array]:
     """Return the velocity (3,), None if invalid, and the rates (3,), zeros if invalid."""
     twist = message.twist.twist
     (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
-    known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
+    known = not message.twist.covariance[0] >= INVALID_VARIANCE  # NaN is not known to be large
     return linear if known and moving else None, rates if turning else np.zeros(3)

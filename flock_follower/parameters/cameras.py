@@ -28,9 +28,10 @@ from typing import Any, Final, NamedTuple
 from flock_follower.parameters.spec import NAMES, Spec
 from flock_follower.ranges import MAX_OFFSET, Range
 
-#: Default pose of a camera: in front of the middle of the vehicle, looking ahead.
-POSITION: Final = (0.10, 0.0, 0.0)
-AHEAD: Final = (0.0, 0.0, 0.0)
+#: Default position of a camera on the body, m: in front of the middle of the vehicle.
+DEFAULT_POSITION: Final = (0.10, 0.0, 0.0)
+#: Default attitude of a camera on the body, rad: it looks ahead.
+DEFAULT_RPY: Final = (0.0, 0.0, 0.0)
 
 CAMERA_SPECS = [
     Spec(NAMES, [''],
@@ -39,9 +40,9 @@ CAMERA_SPECS = [
     Spec('camera.NAME.image', 'NAME/image_raw',
          "topic of the camera's images; of compressed images without /compressed"),
     Spec('camera.NAME.camera_info', 'NAME/camera_info', "topic of the camera's calibration"),
-    Spec('camera.NAME.position', list(POSITION),
+    Spec('camera.NAME.position', list(DEFAULT_POSITION),
          'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
-    Spec('camera.NAME.rpy', list(AHEAD),
+    Spec('camera.NAME.rpy', list(DEFAULT_RPY),
          'roll, pitch, yaw of the camera on the body; zeros look ahead, [0, 0, 1.5708] to the '
          'left',
          Range(unit='rad'), fixed_length=True),
@@ -53,7 +54,8 @@ CAMERA_SPECS = [
 ]
 #: The parameters of one camera that has no name: their key below camera.NAME, and the default.
 ALONE: Final[Mapping[str, tuple[str, Any]]] = {
-    'camera_position': ('position', list(POSITION)), 'camera_rpy': ('rpy', list(AHEAD)),
+    'camera_position': ('position', list(DEFAULT_POSITION)),
+    'camera_rpy': ('rpy', list(DEFAULT_RPY)),
     'rectified': ('rectified', False), 'time_offset': ('time_offset', 0.0),
     'readout_time': ('readout_time', 0.0)}
 
@@ -65,8 +67,8 @@ class CameraValues(NamedTuple):
     image: str = 'image_raw'
     """Base topic of the images; see :meth:`images`."""
     camera_info: str = 'camera_info'
-    position: Sequence[float] = POSITION
-    rpy: Sequence[float] = AHEAD
+    position: Sequence[float] = DEFAULT_POSITION
+    rpy: Sequence[float] = DEFAULT_RPY
     rectified: bool = False
     time_offset: float = 0.0
     readout_time: float = 0.0

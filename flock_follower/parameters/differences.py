@@ -20,12 +20,12 @@ from collections.abc import Mapping
 from typing import Any
 
 #: More differences of two sets of parameters than this are counted, not listed.
-MOST_LISTED = 5
+MAX_LISTED = 5
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """Return the parameters that differ, with both values: 'v_max 0.5 -> 1.0'; '' if none do."""
     changed = [f'{name} {before.get(name, "not set")} -> {after.get(name, "not set")}'
                for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
-    more = len(changed) - MOST_LISTED
-    return ', '.join([*changed[:MOST_LISTED], *([f'and {more} more'] if more > 0 else [])])
+    more = len(changed) - MAX_LISTED
+    return ', '.join([*changed[:MAX_LISTED], *([f'and {more} more'] if more > 0 else [])])

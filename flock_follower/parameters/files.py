@@ -65,7 +65,7 @@ def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | Non
     """
     Return the values in the file beside a recording of the black box; None without a file.
 
-    A neighbours' file that they name is looked for beside the recording, too.
+    A neighbors' file that they name is looked for beside the recording, too.
 
     :raises ValueError, OSError: see :func:`read_parameters`.
     """

@@ -21,7 +21,7 @@ from typing import Any
 
 from flock_follower.files import resource
 from flock_follower.odometry.reader import SourceParams
-from flock_follower.parameters.cameras import AHEAD, CAMERA_SPECS, cameras, POSITION
+from flock_follower.parameters.cameras import CAMERA_SPECS, cameras, DEFAULT_POSITION, DEFAULT_RPY
 from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.perception.markers import load
 from flock_follower.perception.neighbor_filter import FilterParams
@@ -34,9 +34,9 @@ RELATIVE_POSE = [
     Spec('neighbors_file', '',
          'YAML file of the neighbours and their markers; empty: config/neighbors.yaml of this '
          'package'),
-    Spec('camera_position', list(POSITION),
+    Spec('camera_position', list(DEFAULT_POSITION),
          'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
-    Spec('camera_rpy', list(AHEAD),
+    Spec('camera_rpy', list(DEFAULT_RPY),
          'roll, pitch, yaw of the camera on the body; zeros look ahead',
          Range(unit='rad'), fixed_length=True),
     Spec('image_transport', 'raw',

@@ -181,7 +181,7 @@ def test_mcap_without_indexes_is_read_in_order(
 def test_a_channel_that_is_not_of_ros_is_skipped_by_name(
         tmp_path: Path, encoding: str, schema: tuple[str, str, bytes] | None) -> None:
     other = Channel('/log', encoding, schema, lambda number: b'{}')
-    reason = {'/log': f'serialised as {encoding!r}, not CDR'}
+    reason = {'/log': f'serialized as {encoding!r}, not CDR'}
     assert read(write_mcap(tmp_path / 'a.mcap', other, CHATTER)) == ('', reason)
     assert error_of(write_mcap(tmp_path / 'b.mcap', other)).endswith(
         f'b.mcap: holds no message that can be read; /log: {reason["/log"]}')
@@ -222,7 +222,7 @@ def test_a_topic_of_another_serialization_is_named(tmp_path: Path) -> None:
             with sqlite3.connect(path / 'sqlite3.db3') as file:
                 file.execute("UPDATE topics SET serialization_format = 'other'")
         assert error_of(path).endswith(
-            "holds no message that can be read; /chatter: serialised as 'other', not CDR")
+            "holds no message that can be read; /chatter: serialized as 'other', not CDR")
 
 
 def test_messages_lost_in_an_unindexed_file_are_noticed(tmp_path: Path) -> None:

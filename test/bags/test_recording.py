@@ -33,9 +33,9 @@ from flock_follower.bags.bag import BagError, BagMessage, open_bag, serialize
 from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import typestore
 from flock_follower.bags.recording import FlightRecording
-from flock_follower.bags.schedule import NANOSECONDS
+from flock_follower.bags.schedule import NS_PER_S
 
-START = 1_700_000_000 * NANOSECONDS
+START = 1_700_000_000 * NS_PER_S
 STRING = 'std_msgs/msg/String'
 WORDS = RecordedTopic('/words', STRING)
 STATE = RecordedTopic('/state', STRING, latched=True, source='/drone1/state')
@@ -55,7 +55,7 @@ def word(number: int, size: int = 40) -> bytes:
 
 def second(number: int, size: int = 40) -> list[TakenMessage]:
     """Return ten messages of a second."""
-    return [TakenMessage(WORDS, START + number * NANOSECONDS + k, word(10 * number + k, size))
+    return [TakenMessage(WORDS, START + number * NS_PER_S + k, word(10 * number + k, size))
             for k in range(10)]
 
 
@@ -123,7 +123,7 @@ def test_every_write_is_on_the_disk_when_it_returns(
 
 
 @pytest.mark.parametrize(('writes', 'recordings'), [
-    ((second(1)[::-1], [TakenMessage(WORDS, START + NANOSECONDS - 5, word(20))]),  # a little late
+    ((second(1)[::-1], [TakenMessage(WORDS, START + NS_PER_S - 5, word(20))]),  # a little late
      [[*range(10, 20), 20]]),
     ((second(100), second(0)), [[*range(1000, 1010)], [*range(10)]]),  # the clock was set
     ((second(-1_600_000_000), second(1)), [[*range(-16_000_000_000, -15_999_999_990)],
@@ -228,7 +228,7 @@ def recorded(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
     """Return a recording of 8 chunks, and its messages."""
     box = FlightRecording(tmp_path / 'box', *LIMITS)
     for number in range(8):
-        box.write([TakenMessage(STATE, START + number * NANOSECONDS, word(number)),
+        box.write([TakenMessage(STATE, START + number * NS_PER_S, word(number)),
                    *second(number)], number)
     path = box.path
     assert path is not None

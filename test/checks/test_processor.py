@@ -20,15 +20,15 @@ from pathlib import Path
 import pytest
 
 from flock_follower.checks.processor import (
-    BUSY,
+    BUSY_SHARE,
     children,
     Load,
+    LOAD_WINDOW,
     LoadMeter,
     longest_wait,
     read_counters,
     stopped,
     threads_of,
-    WINDOW,
 )
 
 TICK = 0.01  # s of /proc/stat
@@ -104,7 +104,8 @@ def test_other_programs_that_leave_a_processor_free_disturb_nobody(kernel: Kerne
     assert load is not None and load.others == pytest.approx(1.0, abs=0.02) and not load.busy
 
 
-@pytest.mark.parametrize(('share', 'busy'), [(BUSY - 0.01, False), (BUSY + 0.01, True)])
+@pytest.mark.parametrize(('share', 'busy'),
+                         [(BUSY_SHARE - 0.01, False), (BUSY_SHARE + 0.01, True)])
 def test_it_is_busy_from_a_share_on(share: float, busy: bool) -> None:
     assert Load(share, 1.0, 2).busy == busy
 
@@ -117,7 +118,7 @@ def test_one_busy_window_is_enough_and_those_before_do_not_count(kernel: Kernel)
         meter.sample(kernel.time)
     worst = meter.worst()
     assert worst is not None and worst.share == pytest.approx(0.375, abs=0.01)
-    later = meter.worst(11.5 + WINDOW)
+    later = meter.worst(11.5 + LOAD_WINDOW)
     assert later is not None and later.share == pytest.approx(0.0, abs=1e-6)
 
 
@@ -154,7 +155,7 @@ def test_the_longest_wait_is_that_of_one_thread(kernel: Kernel) -> None:
 
 
 @pytest.mark.parametrize(('state', 'expected'), [('T', True), ('t', True), ('S', False)])
-def test_a_stopped_process_is_recognised_whatever_its_name(
+def test_a_stopped_process_is_recognized_whatever_its_name(
         tmp_path: Path, state: str, expected: bool) -> None:
     (tmp_path / '7').mkdir()
     (tmp_path / '7' / 'stat').write_text(f'7 (a) T b) {state} 1 7 7 0\n')

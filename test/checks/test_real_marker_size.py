@@ -27,8 +27,8 @@ import pytest
 from real_vio import fitted_corners, FOLDER, Recording
 
 from flock_follower.checks.image_motion import OwnPath
-from flock_follower.checks.marker_size import distance_ratio, Ratio, SIZE
-from flock_follower.checks.own_motion import SURE
+from flock_follower.checks.marker_size import distance_ratio, Ratio, SIZE_WARNING
+from flock_follower.checks.own_motion import SIGNIFICANT_SIGMAS
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.odometry.reader import OdometrySource
 
@@ -69,8 +69,8 @@ def test_the_size_of_tags_on_walls_is_confirmed_or_named() -> None:
             one = distance_ratio(size * arms, places, rotations,
                                  recording.T_base_camera.translation)
             found += [one] if one is not None and one.at_rest else []
-        sure = [one for one in found if one.deviation < SIZE]
-        named = [abs(one.ratio - 1.0) > max(SIZE, SURE * one.deviation)
+        sure = [one for one in found if one.deviation < SIZE_WARNING]
+        named = [abs(one.ratio - 1.0) > max(SIZE_WARNING, SIGNIFICANT_SIGMAS * one.deviation)
                  for one in (found if size == 1.0 else sure)]
         assert len(sure) >= 8, len(sure)
         assert all(named) if size != 1.0 else not any(named), found

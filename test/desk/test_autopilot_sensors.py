@@ -75,14 +75,14 @@ def test_a_jump_is_an_outlier_unless_the_reset_counter_announces_it():
     assert flight.last('LOCAL_POSITION_NED').y == pytest.approx(5.0, abs=0.5)
 
 
-@pytest.mark.parametrize(('personality', 'synchronised', 'age', 'used'), [
+@pytest.mark.parametrize(('personality', 'synchronized', 'age', 'used'), [
     ('px4', True, 0.05, True), ('px4', True, 0.5, False), ('px4', True, -1.0, False),
     ('px4', False, 0.5, True), ('arducopter', True, 0.5, True)])
-def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learnt(
-        personality, synchronised, age, used):
+def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learned(
+        personality, synchronized, age, used):
     flight = Flight(personality, start='landed', parameters=BLIND[personality])
     flight.fly(0.01)
-    if synchronised:  # our clock is 1000 s ahead of the autopilot's
+    if synchronized:  # our clock is 1000 s ahead of the autopilot's
         flight.send(mavlink.MAVLink_timesync_message(
             round((1000.0 + flight.now) * 1e9), flight.last('TIMESYNC').ts1))
     flight.fly(0.5, lambda: odometry((0.0, 0.0, 0.0), time=1000.0 + flight.now - age))

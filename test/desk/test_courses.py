@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flock_desk.scenarios.courses import Course, course, STEP, turn_rate, wind_course
+from flock_desk.scenarios.courses import Course, course, COURSE_STEP, turn_rate, wind_course
 from flock_desk.scenarios.flock import facing_ahead, Flock, FORMATIONS, places
 from flock_desk.scenarios.scenario import LeaderMotion, Leg, Scenario, Start, Wind
 from flock_desk.scenarios.scenario_file import load
@@ -47,17 +47,17 @@ def test_acceleration_and_jerk_are_bounded_and_speed_is_reached(name: str) -> No
     motion = MOTIONS[name]
     c = flown(motion)
     speeds = np.linalg.norm(c.velocities, axis=1)
-    jerks = np.linalg.norm(np.diff(c.accelerations, axis=0), axis=1) / STEP
+    jerks = np.linalg.norm(np.diff(c.accelerations, axis=0), axis=1) / COURSE_STEP
     assert np.linalg.norm(c.accelerations, axis=1).max() <= 1.02 * motion.acceleration
     assert jerks.max() <= 1.2 * motion.jerk
     wanted = 1.2 if name == 'legs' else motion.speed[0]
     assert 0.9 * wanted <= speeds.max() <= wanted + 1e-9
-    assert np.all(speeds[:round(motion.wait / STEP)] == 0.0)
+    assert np.all(speeds[:round(motion.wait / COURSE_STEP)] == 0.0)
     # Positions, velocities and accelerations fit together.
-    assert np.gradient(c.positions, STEP, axis=0)[1:-1] == pytest.approx(
+    assert np.gradient(c.positions, COURSE_STEP, axis=0)[1:-1] == pytest.approx(
         c.velocities[1:-1], abs=1e-4)
-    assert np.gradient(c.velocities, STEP, axis=0) == pytest.approx(c.accelerations)
-    p, v, _, _ = c.at(10.0 + STEP / 2)
+    assert np.gradient(c.velocities, COURSE_STEP, axis=0) == pytest.approx(c.accelerations)
+    p, v, _, _ = c.at(10.0 + COURSE_STEP / 2)
     assert p == pytest.approx(c.positions[1200:1202].mean(axis=0))
     assert v == pytest.approx(c.velocities[1200:1202].mean(axis=0))
     assert np.array_equal(c.at(1e9)[0], c.positions[-1])
@@ -65,8 +65,8 @@ def test_acceleration_and_jerk_are_bounded_and_speed_is_reached(name: str) -> No
 
 def test_a_circle_is_round_and_a_figure_eight_crosses_itself() -> None:
     later = flown(MOTIONS['circle']).positions[1200:, :2]
-    centre = (later.max(axis=0) + later.min(axis=0)) / 2
-    assert np.linalg.norm(later - centre, axis=1) == pytest.approx(1.6, abs=0.02)
+    center = (later.max(axis=0) + later.min(axis=0)) / 2
+    assert np.linalg.norm(later - center, axis=1) == pytest.approx(1.6, abs=0.02)
     eight = flown(MOTIONS['figure_eight'], bearing=(0.0, 0.0)).positions
     assert np.linalg.norm(eight[1200:] - eight[0], axis=1).min() < 0.05
     assert np.abs(eight[:, 0] - eight[0, 0]).max() == pytest.approx(2.0, abs=0.02)
@@ -78,10 +78,10 @@ def test_heading_is_fixed_along_the_course_or_away_no_faster_than_a_pilot_turns(
     assert c.headings[1200:] == pytest.approx(np.arctan2(moving[:, 1], moving[:, 0]))
     assert not flown(MOTIONS['circle']).headings.any()
     heading, offset = 0.0, np.array([0.0, 2.0, 0.3])
-    for _ in range(round(4.0 / STEP)):
+    for _ in range(round(4.0 / COURSE_STEP)):
         rate = turn_rate(heading, offset)
         assert abs(rate) <= 1.0
-        heading += STEP * float(rate)
+        heading += COURSE_STEP * float(rate)
     assert heading == pytest.approx(np.pi / 2.0, abs=0.01)
     assert turn_rate(np.array([3.0, -3.0]), np.array([[-1.0, 0.0, 0.0]] * 2)) == pytest.approx(
         [2.0 * (np.pi - 3.0), -2.0 * (np.pi - 3.0)])

@@ -26,10 +26,10 @@ from flock_desk.camera.renderer import T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown import EmbeddedVehicle, ExternalLeader, ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
     calibration,
+    CAMERA_SENSOR,
     LATEST_NS,
     real_time_camera,
     RealTimeFlight,
-    SENSOR,
     STEP_NS,
 )
 from flock_desk.closed_loop.scenario_run import ScenarioRun
@@ -298,7 +298,7 @@ def test_a_leader_elsewhere_is_where_it_reports_and_the_scenarios_does_not_fly(c
         assert frame.usable
         assert frame.leader.position == pytest.approx([0.0, north, 2.0], abs=1e-6)
         # Every pose that the image shows had been reported.
-        assert START + frame.stamp_ns + round(0.5e9 * SENSOR.exposure) <= flown.ahead.newest
+        assert START + frame.stamp_ns + round(0.5e9 * CAMERA_SENSOR.exposure) <= flown.ahead.newest
     assert len(flown.frames) >= 73 and flown.flight.skipped_images == 0
     leader = ExternalLeader(flown.ahead, START, np.zeros(3))
     for stalled, there in ((0.1, True), (0.2, False)):

@@ -32,7 +32,7 @@ from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Tr
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
 
-FISHEYE = Camera(focal_x=372.4, focal_y=372.1, centre_x=318.8, centre_y=241.7,
+FISHEYE = Camera(focal_x=372.4, focal_y=372.1, center_x=318.8, center_y=241.7,
                  model='equidistant', distortion=(-0.018, 0.012, -0.009, 0.002))
 #: As wide as they come: its corners are beyond the image circle.
 WIDE = Camera(212, 200, 71.5, 71.5, 105.3, 100.9, 'equidistant',
@@ -55,8 +55,8 @@ POSES = {
 
 def project(camera, points):
     """Return pixels (N, 2) of points (N, 3) in the optical frame, by OpenCV."""
-    matrix = np.array([[camera.focal_x, 0, camera.centre_x],
-                       [0, camera.focal_y, camera.centre_y], [0, 0, 1.0]])
+    matrix = np.array([[camera.focal_x, 0, camera.center_x],
+                       [0, camera.focal_y, camera.center_y], [0, 0, 1.0]])
     projection = cv2.fisheye.projectPoints if camera.model == 'equidistant' else cv2.projectPoints
     pixels, _ = projection(np.reshape(points, (-1, 1, 3)), np.zeros(3), np.zeros(3), matrix,
                            np.array(camera.distortion))
@@ -64,8 +64,8 @@ def project(camera, points):
 
 
 def model_of(camera):
-    return CameraModel(np.array([[camera.focal_x, 0, camera.centre_x],
-                                 [0, camera.focal_y, camera.centre_y], [0, 0, 1]]),
+    return CameraModel(np.array([[camera.focal_x, 0, camera.center_x],
+                                 [0, camera.focal_y, camera.center_y], [0, 0, 1]]),
                        camera.distortion, camera.model, camera.width, camera.height)
 
 
@@ -113,15 +113,15 @@ def test_light_becomes_a_pixel_by_vignetting_gamma_and_noise_that_repeats_with_t
     sensor = Sensor(gamma=1.0, vignetting=0.0, gain=1.0, full_well=2000.0, read_noise=20.0)
     renderer = Renderer(STRAIGHT, sensor)
     for radiance in (0.1, 0.5):
-        grey = np.full((480, 640), radiance, dtype=np.float32)
-        image = renderer.develop(3, grey) / 255.0
+        gray = np.full((480, 640), radiance, dtype=np.float32)
+        image = renderer.develop(3, gray) / 255.0
         assert image.mean() == pytest.approx(radiance, abs=0.001)
         expected = radiance / 2000.0 + (20.0 / 2000.0)**2 + 1.0 / 12.0 / 255.0**2
         assert image.var() == pytest.approx(expected, rel=0.02)
     again = Renderer(STRAIGHT, sensor)
-    np.testing.assert_array_equal(renderer.develop(7, grey), again.develop(7, grey))
-    assert (renderer.develop(7, grey) != renderer.develop(8, grey)).any()
-    image = Renderer(STRAIGHT, Sensor(gain=1.0, full_well=1e12, read_noise=0.0)).develop(0, grey)
+    np.testing.assert_array_equal(renderer.develop(7, gray), again.develop(7, gray))
+    assert (renderer.develop(7, gray) != renderer.develop(8, gray)).any()
+    image = Renderer(STRAIGHT, Sensor(gain=1.0, full_well=1e12, read_noise=0.0)).develop(0, gray)
     x, y = STRAIGHT.rays(np.array(0.0), np.array(0.0))
     light = 0.5 / (1 + 0.35 * (x**2 + y**2))**2  # vignetting in the corner
     assert image[237, 322] == round(255 * 0.5**(1 / 2.2))

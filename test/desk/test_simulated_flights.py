@@ -31,13 +31,13 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop import campaign
+from flock_desk.closed_loop.camera_views import CameraViews
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.metrics import band_exits, Flights, joined, measure, STATES, summary
 from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
-from flock_desk.scenarios.courses import STEP
+from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
     Leg,
@@ -201,7 +201,7 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(monkeypatch: pytest.Mo
     class EnoughError(Exception):  # what comes later is not asked about
         pass
 
-    class Watched(Lookout):
+    class Watched(CameraViews):
         def arrived(self, now: float) -> Any:
             arrived = super().arrived(now)
             nearest.append(float(self._world.distances.min()))
@@ -215,7 +215,7 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(monkeypatch: pytest.Mo
                     errors.append(float(away - world.distances[row, 0]))
             return arrived
 
-    monkeypatch.setattr(campaign, 'Lookout', Watched)
+    monkeypatch.setattr(campaign, 'CameraViews', Watched)
     scenario = load('range_only_5s')
     # The course of the leader depends on how long it is.
     with pytest.raises(EnoughError):
@@ -322,13 +322,15 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
                        # Nobody holds the altitude.
                        response=Response(thrust_error=0.0, odometry_delay=(0.0, 0.0)))
     world, ages, images = World(scenario, [0, 1]), [], []
-    lookout = Lookout(world, PerceptionNoise())
+    lookout = CameraViews(world, PerceptionNoise())
     for k in range(1, 360):
         world.advance(k)
         lookout.look(k)
-        ages += [k * STEP - own.stamp for own in world.odometry(k * STEP) if own and k > 60]
-        images += [k * STEP - seen[0].estimate.stamp for _, seen in lookout.arrived(k * STEP)
+        ages += [k * COURSE_STEP - own.stamp for own in world.odometry(k * COURSE_STEP) if own
+                 and k > 60]
+        images += [k * COURSE_STEP - seen[0].estimate.stamp for _,
+                   seen in lookout.arrived(k * COURSE_STEP)
                    if seen]
-    assert [min(ages), max(ages)] == pytest.approx([0.06, 0.16], abs=STEP)
+    assert [min(ages), max(ages)] == pytest.approx([0.06, 0.16], abs=COURSE_STEP)
     # An image waits for the odometry after it.
     assert min(images) + 1e-9 >= 0.06 and max(images) < 0.16 + 2 / 30

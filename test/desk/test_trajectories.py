@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from flock_desk.scenarios.trajectories import fly, leader_course, STEP
+from flock_desk.scenarios.trajectories import fly, leader_course, TRACK_STEP
 from flock_follower.geometry import quaternion_to_matrix
 
 DRAG, GRAVITY = 0.25, 9.81
@@ -29,10 +29,10 @@ def flight():
 
 
 def test_the_leaders_velocity_and_acceleration_are_the_derivatives_of_its_course():
-    times = np.arange(4001) * STEP
+    times = np.arange(4001) * TRACK_STEP
     p, v, a, heading = leader_course(times)
-    np.testing.assert_allclose(np.gradient(p, STEP, axis=0)[1:-1], v[1:-1], atol=1e-4)
-    np.testing.assert_allclose(np.gradient(v, STEP, axis=0)[1:-1], a[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(p, TRACK_STEP, axis=0)[1:-1], v[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(v, TRACK_STEP, axis=0)[1:-1], a[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.arctan2(v[:, 1], v[:, 0]), heading, atol=1e-6)
 
 

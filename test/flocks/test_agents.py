@@ -30,10 +30,10 @@ from flock_desk.flocks.agents import (
 from flock_desk.flocks.flock_metrics import extremum, Metrics, metrics
 from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
-    LEADER_FOLLOWER,
+    LEADER_FOLLOWER_START,
     leader_input,
-    LEADERLESS,
-    PARAMS,
+    LEADERLESS_START,
+    PAPER_PARAMS,
     random_start,
 )
 from flock_follower.flocking import accelerations, FlockingParams
@@ -53,10 +53,10 @@ def test_velocities_agree_from_when_on_they_stay_so(disagreement: list[float],
 
 
 def test_vicsek_fits_the_papers_figure_only_if_velocities_are_averaged() -> None:
-    averaged, literal = (simulate(*LEADERLESS, PARAMS, duration=20.0, model=model)
+    averaged, literal = (simulate(*LEADERLESS_START, PAPER_PARAMS, duration=20.0, model=model)
                          for model in ('vicsek_mean_velocity', 'vicsek'))
     assert averaged.metrics.mean_distance[-1] == pytest.approx(0.900, abs=5e-4)
-    assert literal.metrics.mean_distance[-1] > 5.0 * np.sqrt(PARAMS.d1)
+    assert literal.metrics.mean_distance[-1] > 5.0 * np.sqrt(PAPER_PARAMS.d1)
     speeds = np.linalg.norm(literal.velocities, axis=2)
     assert speeds == pytest.approx(np.broadcast_to([0.54, 0.42, 0.99], speeds.shape), rel=1e-12)
 
@@ -64,10 +64,10 @@ def test_vicsek_fits_the_papers_figure_only_if_velocities_are_averaged() -> None
 @pytest.mark.parametrize('dt', [0.01, 0.1])
 def test_semi_implicit_euler_keeps_the_band_behind_the_leader(dt: float) -> None:
     def law(t: float, x: Array, v: Array) -> Array:
-        return np.stack([leader_input(t), accelerations(x, v, PARAMS)[1]])
+        return np.stack([leader_input(t), accelerations(x, v, PAPER_PARAMS)[1]])
 
-    for x, _ in semi_implicit(law, (*LEADER_FOLLOWER,), np.arange(0.0, 10.05, 0.1), dt):
-        assert PARAMS.d0 < np.sum((x[1] - x[0]) ** 2) < PARAMS.d1
+    for x, _ in semi_implicit(law, (*LEADER_FOLLOWER_START,), np.arange(0.0, 10.05, 0.1), dt):
+        assert PAPER_PARAMS.d0 < np.sum((x[1] - x[0]) ** 2) < PAPER_PARAMS.d1
 
 
 def test_no_step_of_the_adaptive_integrator_straddles_a_break() -> None:
@@ -100,7 +100,7 @@ def test_metrics_of_a_known_flock() -> None:
     assert m.speed == pytest.approx([2.0 / 3.0, 2.0])
     assert m.order == pytest.approx([np.sqrt(2.0) / 3.0, 1.0])
     assert m.disagreement == pytest.approx([np.sqrt(4.0 / 3.0), 0.0])
-    assert np.isinf(metrics(m.time, x, v, PARAMS).lyapunov).all()
+    assert np.isinf(metrics(m.time, x, v, PAPER_PARAMS).lyapunov).all()
     t = np.linspace(0.0, 1.0, 11)  # an extremum between samples is that of the parabola
     assert extremum(t, 3.0 - (t - 0.437) ** 2, least=False) == pytest.approx((0.437, 3.0))
     assert extremum(t, t, least=True) == (0.0, 0.0)
@@ -110,18 +110,19 @@ FAR = np.array([[0.0, 0.0], [1.2, 0.0], [9.0, 0.0]])
 
 
 @pytest.mark.parametrize(('positions', 'model', 'message'), [
-    (LEADERLESS.positions[0], 'flocking', r'^positions has shape \(2,\): must be'),
-    (0.5 * LEADERLESS.positions, 'cucker_dong', r'^two agents start 0\.62\d* m apart: must be more'
+    (LEADERLESS_START.positions[0], 'flocking', r'^positions has shape \(2,\): must be'),
+    (0.5 * LEADERLESS_START.positions, 'cucker_dong',
+     r'^two agents start 0\.62\d* m apart: must be more'
                                                 r' than sqrt\(d0\) = 1 m$'),
     (FAR, 'flocking', r'^two agents start 9 m apart: must be less than sqrt\(d1\) = 1\.5 m'),
     (FAR, 'boids', r"^model = 'boids': must be one of flocking, cucker_dong, cucker_smale")])
 def test_bad_input_is_refused_with_what_to_change(positions: Any, model: Any,
                                                   message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        simulate(positions, LEADERLESS.velocities, PARAMS, model=model)
+        simulate(positions, LEADERLESS_START.velocities, PAPER_PARAMS, model=model)
 
 
-@pytest.mark.parametrize('params', [PARAMS, FLIGHT_PARAMS])
+@pytest.mark.parametrize('params', [PAPER_PARAMS, FLIGHT_PARAMS])
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_random_starts_keep_clear_of_the_singularities(params: FlockingParams,
                                                        dimension: int) -> None:

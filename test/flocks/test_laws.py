@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The law on a neighbour graph: what it shares with the paper's law, and what it promises."""
+"""The law on a neighbor graph: what it shares with the paper's law, and what it promises."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ import pytest
 
 from flock_desk.flocks import laws
 from flock_desk.flocks.agents import simulate_graph
-from flock_desk.flocks.paper import FLIGHT_PARAMS, LEADERLESS, PARAMS, random_start
+from flock_desk.flocks.paper import FLIGHT_PARAMS, LEADERLESS_START, PAPER_PARAMS, random_start
 from flock_follower import flocking
 from flock_follower.flock.neighbor_graph import graph_law
 from flock_follower.geometry import Array, rotation_vector_to_matrix
@@ -47,8 +47,8 @@ def two(r2: float) -> Array:
 
 
 def test_the_complete_graph_is_the_papers_law() -> None:
-    u = laws.graph_accelerations(*LEADERLESS, PARAMS, ALL, ALL)
-    assert u == pytest.approx(flocking.accelerations(*LEADERLESS, PARAMS), rel=1e-12)
+    u = laws.graph_accelerations(*LEADERLESS_START, PAPER_PARAMS, ALL, ALL)
+    assert u == pytest.approx(flocking.accelerations(*LEADERLESS_START, PAPER_PARAMS), rel=1e-12)
 
 
 @pytest.mark.parametrize(('r2', 'push'), [
@@ -82,8 +82,8 @@ def test_the_graph_law_sums_to_zero_and_turns_with_the_axes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('agents', 'dimension', 'params', 'seed', 'duration'), [
-    (10, 2, PARAMS, 10, 4.0), (30, 3, FLIGHT_PARAMS, 30, 4.0),
-    (50, 3, PARAMS, 3, 0.5)])  # the last diverges within 0.4 s if no step is halved
+    (10, 2, PAPER_PARAMS, 10, 4.0), (30, 3, FLIGHT_PARAMS, 30, 4.0),
+    (50, 3, PAPER_PARAMS, 3, 0.5)])  # the last diverges within 0.4 s if no step is halved
 def test_random_flocks_stay_apart_and_keep_every_edge(agents: int, dimension: int, params: Any,
                                                       seed: int, duration: float) -> None:
     start = random_start(agents, dimension, params, seed)

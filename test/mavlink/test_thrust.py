@@ -19,7 +19,7 @@ from bridge_flight import Flight, PERIOD
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.embedded import STEP
+from flock_desk.vehicles.embedded import STEP_TIME
 from flock_follower.gate.envelope import GateLimits
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.messages import NANOSECONDS, OdometryState
@@ -53,23 +53,23 @@ class FollowingFlight(Flight):
         self.heights, self.handed_over, self.leader_height = [], None, HEIGHT
 
     def fly(self, seconds):
-        for _ in range(round(seconds / STEP)):
+        for _ in range(round(seconds / STEP_TIME)):
             self.vehicle.thrust_error = self.error(self.now - self.begun)
             self._sense(self.now)
-            super().fly(STEP)
+            super().fly(STEP_TIME)
             if self.begun < math.inf:
                 self.heights.append(float(self.vehicle.position[2]))
             if self.handed_over is None and self.bridge.gate.handover(self.now):
                 self.handed_over = self.heights[-1]
 
     def _sense(self, now):
-        memory = math.exp(-STEP / 0.3)
+        memory = math.exp(-STEP_TIME / 0.3)
         self.noise = memory * self.noise + math.sqrt(
             1.0 - memory ** 2) * NOISE * self.rng.normal(size=3)
         self.known.append((now, self.vehicle.position.copy(),
                            self.vehicle.velocity + self.noise, self.vehicle.yaw))
         time, position, velocity, yaw = self.known[-1 - min(
-            round(LATE / STEP), len(self.known) - 1)]
+            round(LATE / STEP_TIME), len(self.known) - 1)]
         arrival = round(now * NANOSECONDS)
         self.bridge.gate.update_velocity('odom', velocity, now - time, now, yaw=yaw,
                                          position=position)

@@ -87,7 +87,7 @@ def refused(capfd: pytest.CaptureFixture[str], node: str, *arguments: str) -> st
     ('planner', '--params-file mine.yaml --ros-args', '--params-file: must come after'),
     ('planner', '--ros-args -p a_max:=-1.0', 'a_max = -1.0: must be a number in [1.5, 20] m/s^2'),
     ('relative_pose', '--ros-args -p neighbors_file:=/nowhere.yaml', '/nowhere.yaml'),
-    ('relative_pose', '--ros-args -p neighbours_file:=x', 'unknown parameter neighbours_file'),
+    ('relative_pose', '--ros-args -p neighbor_file:=x', 'unknown parameter neighbor_file'),
     ('mavlink_bridge', '--ros-args -p connection:=udp:nowhere', "connection = 'udp:nowhere'"),
     ('mavlink_bridge', f'--ros-args -p {BRIDGE} -p signing_key_file:=/nowhere', '/nowhere'),
     ('mavlink_bridge', f'--ros-args -p {BRIDGE} -p global_origin:=[91.0,8.5,4.0]', 'latitude'),

@@ -219,7 +219,7 @@ def test_no_deadline_ends_a_process_that_finishes_its_files(
     deadlines: list[float] = []
     monkeypatch.setattr(nodes, 'AS_A_PROGRAM', True)
     monkeypatch.setattr(signal, 'setitimer', lambda _, seconds: deadlines.append(seconds))
-    with nodes.unhurried():
+    with nodes.no_exit_deadline():
         nodes.set_deadline()
     assert deadlines == []
     nodes.set_deadline()

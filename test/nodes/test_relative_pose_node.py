@@ -136,7 +136,7 @@ def rig(ros: None) -> Iterator[Callable[..., Rig]]:
         one.close()
 
 
-def test_an_image_becomes_a_neighbour_in_the_frame_of_odom(
+def test_an_image_becomes_a_neighbor_in_the_frame_of_odom(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     for k in range(21):
@@ -181,7 +181,7 @@ def test_a_second_print_of_its_marker_is_published_by_another_name_and_told(
     assert 'in sight twice' not in r.problems(ahead=3.0)
 
 
-def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
+def test_every_image_processed_is_told_with_or_without_a_neighbor_in_it(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig(max_wait=0.0)
     r.image(0.0, image)  # without odometry nothing is looked for
@@ -269,10 +269,10 @@ def test_the_debug_image_is_drawn_only_while_someone_looks(
     assert (message.height, message.width, message.step, message.encoding) == (
         480, 640, 1920, 'bgr8')
     pixels = np.frombuffer(message.data, dtype=np.uint8).reshape(-1, 3)
-    assert np.ptp(pixels, axis=1).max() > 60  # it is drawn in colour
+    assert np.ptp(pixels, axis=1).max() > 60  # it is drawn in color
 
 
-def test_out_of_sight_the_neighbour_goes_on_by_ranges(
+def test_out_of_sight_the_neighbor_goes_on_by_ranges(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     true = float(np.linalg.norm(AHEAD.translation))
@@ -323,7 +323,7 @@ def test_the_child_frame_of_odom_is_placed_by_tf_static(
     np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
 
 
-def test_the_motion_without_odometry_places_the_neighbour_in_its_own_frame(
+def test_the_motion_without_odometry_places_the_neighbor_in_its_own_frame(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     for k in range(4):

@@ -78,11 +78,11 @@ def test_a_shutdown_that_hangs_with_the_interpreter_locked_ends_all_the_same():
                              env=private_environment())
     try:
         assert stuck.stdout.readline() == b'spins\n'
-        signalled = time.monotonic()
+        signaled = time.monotonic()
         stuck.send_signal(signal.SIGINT)
         assert stuck.stdout.readline() == b'hangs\n'
         assert stuck.wait(timeout=10.0) == -signal.SIGALRM
-        assert time.monotonic() - signalled < 2.0
+        assert time.monotonic() - signaled < 2.0
     finally:
         stuck.kill()
         stuck.communicate()

@@ -48,7 +48,7 @@ BAND = {'nearest_m': '1.2', 'farthest_m': '3.0'}
 
 
 class Rig(Driven):
-    """The node with a planner's report, odometry, a leader and another neighbour."""
+    """The node with a planner's report, odometry, a leader and another neighbor."""
 
     def __init__(self) -> None:
         super().__init__(Visualizer(

@@ -79,7 +79,7 @@ def test_tags_on_walls_seen_in_flight_come_out_at_rest_though_images_are_stamped
     assert offset.estimate == pytest.approx(0.004 - 0.05, abs=0.003)
     assert offset.deviation < 0.001
     assert len(found) > 1100
-    assert velocity_rms(found) < 0.1  # while the offset is learnt
+    assert velocity_rms(found) < 0.1  # while the offset is learned
     assert scatter(found) < 0.08  # its odometry corrects itself by 29 cm meanwhile
 
 

@@ -14,7 +14,7 @@
 
 """The difference of two sets of parameters, as text."""
 
-from flock_follower.parameters.differences import differences, MOST_LISTED
+from flock_follower.parameters.differences import differences, MAX_LISTED
 
 
 def test_each_parameter_that_differs_is_named_with_both_values() -> None:
@@ -25,5 +25,5 @@ def test_each_parameter_that_differs_is_named_with_both_values() -> None:
 
 
 def test_many_are_counted() -> None:
-    many = {f'p{number}': number for number in range(MOST_LISTED + 3)}
+    many = {f'p{number}': number for number in range(MAX_LISTED + 3)}
     assert differences({}, many).endswith('p4 not set -> 4, and 3 more')

@@ -146,7 +146,7 @@ def test_a_file_that_means_another_node_is_reported(
     assert reported.replace(f'{path}: ', '') == said
 
 
-def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Path) -> None:
+def test_the_planner_reads_who_flies_along_from_the_neighbors_file(tmp_path: Path) -> None:
     document = yaml.safe_load(resource('config/neighbors.yaml').read_text())
     (leader,) = document['neighbors']
     document['neighbors'] += [{**leader, 'name': 'tower', 'marker_id': 1, 'role': 'avoid',
@@ -165,6 +165,6 @@ def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Pa
         planner_params({**values, 'neighbors_file': '/nowhere.yaml'})
 
 
-def test_planner_and_neighbours_file_know_the_same_roles_and_radii() -> None:
+def test_planner_and_neighbors_file_know_the_same_roles_and_radii() -> None:
     assert (neighbors_file.ROLES, neighbors_file.RADII) == (ROLES, RADIUS)
     assert neighbors_file.MarkedNeighbor('x', ()).role == Member().role

@@ -24,7 +24,7 @@ import pytest
 
 pytestmark = pytest.mark.slow
 MOVED = 'run `make bless` if it is meant to move'
-MILLIMETRE = 1e-3
+MILLIMETER = 1e-3
 
 
 def worst(rows: list[Row], golden: list[Row], numbers: slice = slice(None)) -> tuple[float, str]:
@@ -48,4 +48,4 @@ def test_nothing_that_is_published_moves_by_more_than_1e_4() -> None:
 def test_positions_agree_within_a_millimetre_with_any_opencv() -> None:
     golden = [row for row in golden_result.read() if row[0] == '/neighbors']
     moved, where = worst(golden_result.neighbors(), golden, slice(0, 3))
-    assert moved < MILLIMETRE, f'OpenCV {cv2.__version__}: {where}'
+    assert moved < MILLIMETER, f'OpenCV {cv2.__version__}: {where}'

@@ -32,7 +32,7 @@ from flock_follower.bags.writer import BagWriter
 from flock_follower.check import main as check
 
 pytestmark = pytest.mark.slow
-GREY = cv2.imencode('.jpg', np.full((480, 640), 128, dtype=np.uint8))[1].ravel()
+GRAY = cv2.imencode('.jpg', np.full((480, 640), 128, dtype=np.uint8))[1].ravel()
 CAMERAS = {'cameras': ['front', 'left'], 'camera': {
     'front': {'image': 'front/image_raw'},
     'left': {'image': '/port/mono', 'camera_info': '/port/info', 'rpy': [0.0, 0.0, 1.2]}}}
@@ -44,7 +44,7 @@ def both(message: BagMessage) -> list[BagMessage]:
         return [message._replace(topic=topic) for topic in ('/front/camera_info', '/port/info')]
     if message.topic == '/image_raw/compressed':
         def empty(fields: Any) -> None:
-            fields.data = GREY
+            fields.data = GRAY
         return [message._replace(topic='/front/image_raw/compressed'),
                 edited(message, empty)._replace(topic='/port/mono/compressed')]
     return [message]

@@ -108,7 +108,7 @@ def lost(message: Any) -> None:
 FAULTS: dict[str, tuple[Change, tuple[str, str, str, str]]] = {
     'no images': (of(IMAGES, unreadable), ('error', 'images', '', 'mono8')),
     'a lost source': (of('/odom', lost), (
-        'error', 'odom', 'are invalid: quaternion = 0', 'initialised'))}
+        'error', 'odom', 'are invalid: quaternion = 0', 'initialized'))}
 
 
 def assert_told(found: dict[str, Any], row: tuple[str, str, str, str]) -> None:

@@ -133,8 +133,8 @@ def test_a_flight_without_a_command_is_judged_by_what_is_known(tmp_path: Path) -
     np.savez(tmp_path / 'autopilot.npz', state_time=times, setpoint_time=times[:20],
              velocity=np.outer(np.linspace(0.0, 6.0, 600), [1.0, 0.0, 0.0]),
              setpoint_acceleration=np.zeros((20, 3)))
-    judgements = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}))
-    assert {j.bound.key for j in judgements if j.fault} > {
+    judgments = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}))
+    assert {j.bound.key for j in judgments if j.fault} > {
         'planner.rate_hz', 'planner.along_law_share', 'recall_of_processed', 'setpoints.sent'}
     # A vehicle that runs away is none of a busy machine.
     excused = judge(BOUNDS, replay_figures(read_replayed(BAG, tmp_path, PARAMS), {}), busy=True)

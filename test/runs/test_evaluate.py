@@ -88,7 +88,7 @@ def with_ranges(path: Path, seen: float, seconds: float) -> Path:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_ranges_in_a_bag_are_used_where_the_neighbour_is_not_in_sight(tmp_path: Path) -> None:
+def test_ranges_in_a_bag_are_used_where_the_neighbor_is_not_in_sight(tmp_path: Path) -> None:
     bag_path = with_ranges(tmp_path / 'bag', 3.0, 7.0)
     assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
     with open_bag(bag_path) as bag, open_bag(tmp_path / 'out' / 'result.mcap') as result:

@@ -30,7 +30,7 @@ import pytest
 from flock_desk import figures
 from flock_desk.closed_loop.controllers import CONTROLLERS
 from flock_desk.runs import paper_plots
-from flock_desk.runs.paper_plots import styled, WIDTH
+from flock_desk.runs.paper_plots import COLUMN_WIDTH, styled
 
 pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
@@ -51,7 +51,7 @@ def redrawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, F
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_plots, 'save', keep)
         assert figures.main(['--output', str(out), '--campaign', str(out / 'none.json')]) == 0
-        patch.setattr(figures, 'DURATION', 1.0)
+        patch.setattr(figures, 'FLOCK_DURATION', 1.0)
         for dim in '23':
             assert figures.main(['--out', str(out / 'flocks'), '--agents', '9', '--dim', dim]) == 0
     return out, kept
@@ -66,7 +66,7 @@ def assert_legible(figure: Figure, name: str) -> None:
     """Every text is on its page, large enough, and no title."""
     with styled():
         figure.draw_without_rendering()
-    assert figure.get_size_inches()[0] == WIDTH and not figure.get_suptitle(), name
+    assert figure.get_size_inches()[0] == COLUMN_WIDTH and not figure.get_suptitle(), name
     texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
     assert min(t.get_fontsize() for t in texts) >= 7.0, name
     labels = [text for legend in figure.findobj(Legend) for text in legend.get_texts()]

@@ -301,7 +301,7 @@ def test_a_flight_that_fails_ends_with_the_reason_and_nothing_runs_on(tmp_path, 
 def test_a_flight_that_is_too_late_is_judged_by_what_was_flown(
         tmp_path, pretended, busy, judged, code):
     pretended.setattr('flock_desk.runs.flight.PATIENCE', -1.0)
-    pretended.setattr('flock_desk.runs.flight.COUNTED', 0.0)
+    pretended.setattr('flock_desk.runs.flight.COUNTER_PERIOD', 0.0)
     load = SimpleNamespace(busy=busy)
     pretended.setattr(Pretended, 'load', property(
         lambda _: SimpleNamespace(worst=lambda *_: load, sample=lambda _: None),

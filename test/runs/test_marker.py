@@ -162,7 +162,7 @@ def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_pa
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,
+def test_what_it_prints_is_a_neighbors_file(tmp_path: Path,
                                              capsys: pytest.CaptureFixture[str]) -> None:
     main(['--id', '7', '--dictionary', 'DICT_6X6_250', '--size', '0.123', '--output',
           str(tmp_path / 'm.pdf')])

@@ -28,7 +28,7 @@ from flock_desk.runs.console import guarded, logs_in, progress
 from flock_desk.runs.figure_table import bounds, FIGURES, parts_of, words
 from flock_desk.runs.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
 from flock_desk.runs.processes import TooBusyError
-from flock_desk.runs.report import announce, report, table, text, WIDTH, write_report
+from flock_desk.runs.report import announce, LINE_WIDTH, report, table, text, write_report
 from flock_follower.checks.processor import Load
 
 SUMMARY: dict[str, Any] = {
@@ -44,7 +44,7 @@ BOUNDS = (FigureBound('recall', least=0.98), FigureBound('setpoints.rate_hz', 19
 def faults(document: Any) -> list[str]:
     found = parse_bounds(document)
     check_names(found, SUMMARY)
-    return [judgement.fault for judgement in judge(found, SUMMARY) if judgement.fault]
+    return [judgment.fault for judgment in judge(found, SUMMARY) if judgment.fault]
 
 
 def test_bounds_hold_at_both_ends_and_each_broken_one_is_named() -> None:
@@ -98,19 +98,19 @@ def test_the_verdict_of_a_busy_machine_is_a_code_and_the_last_line(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     load, summary = Load(0.4, 1.2, 2), {'late': 300.0, 'far': 9.0}
     late, far = FigureBound('late', most=200.0, load=math.inf), FigureBound('far', most=2.0)
-    judgements = report(tmp_path, 'title', '', summary, [late], (), load=load)
-    assert announce(summary, judgements, [], tmp_path, load) == 3
+    judgments = report(tmp_path, 'title', '', summary, [late], (), load=load)
+    assert announce(summary, judgments, [], tmp_path, load) == 3
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith('too busy: for 40% of the worst 2 s') and last.endswith(
         'not judged: late')
     page = (tmp_path / 'report.html').read_text()
     assert 'Too busy: for 40% of the worst 2 s' in page and '>not judged</td>' in page
     # A fault that no load explains is the verdict.
-    judgements = report(tmp_path, 'title', '', summary, [late, far], (), load=load)
-    assert announce(summary, judgements, [], tmp_path, load) == 1
+    judgments = report(tmp_path, 'title', '', summary, [late, far], (), load=load)
+    assert announce(summary, judgments, [], tmp_path, load) == 1
     assert 'FAILED: far' in capsys.readouterr().err
-    judgements = report(tmp_path, 'title', '', summary, [late], (), load=Load(0.01, 0.1, 2))
-    assert announce(summary, judgements, [], tmp_path, None) == 1
+    judgments = report(tmp_path, 'title', '', summary, [late], (), load=Load(0.01, 0.1, 2))
+    assert announce(summary, judgments, [], tmp_path, None) == 1
 
 
 def test_each_command_has_the_bounds_of_the_table() -> None:
@@ -127,23 +127,23 @@ def test_each_command_has_the_bounds_of_the_table() -> None:
 def test_bounds_stand_beside_their_figures_in_a_hundred_columns(
         capsys: pytest.CaptureFixture[str]) -> None:
     lines = table(SUMMARY, judge(BOUNDS, SUMMARY))
-    assert max(map(len, lines)) <= WIDTH
+    assert max(map(len, lines)) <= LINE_WIDTH
     assert [line.split() for line in lines[:3]] == [
         ['frames', '360'], ['recall', '0.97', '≥', '0.98', 'FAILED'],
         ['nees_position', 'unknown', '≥', '1,', '≤', '6', 'FAILED']]
     shown = '\n'.join(lines)
     assert 'bag' not in shown and 'odometry comes late' in shown  # the bag is no figure
     assert re.search(r'planner.missed_ticks +0 +≤ 3 +ok', shown)
-    judgements = judge([FigureBound('setpoints.reasons.no command', most=2),
+    judgments = judge([FigureBound('setpoints.reasons.no command', most=2),
                         FigureBound('nowhere', most=2)], SUMMARY)
-    assert announce(SUMMARY, judgements, [Path('out/report.html')], Path('logs')) == 1
+    assert announce(SUMMARY, judgments, [Path('out/report.html')], Path('logs')) == 1
     out, errors = capsys.readouterr()
     assert 'setpoints.reasons.no command' in out and 'nowhere' in out
     assert out.splitlines()[-1] == 'report: out/report.html'
     assert errors.splitlines() == [
         'FAILED: nowhere is not known: it was not measured, or is not finite',
         'the logs of every process are in logs']
-    assert announce(SUMMARY, judgements[:1], [], Path('logs')) == 0
+    assert announce(SUMMARY, judgments[:1], [], Path('logs')) == 0
 
 
 def test_the_page_names_figures_in_words_with_their_keys_and_warnings_first(

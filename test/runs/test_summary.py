@@ -72,7 +72,7 @@ def test_images_of_flight_without_odometry_are_not_judged() -> None:
         judged(np.array([True, True, False]), STAMPS[:3], states), [1.0, np.nan, 0.0])
 
 
-def test_an_offset_of_the_neighbour_is_the_error() -> None:
+def test_an_offset_of_the_neighbor_is_the_error() -> None:
     estimates = found(straight([2.0, 0.0, 0.0]), np.array([0.0, 0.1, 0.0]))
     figures = sight_figures([table(estimates, [2.03, 0.04, 0.0])], 1.0)
     assert figures['position_rms_m'] == pytest.approx(0.05)

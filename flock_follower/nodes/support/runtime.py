@@ -62,7 +62,7 @@ Message = TypeVar('Message')
 T = TypeVar('T')
 #: Functions that read a type from its bytes faster than rclpy; the results have the same fields.
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
-#: Bytes of the largest small message. rclpy takes 13 s to deserialise one of 17 MB, and no other
+#: Bytes of the largest small message. rclpy takes 13 s to deserialize one of 17 MB, and no other
 #: thread of the process runs meanwhile.
 SMALL_MESSAGE = 4096
 READING_TIME = 1e-3  # s within which two clocks are read
@@ -158,7 +158,7 @@ class FlockNode(Node):
         A ValueError is an invalid message and counts under its topic; any other exception counts
         as an internal error with its place. The silence of a ``required`` topic shows in
         /diagnostics with the reason. ``informed``: the callback gets rclpy's message info, too. A
-        message of more than ``largest`` bytes is refused before it is deserialised, and counted;
+        message of more than ``largest`` bytes is refused before it is deserialized, and counted;
         None: any size is taken.
         """
         take = self._taker(

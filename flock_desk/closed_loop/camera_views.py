@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from flock_desk.closed_loop.world import ODOMETRY_STEPS, World
-from flock_desk.scenarios.courses import STEP
+from flock_desk.scenarios.courses import COURSE_STEP
 from flock_desk.scenarios.flock import LEADER
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.sensing import (
@@ -55,10 +55,11 @@ from flock_follower.perception.range_tracking import PlacedRange, RangeSeries, R
 IMAGE_STEPS = 4
 BODY = 0.25  # m: radius of a vehicle that stands in the way of a view
 YAW_NOISE = 0.02  # rad: of a vehicle's yaw measured in an image
-ASKEW = 0.02  # rad: by which its markers hang
+MARKER_TILT = 0.02  # rad: error of the attitude of a marker on its vehicle
 _USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
-_CENTRE = np.zeros(3)
-_STILL, _STANDING = np.zeros(3), 1e-4 * np.eye(3)  # m/s, and its covariance: of a print
+_BODY_CENTER = np.zeros(3)
+_PRINT_VELOCITY = np.zeros(3)  # m/s
+_PRINT_VELOCITY_COVARIANCE = 1e-4 * np.eye(3)  # (m/s)^2
 
 
 class Sighted(NamedTuple):
@@ -73,8 +74,8 @@ class Sighted(NamedTuple):
     """Whether it is in the frame without odometry."""
 
 
-class Lookout:
-    """The cameras and the neighbour filters of all rows of a world."""
+class CameraViews:
+    """The cameras and the neighbor filters of all rows of a world."""
 
     def __init__(self, world: World, noise: PerceptionNoise) -> None:
         self._world, self._noise = world, noise
@@ -87,10 +88,10 @@ class Lookout:
                        for v in world.others[number - 1]]
         errors = scenario.odometry
         self._tilt = GaussMarkov(world.random('tilt'), 2, errors.tilt, errors.tilt_memory,
-                                 IMAGE_STEPS * STEP, errors.tilt_bias)
+                                 IMAGE_STEPS * COURSE_STEP, errors.tilt_bias)
         self._turned = np.concatenate([g.standard_normal((len(self._latency), m))
                                        for g in world.random('attitudes')], axis=1)
-        askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
+        askew = np.stack([MARKER_TILT * scenario.random(run, 'askew').standard_normal(m + 1)
                           for run, number in world.rows if number == 1])
         self._askew = askew[:, world.others].ravel()
         self._filters = [NeighborFilter() for _ in range(m * rows)]
@@ -104,7 +105,7 @@ class Lookout:
             self._range_latency = np.array([g.uniform(*scenario.ranges.latency)
                                             for g in generators])
             self._radios = Radios(scenario.ranges, generators)
-            self._series = [RangeSeries(each, _CENTRE) for each in self._filters]
+            self._series = [RangeSeries(each, _BODY_CENTER) for each in self._filters]
         self._alone: dict[int, NeighborFilter] = {}
         """Filters of those rows that fly without odometry."""
         self._sight: Array | None = None
@@ -117,7 +118,7 @@ class Lookout:
 
     def look(self, k: int) -> None:
         """Take the images, and measure the ranges, of step k of the world."""
-        world, now = self._world, k * STEP
+        world, now = self._world, k * COURSE_STEP
         if k % IMAGE_STEPS == 0:
             self._look(k // IMAGE_STEPS, now)
             for number, place in enumerate(world.scenario.prints, start=1):
@@ -168,7 +169,8 @@ class Lookout:
         """
         if k % IMAGE_STEPS != 0 or not any(motions):
             return
-        world, image, now, m = self._world, k // IMAGE_STEPS, k * STEP, len(self._world.others)
+        world, image, now = self._world, k // IMAGE_STEPS, k * COURSE_STEP
+        m = len(world.others)
         found, offsets = self._visible[image] & self.in_sight.ravel(), world.offsets.reshape(-1, 3)
         covariances, scale = relative_noise(offsets, self._noise), world.scenario.sensing.noise
         for row, motion in enumerate(motions):
@@ -205,7 +207,7 @@ class Lookout:
                 continue
             row = i // m
             own = OdometrySample(now, world.vio.position[row], IDENTITY_QUATERNION,
-                                 world.vio.velocity[row], _STILL, world.travel[row])
+                                 world.vio.velocity[row], _PRINT_VELOCITY, world.travel[row])
             state = self._series[i].take(PlacedRange(now, distance, noise, own.travel), own)
             if state is not None:
                 self._send(float(arrivals[i]), i, state, None)
@@ -214,7 +216,7 @@ class Lookout:
         """
         Add a print to the images just taken that show it.
 
-        Which of two is the leader is not modelled: perception is taken to know, as its tests show.
+        Which of two is the leader is not modeled: perception is taken to know, as its tests show.
         """
         world, vio = self._world, self._world.vio
         offsets = np.array(place.position) - world.vehicle.position
@@ -224,11 +226,12 @@ class Lookout:
         seen_from = vio.position + turned(offsets, vio.yaw_error)
         covariances = np.zeros((len(offsets), 15, 15))
         covariances[:, POSITION, POSITION] = relative_noise(offsets, self._noise)
-        covariances[:, VELOCITY, VELOCITY] = _STANDING
+        covariances[:, VELOCITY, VELOCITY] = _PRINT_VELOCITY_COVARIANCE
         for row in np.flatnonzero(shown).tolist():
             arrival, stamp = self._images[row][-1]
             self._coming[row].append((arrival, Sighted(name, Estimate(
-                stamp, seen_from[row], _STILL, body, _STILL, _STILL, covariances[row]),
+                stamp, seen_from[row], _PRINT_VELOCITY, body, _PRINT_VELOCITY, _PRINT_VELOCITY,
+                covariances[row]),
                 place.yaw)))
 
     def _in_sight(self, offsets: Array, eyes: Array) -> Any:
@@ -247,7 +250,7 @@ class Lookout:
         sight = np.einsum('nji,nj->ni', eyes, offsets)
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         before, self._sight = sight if self._sight is None else self._sight, sight
-        turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
+        turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * COURSE_STEP)
         return turning
 
     def arrived(self, now: float) -> list[tuple[list[float], list[Sighted]]]:
@@ -266,7 +269,7 @@ def _updated(track: NeighborFilter, now: float, place: Array, covariance: Array
     """Return the estimate after a place (3,), m, of a covariance (3, 3); None if it is refused."""
     full = YAW_NOISE ** 2 * np.eye(6)
     full[:3, :3] = covariance
-    outcome = track.update(now, Transform(translation=place), _CENTRE, full)
+    outcome = track.update(now, Transform(translation=place), _BODY_CENTER, full)
     return track.newest if outcome in _USED else None
 
 
@@ -290,8 +293,8 @@ def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any
     the others is found if it is in sight (c, m).
     """
     sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
-    count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
-    times = np.arange(count) * IMAGE_STEPS * STEP
+    count = round(scenario.duration / COURSE_STEP) // IMAGE_STEPS + 1
+    times = np.arange(count) * IMAGE_STEPS * COURSE_STEP
     latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
     found = [rng.random(count) < sensing.recall]
     clear = np.ones(count, dtype=bool)
