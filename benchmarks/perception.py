@@ -221,12 +221,15 @@ class Flight:
 
     :param count: images to play, 0 for all.
     :param dictionary: of the leader's marker.
+    :param others: names of the detectors beside ours, None for all.
     """
 
-    def __init__(self, bag: Path, count: int, dictionary: str = ARUCO) -> None:
+    def __init__(self, bag: Path, count: int, dictionary: str = ARUCO,
+                 others: Sequence[str] | None = None) -> None:
         self.config = replace(neighbors.load(resource('config/neighbors.yaml')),
                               dictionary=dictionary)
-        self.detectors = detectors(dictionary)
+        found = detectors(dictionary)
+        self.detectors = {name: found[name] for name in others or found}
         self.methods = (*self.detectors, 'ours')
         self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
         self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)

@@ -38,7 +38,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.look import View
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
-from flock_follower.perception.pose import ippe, refine
+from flock_follower.perception.square_pose import ippe, refine
 from flock_follower.perception.time_offset import TimeOffset
 from flock_follower.perception.tracker import camera_mounting
 

@@ -40,8 +40,9 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_motion import ATTITUDE, Estimate, POSITION, VELOCITY
-from flock_follower.perception.pose import locate, refine, Target
+from flock_follower.perception.pose import locate, Target
 from flock_follower.perception.prints import Fault
+from flock_follower.perception.square_pose import refine
 from flock_follower.perception.time_offset import MountedCamera
 
 #: A fit to a smeared marker starts from the estimate: after this time, s, without a measurement
@@ -225,7 +226,8 @@ class Look:
         """Return a measurement of a neighbour, or what its detected marker shows instead."""
         name, confirmed_at = found.name, self.camera.confirmed_at
         if found.spacing is None:
-            if self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD:
+            recent = self.stamp - confirmed_at.get(name, -math.inf) <= CONFIRM_PERIOD
+            if recent or found.margin is not None:  # both would take too long for one image
                 return found
             place, prior = found.T_camera_body, PosePrior(None, self.expected[name].up)
             ids, corners = search.near(

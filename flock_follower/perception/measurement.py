@@ -112,7 +112,8 @@ class Measurement(NamedTuple):
     rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
     ``spacing``, px, of the brightness profiles, None without profiles.
     ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
-    equal, infinite if several markers decide it, None if it was not checked. ``alike`` is the
+    equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
+    probability of the mirrored attitude when it was last checked. ``alike`` is the
     share of the covariance that is of errors alike from image to image.
     """
 
@@ -124,12 +125,13 @@ class Measurement(NamedTuple):
     spacing: tuple[float, float] | None
     stage: str = 'track'
     margin: float | None = None
+    doubt: float = 0.0
     alike: float = 0.0
 
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:
     """Return a measurement with mean and covariance of both poses, and the margin of the best."""
-    measurement = measurement._replace(margin=best.margin)
+    measurement = measurement._replace(margin=best.margin, doubt=best.share)
     if best.other is None or not best.share > 1e-6:
         return measurement
     pose, other = measurement.T_camera_body, best.other.pose

@@ -18,9 +18,6 @@ From a neighbour's markers in an image to its pose and covariance.
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
 and the more probable is kept. If motion or a lens out of focus leave no edges, the whole print is
 fitted as it is smeared.
-
-A square has two poses that explain its corners almost equally well, mirrored about the line of
-sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014; IPPE).
 """
 
 from __future__ import annotations
@@ -28,16 +25,14 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import ANEW, EdgeFit, fit, LONGEST_TURN, SWOLLEN
 from flock_follower.perception.edges import facing, moved, project, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import (
     angle,
     Choice,
@@ -57,7 +52,9 @@ from flock_follower.perception.smear_fit import (
     smear_model,
     SmearFit,
     SmearModel,
+    SmearStart,
 )
+from flock_follower.perception.square_pose import ippe, mirrored
 
 #: Edge errors below this, px, cannot decide between two attitudes.
 SIGMA_FLOOR = 0.05
@@ -84,51 +81,6 @@ RUN_TOGETHER = 0.25
 SMEAR_DEGREES = 40.0
 
 
-def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
-    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
-    normalised = camera.undistort(corners)
-    if not np.all(np.isfinite(normalised)):
-        return []
-    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
-    # faces the camera upright is half a turn away from it. So it is given the square as if it
-    # lay in the image, x right and y down, whichever of its corners is on top.
-    quarters = int(np.argmin(normalised.sum(axis=1)))
-    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
-    # Undistorted coordinates and an identity matrix serve every lens model alike.
-    _, rotations, translations, _ = cv2.solvePnPGeneric(
-        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
-        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
-    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
-    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
-            for r, t in zip(rotations, translations)
-            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
-
-
-def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
-           pose: Transform) -> tuple[Transform, Array] | None:
-    """
-    Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
-
-    The second value is the Jacobian (8, 6), px per m and rad. Of ``points`` (4, 3) on a body, m,
-    ``corners`` (4, 2) are seen, px; a step turns the body about ``center`` (3,), m.
-    """
-    for _ in range(20):
-        seen = pose.apply(points)
-        pixels, by_point = camera.linearize(seen)
-        residual = (corners - pixels).ravel()
-        middle = pose.apply(center[None])[0]
-        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
-        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
-        step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
-        if step is None or not np.all(np.isfinite(step)):
-            return None
-        if np.max(np.abs(step)) < 1e-7:
-            break
-        pose = moved(pose, middle, step)
-    return pose, jacobian
-
-
 class Target(NamedTuple):
     """A neighbour and the image models of its markers, in their order."""
 
@@ -144,34 +96,70 @@ def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
 
 
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
-          spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
+          last: Measurement | None, check_mirrored: bool) -> Measurement | None:
     """
     Return a neighbour close to where it is expected, or None if its markers are not there.
 
-    :param spacing: that of its last measurement.
+    :param last: its last measurement, if any: if its print was smeared, edges are looked for only
+        if it is so no longer.
     :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
     """
     if expected.pose is None:
         return None
-    found, sharp = _fit_shown(image, camera, sought.model, expected.pose, spacing)
-    if sharp:
-        return None
-    if found is None:  # it may have moved farther than expected
-        start = _shifted(image, camera, sought, expected.pose)
-        found, sharp = (None, False) if start is None else _fit_shown(
-            image, camera, sought.model, start, None)
-        if found is not None:  # from afar it may have settled early
-            found = fit(image, camera, found.lines.model, found.pose, found.spacing) or found
+    spacing = None if last is None else last.spacing
+    smeared = last is not None and spacing is None and len(sought.model.codes) == 1
+    found: EdgeFit | None = None
+    whole: _Whole | None = None
+    if not smeared:
+        found, sharp = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+        if sharp:
+            return None
+    if found is None:  # it is smeared, or it moved farther than expected
+        found, whole = _fit_around(image, camera, sought, expected.pose, smeared)
     if found is not None and found.inliers < PLAIN_INLIERS:  # the others may be out of reach
         again = fit(image, camera, found.lines.model, found.pose)
         found = again if again is not None and again.inliers > found.inliers else found
-    blurred = found is not None and (
-        found.blur > RUN_TOGETHER and len(found.lines.model.codes) == 1)
-    smeared = _smeared(image, camera, sought, expected, check_mirrored) if blurred or (
-        found is None and not sharp) else None
-    if smeared is not None or found is None:
-        return smeared
-    return _of_edges(image, camera, sought, found, expected, spacing, check_mirrored)
+    blurred = found is not None and found.blur > RUN_TOGETHER and (
+        len(found.lines.model.codes) == 1)
+    if whole is None and blurred:
+        whole = _fit_whole(image, camera, sought, _smear_starts(
+            image, camera, sought, expected.pose))
+    if whole is not None and (found is None or blurred):
+        if check_mirrored or last is None or last.spacing is not None:
+            return _of_smears(image, camera, sought, whole, expected)
+        return _with_doubt(sought, whole, last.doubt)
+    return None if found is None else _of_edges(
+        image, camera, sought, found, expected, spacing, check_mirrored)
+
+
+class _Whole(NamedTuple):
+    """A fit to the whole print of a marker, by its index among the neighbour's."""
+
+    index: int
+    fit: SmearFit
+
+
+def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Transform,
+                smeared: bool) -> tuple[EdgeFit | None, _Whole | None]:
+    """Return fits to the edges and to a whole print up to two cells and a half from a pose."""
+    starts = _smear_starts(image, camera, sought, pose)
+    if not starts and not smeared:
+        return None, None
+    whole = None
+    blurred = len(sought.model.codes) == 1 and any(
+        start.blur > RUN_TOGETHER for _, start in starts)
+    if blurred:
+        whole = _fit_whole(image, camera, sought, starts)
+        if whole is not None and whole.fit.blur > RUN_TOGETHER:
+            return None, whole
+    place = starts[0][1].pose if starts else pose
+    found, sharp = _fit_shown(image, camera, sought.model,
+                              place if whole is None else whole.fit.pose, None)
+    if sharp:
+        return None, None
+    if found is not None:  # from afar it may have settled early
+        return fit(image, camera, found.lines.model, found.pose, found.spacing) or found, whole
+    return None, whole if blurred else _fit_whole(image, camera, sought, starts)
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
@@ -222,7 +210,9 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
     """Return a neighbour by the whole print of a detected marker, smeared."""
     fits = [found for start in starts
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
-    return _of_smears(image, camera, sought, index, fits, expected, True) if fits else None
+    if len(fits) == 1:
+        return _of_smears(image, camera, sought, _Whole(index, fits[0]), expected)
+    return _choose_smeared(sought, index, fits, expected) if fits else None
 
 
 class _Shown(NamedTuple):
@@ -268,46 +258,65 @@ def _sharp(found: EdgeFit) -> bool:
     return found.inliers > SHARP_INLIERS and found.rms < SHARP_RMS
 
 
-def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
-             pose: Transform) -> Transform | None:
-    """Return a pose moved to where the print of one of its markers resembles the image, if any."""
-    for k in np.flatnonzero(facing(sought.model, pose)).tolist():
-        begin = seek(image, camera, sought.smears[k], pose)
-        if begin is not None:
-            return begin[0]
-    return None
+def _smear_starts(image: GrayImage, camera: CameraModel, sought: Target,
+                  pose: Transform) -> list[tuple[int, SmearStart]]:
+    """Return where the prints of the markers that face the camera resemble the image."""
+    found = ((k, seek(image, camera, sought.smears[k], pose))
+             for k in np.flatnonzero(facing(sought.model, pose)).tolist())
+    return [(k, start) for k, start in found if start is not None]
 
 
-def _smeared(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
-             check_mirrored: bool) -> Measurement | None:
-    """Return a neighbour one of whose markers is smeared, near its expected place, or None."""
-    assert expected.pose is not None
-    for k in np.flatnonzero(facing(sought.model, expected.pose)).tolist():
-        found = fit_smeared(image, camera, sought.smears[k], expected.pose)
+def _fit_whole(image: GrayImage, camera: CameraModel, sought: Target,
+               starts: list[tuple[int, SmearStart]]) -> _Whole | None:
+    """Return the fit to the first marker whose print is smeared as it starts, or None."""
+    for k, start in starts:
+        found = descend(image, camera, sought.smears[k], start)
         if found is not None:
-            return _of_smears(image, camera, sought, k, [found], expected, check_mirrored)
+            return _Whole(k, found)
     return None
 
 
-def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, index: int,
-               fits: list[SmearFit], expected: PosePrior, check_mirrored: bool) -> Measurement:
-    """Return the measurement of the likelier of both attitudes, of fits to one or both of them."""
-    marker, model = sought.neighbor.markers[index], sought.smears[index]
-    if len(fits) == 1 and check_mirrored:
-        found = fits[0]
-        start = mirrored(found.pose, found.pose.apply(marker.T_body_marker.translation[None])[0],
-                         marker.T_body_marker.rotation[:, 2])
-        other = None if start is None else descend(
-            image, camera, model, start, found.smear, found.lens)
-        fits = fits if other is None else [*fits, other]
+def _of_smears(image: GrayImage, camera: CameraModel, sought: Target, found: _Whole,
+               expected: PosePrior) -> Measurement:
+    """Return the measurement of the likelier attitude: of a fit, or of its mirrored one."""
+    index, fitted = found
+    start = _mirrored_body(sought, index, fitted.pose)
+    other = None if start is None else descend(
+        image, camera, sought.smears[index], SmearStart(start, fitted.smear, fitted.lens))
+    return _choose_smeared(
+        sought, index, [fitted] if other is None else [fitted, other], expected)
+
+
+def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | None:
+    """Return the pose of a neighbour mirrored about the sight of a marker; None if the same."""
+    on_body = sought.neighbor.markers[index].T_body_marker
+    return mirrored(pose, pose.apply(on_body.translation[None])[0], on_body.rotation[:, 2])
+
+
+def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
+                    expected: PosePrior) -> Measurement:
+    """Return the measurement of the likelier of one or both attitudes of a smeared marker."""
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, SMEAR_DEGREES * (each.rms / least)**2, each)
                    for each in fits], expected)
-    found = best.chosen.fit
-    measurement = Measurement(
-        sought.neighbor.name, found.pose, marker.T_body_marker.translation,
+    return widened(_smear_measurement(sought, index, best.chosen.fit), best)
+
+
+def _with_doubt(sought: Target, found: _Whole, doubt: float) -> Measurement:
+    """Return the measurement of a smeared marker whose mirrored attitude is not fitted."""
+    measurement = _smear_measurement(sought, found.index, found.fit)
+    other = _mirrored_body(sought, found.index, found.fit.pose)
+    if other is None:
+        return measurement
+    both = (Hypothesis(pose, 0.0) for pose in (found.fit.pose, other))
+    return widened(measurement, Choice(next(both), 0.0, next(both), doubt))._replace(margin=None)
+
+
+def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measurement:
+    return Measurement(
+        sought.neighbor.name, found.pose,
+        sought.neighbor.markers[index].T_body_marker.translation,
         found.covariance * WIDENING**2, found.rms, None, alike=ALIKE_SHARE)
-    return widened(measurement, best) if check_mirrored else measurement
 
 
 def _shown(image: GrayImage, found: EdgeFit, tracked: bool = False) -> Any:
@@ -333,23 +342,6 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     if refitted is None or angle(refitted[0], found.pose) < SAME_ATTITUDE:
         return []
     return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
-
-
-def mirrored(pose: Transform, center: Array, facing_along: Array) -> Transform | None:
-    """
-    Return a pose mirrored about the line of sight; None if it is the same.
-
-    :param center: of the marker (3,), in the camera's optical frame, m, which stays in place.
-    :param facing_along: the marker's normal (3,) on the body.
-    """
-    normal, sight = pose.rotation @ facing_along, center / np.linalg.norm(center)
-    other = -normal + 2.0 * float(normal @ sight) * sight
-    axis = np.cross(normal, other)
-    sine = float(np.linalg.norm(axis))
-    if sine < SAME_ATTITUDE:
-        return None
-    turn = axis / sine * math.atan2(sine, float(normal @ other))
-    return moved(pose, center, np.concatenate([np.zeros(3), turn]))
 
 
 def _refit(camera: CameraModel, fitted: EdgeFit,

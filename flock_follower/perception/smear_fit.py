@@ -73,6 +73,9 @@ class SmearModel:
 
     ``origin`` (3,) and ``axes`` (2, 3), m: place of (0, 0) on the body, and steps of one cell.
     ``places`` (s, 2), cells, are the sample points, row by row; ``around`` are more of them.
+    ``on_body`` (s, 3), m: ``places`` on the body; ``middle`` (3,) of the marker; ``from_middle``
+    (s, 2), cells, how far off ``places`` are; ``across`` (s, 2) is -0.5 to 0.5 across the marker.
+    ``cell``, m, is the length of a cell.
     ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
     for each of :data:`LENSES`.
     ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
@@ -89,7 +92,12 @@ class SmearModel:
         self.origin = marker.T_body_marker.apply(
             0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
         self.axes = cell * np.array([R[:, 0], -R[:, 1]])
+        self.cell = cell
         self.places, self.around = _samples(n, MARGIN), _samples(n, MARGIN + REACH)
+        self.on_body = self.origin + self.places @ self.axes
+        self.middle = self.origin + 0.5 * (n - 1) * self.axes.sum(axis=0)
+        self.from_middle = np.abs(self.places - 0.5 * (n - 1))
+        self.across = self.places / (n - 1) - 0.5
         white = np.pad(printed, _WHITE, constant_values=True).astype(float)
         level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
         self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
@@ -161,6 +169,19 @@ _STEEPEST = 0.4
 _REGULAR = np.diag([0.0] * 9 + [_UNEVEN**-2] * 3 + [0.0, 0.0])
 
 
+class SmearStart(NamedTuple):
+    """Pose, smear and blur to descend from, as in :class:`SmearFit`."""
+
+    pose: Transform
+    smear: Array
+    lens: int
+
+    @property
+    def blur(self) -> float:
+        """Return the standard deviation of the blur along the smear, cells."""
+        return _blur(self.smear, self.lens)
+
+
 class SmearFit(NamedTuple):
     """
     A pose that explains a smeared marker.
@@ -177,6 +198,15 @@ class SmearFit(NamedTuple):
     smear: Array
     lens: int
 
+    @property
+    def blur(self) -> float:
+        """Return the standard deviation of the blur along the smear, cells."""
+        return _blur(self.smear, self.lens)
+
+
+def _blur(smear: Array, lens: int) -> float:
+    return math.sqrt(float(smear.dot(smear)) / 12.0 + float(LENSES[lens])**2)
+
 
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
                 start: Transform) -> SmearFit | None:
@@ -186,11 +216,11 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
     ``start`` may be off by two cells and a half, and a little in all else.
     """
     begin = seek(image, camera, model, start)
-    return None if begin is None else descend(image, camera, model, *begin)
+    return None if begin is None else descend(image, camera, model, begin)
 
 
 def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
-         start: Transform) -> tuple[Transform, Array, int] | None:
+         start: Transform) -> SmearStart | None:
     """
     Return the pose, shifted, smear and blur with which the print is likest to the image.
 
@@ -213,7 +243,7 @@ def seek(image: GrayImage, camera: CameraModel, model: SmearModel,
     shift = (np.array([column, row]) - REACH) / PER_CELL
     offset = start.rotation @ (shift @ model.axes)
     pose = Transform(start.rotation, start.translation + offset)
-    return pose, model.smears[which], model.lenses[which]
+    return SmearStart(pose, model.smears[which], model.lenses[which])
 
 
 def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, Any] | None:
@@ -231,6 +261,24 @@ def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, 
     return brightness.astype(float), inside
 
 
+class _Linear(NamedTuple):
+    """
+    The print at a pose and a smear, and by how much its samples, (s,), change with each unknown.
+
+    ``design`` (s, 14), grey levels per unit of the pose (6), the response (6) and the smear (2);
+    ``steep`` (s,), grey levels squared, of how well blur is known. ``usable`` (s,), bool: samples
+    in the image that show the marker; ``center`` (3,), m, is about which it turns. ``light``:
+    difference between white and black, grey levels.
+    """
+
+    brightness: Array
+    usable: Any
+    design: Array
+    steep: Array
+    center: Array
+    light: float
+
+
 class _Descent(NamedTuple):
     """
     Residuals, (s,), grey levels, after a step, and the inputs of the step.
@@ -246,69 +294,94 @@ class _Descent(NamedTuple):
     response: Array
 
 
-def descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Transform,
-            smear: Array, lens: int) -> SmearFit | None:
+def descend(image: GrayImage, camera: CameraModel, model: SmearModel,
+            start: SmearStart) -> SmearFit | None:
     """Return the fit at the least weighted squares near a pose and a smear."""
-    on_body = model.origin + model.places @ model.axes
-    middle = model.origin + 0.5 * (model.cells - 1) * model.axes.sum(axis=0)
-    cell = float(np.linalg.norm(model.axes[0]))
-    across = model.places / (model.cells - 1) - 0.5
-    weights, variance, light, curve = np.ones(len(on_body)), _FLOOR**2, 0.0, 0.0
+    pose, smear, lens = start
+    weights, variance, response = np.ones(len(model.places)), _FLOOR**2, None
     for count in range(_PASSES):
-        points, center = pose.apply(on_body), pose.apply(middle[None])[0]
-        seen = _look(image, camera, points)
-        if seen is None:
+        lens = _lens_of(camera, model, pose, lens)
+        at = _linearized(image, camera, model, SmearStart(pose, smear, lens), response)
+        if at is None:
             return None
-        brightness, inside = seen
-        # What lies beyond the white around the marker is smeared into its rim.
-        reach = np.abs(model.places - 0.5 * (model.cells - 1)) + 0.5 * np.abs(smear)
-        weights = weights * (inside & (reach < 0.5 * model.cells + _AROUND).all(axis=1))
-        if lens < FOCUSED:
-            blur = _LENS * center[2] / (camera.matrix[0, 0] * cell)
-            lens = int(np.abs(LENSES[:FOCUSED] - blur).argmin())
-        white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
-        # Gamma and over-exposure bend what would be straight; light falls unevenly.
-        response = np.stack([white, np.ones_like(white), white * (1.0 - white),
-                             white * (1.0 - white) * (1.0 - 2.0 * white),
-                             *(white * across.T)], axis=1)
-        if count == 0:
-            first = solve_normal(response.T.dot(response), response.T.dot(brightness))
-            if first is None:
-                return None
-            light, _, curve, *_ = first.tolist()
-        slope = (light + curve * (1.0 - 2.0 * white))[:, None]
-        along = _by_point(pose, model, points, slope * by_place)
-        design = np.concatenate([along, cross(points - center, along), response,
-                                 slope * by_smear], axis=1)
         # The steeper it is, the more the true blur of lens and cells matters.
-        steep = _BLURRED**2 * (slope * slope * by_place * by_place).sum(axis=1)
-        weights = weights / (variance + steep)
-        weighted = design * weights[:, None]
-        information = weighted.T.dot(design) + _PRIOR + _REGULAR / max(light, _MIN_CONTRAST)**2
+        weights = weights * at.usable / (variance + at.steep)
+        weighted = at.design * weights[:, None]
+        information = weighted.T.dot(at.design) + _PRIOR + (
+            _REGULAR / max(at.light, _MIN_CONTRAST)**2)
         # Smears to either side of an axis look alike: a whole step from one leads to the other.
         held = information + information * _PRIOR if count < _DAMPED else information
-        step = solve_normal(held, weighted.T.dot(brightness))
+        step = solve_normal(held, weighted.T.dot(at.brightness))
         if step is None:
             return None
-        light, _, curve = step[6:9].tolist()  # what remains of the response is small
+        response = step[6:9].tolist()
         turn, offset = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
         smear, smeared = smear + step[-2:], float(np.abs(step[-2:]).max())
-        if (not max(turn, smeared) < _LONGEST_TURN or light <= 0.0
-                or offset > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
+        if (not max(turn, smeared) < _LONGEST_TURN or response[0] <= 0.0
+                or offset > _LONGEST_STEP * at.center[2] or math.hypot(*smear) > _LONGEST):
             return None
-        pose = moved(pose, center, step)
-        residual = brightness - design.dot(step)
-        if count > 2 and turn < _SMALL and max(offset / cell, smeared) < 10.0 * _SMALL:
+        pose = moved(pose, at.center, step)
+        residual = at.brightness - at.design.dot(step)
+        if count > 2 and turn < _SMALL and max(offset / model.cell, smeared) < 10.0 * _SMALL:
             break
         squares = residual * residual
         variance = max(1.4826**2 * median(squares), _FLOOR**2)
-        weights = np.maximum(1.0 - squares / (25.0 * (variance + steep)), 0.0)**2
+        weights = np.maximum(1.0 - squares / (25.0 * (variance + at.steep)), 0.0)**2
     else:
         return None
-    if math.hypot(*step[10:12].tolist()) > _STEEPEST * light:
+    if math.hypot(*step[10:12].tolist()) > _STEEPEST * response[0]:
         return None
-    return _checked(model, pose, smear, lens, _Descent(
-        residual, response.dot(step[6:-2]), weights, information, light, response))
+    columns = at.design[:, 6:12]
+    return _checked(model, SmearStart(pose, smear, lens), _Descent(
+        residual, columns.dot(step[6:12]), weights, information, response[0], columns))
+
+
+def _lens_of(camera: CameraModel, model: SmearModel, pose: Transform, lens: int) -> int:
+    """Return the index of the blur of a lens in focus at a pose; one out of focus stays."""
+    if lens >= FOCUSED:
+        return lens
+    depth = float(pose.apply(model.middle[None])[0, 2])
+    blur = _LENS * depth / (camera.matrix[0, 0] * model.cell)
+    return int(np.abs(LENSES[:FOCUSED] - blur).argmin())
+
+
+def _linearized(image: GrayImage, camera: CameraModel, model: SmearModel, start: SmearStart,
+                response: list[float] | None) -> _Linear | None:
+    """
+    Return the print near ``start``; None if the image does not show it.
+
+    :param response: difference between white and black, black, and bend, grey levels; None: they
+        are fitted to the image.
+    """
+    pose, smear, lens = start
+    points, center = pose.apply(model.on_body), pose.apply(model.middle[None])[0]
+    seen = _look(image, camera, points)
+    if seen is None:
+        return None
+    brightness, inside = seen
+    # What lies beyond the white around the marker is smeared into its rim.
+    usable = inside & (model.from_middle + 0.5 * np.abs(smear) < 0.5 * model.cells + _AROUND
+                       ).all(axis=1)
+    white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
+    design = np.empty((len(white), 14))
+    # Gamma and over-exposure bend what would be straight; light falls unevenly.
+    bent = white * (1.0 - white)
+    design[:, 6], design[:, 7], design[:, 8] = white, 1.0, bent
+    design[:, 9] = bent * (1.0 - 2.0 * white)
+    design[:, 10:12] = white[:, None] * model.across
+    if response is None:
+        columns = design[:, 6:12]
+        first = solve_normal(columns.T.dot(columns), columns.T.dot(brightness))
+        if first is None:
+            return None
+        response = first[:3].tolist()
+    slope = (response[0] + response[2] * (1.0 - 2.0 * white))[:, None]
+    by_place = slope * by_place
+    design[:, :3] = _by_point(pose, model, points, by_place)
+    design[:, 3:6] = cross(points - center, design[:, :3])
+    design[:, 12:] = slope * by_smear
+    steep = _BLURRED**2 * (by_place * by_place).sum(axis=1)
+    return _Linear(brightness, usable, design, steep, center, response[0])
 
 
 def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array) -> Array:
@@ -321,22 +394,21 @@ def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array
     return moved_by
 
 
-def _checked(model: SmearModel, pose: Transform, smear: Array, lens: int,
-             last: _Descent) -> SmearFit | None:
+def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | None:
     """Return a fit, None if it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))
     left = float(weights.dot(last.residual**2))
     if (contrast < _MIN_CONTRAST or not left < (1.0 - _ALIKE**2) * spread
-            or not _shows_code(model, smear, last)):
+            or not _shows_code(model, end.smear, last)):
         return None
     chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR), 1), 1.0)
     covariance = normal_covariance(last.information / (chi2 * _ALIKE_SAMPLES))
     if covariance is None:
         return None
-    return SmearFit(pose, covariance[:6, :6],
-                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast, smear, lens)
+    return SmearFit(end.pose, covariance[:6, :6], math.sqrt(
+        left / max(float(weights.sum()), 1e-9)) / contrast, end.smear, end.lens)
 
 
 def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:

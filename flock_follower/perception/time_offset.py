@@ -41,6 +41,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometryBuffer
 from flock_follower.perception.learnt_noise import LearntNoise
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_motion import FilterParams
 from flock_follower.ranges import MAX_OFFSET
 
@@ -205,5 +206,5 @@ class MountedCamera:
         """Number of images for which a neighbour's mirrored attitude need not be checked."""
         self.confirmed_at: dict[str, float] = {}
         """Stamp of the last image in which a neighbor was measured by more than its smear, s."""
-        self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
-        """That of the brightness profiles of each neighbour's last measurement, px."""
+        self.measured: dict[str, Measurement] = {}
+        """The last measurement of each neighbor."""

@@ -65,8 +65,9 @@ from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
-#: and otherwise in one of so many.
+#: and otherwise in one of so many; of a smeared print in one of so many.
 MARGIN, MIRRORED_EVERY = 100.0, 30
+SMEARED_EVERY = 3
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -186,7 +187,7 @@ class Tracker:
         for name in look.near:
             self._measure(image, look, name, track(
                 image, model, self._targets[name], look.expected[name],
-                look.camera.spacings[name], look.camera.unchecked[name] == 0))
+                look.camera.measured.get(name), look.camera.unchecked[name] == 0))
         for name, expected in self._candidates(look):
             found = track(image, model, self._targets[name], expected, None, True)
             if found is not None and not look.known(found, self._side[name]):
@@ -256,7 +257,8 @@ class Tracker:
         look.measured[name] = found
         unchecked = look.camera.unchecked
         if found.margin is not None:
-            unchecked[name] = MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
+            unchecked[name] = SMEARED_EVERY - 1 if found.spacing is None else (
+                MIRRORED_EVERY - 1 if found.margin > MARGIN else 0)
         elif unchecked[name]:
             unchecked[name] -= 1
 
@@ -376,7 +378,7 @@ class Tracker:
                     candidate.track, look, placed)
             return
         self._schedule.saw(name, camera, placed.time)
-        camera.spacings[name] = measurement.spacing
+        camera.measured[name] = measurement
         if not other:
             self._learn(camera, measurement, placed)
         sighting.measurements[name] = measurement

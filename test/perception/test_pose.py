@@ -233,6 +233,7 @@ def test_clear_edges_whose_code_is_hidden_are_not_taken_for_a_smear(
         raise AssertionError('the marker is not smeared')
 
     monkeypatch.setattr(pose_module, 'fit_smeared', smeared)
+    monkeypatch.setattr(pose_module, 'descend', smeared)
     assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, True) is None
     assert locate(image, SMALL, LEADER, 0, corners, PosePrior(body(marker))) is None
 

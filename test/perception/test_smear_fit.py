@@ -31,7 +31,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.smear_fit import descend, fit_smeared, smear_model
+from flock_follower.perception.smear_fit import descend, fit_smeared, smear_model, SmearStart
 
 CAMERA = make_camera(width=240, height=180)
 CELL = SIDE / 6.0
@@ -83,7 +83,8 @@ def test_a_smeared_marker_has_an_honest_covariance(cells: float, gamma: float) -
 def test_a_fit_ends_where_it_leads_no_farther(cells: float) -> None:
     image = smeared(HERE, cells, 0.4, gamma=2.2)
     found = known(fit_smeared(image, CAMERA, MODEL, off(body(HERE), 2)))
-    again = known(descend(image, CAMERA, MODEL, found.pose, found.smear, found.lens))
+    again = known(descend(image, CAMERA, MODEL, SmearStart(
+        found.pose, found.smear, found.lens)))
     turned = matrix_to_rotation_vector(again.pose.rotation @ found.pose.rotation.T)
     assert np.linalg.norm(turned) < 0.01
     assert np.linalg.norm(again.smear - found.smear) < 0.02
