@@ -110,7 +110,7 @@ class Measurement(NamedTuple):
     R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges are
     from their projections, px; of a smeared marker the difference of its image from the
     rendered one, as a share of contrast; ``stage`` how it was found: 'track', 'roi' or 'full'.
-    ``spacing``, px, of the brightness profiles, None without profiles.
+    ``spacing``, px, of the brightness profiles, None without profiles: of a smeared print.
     ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
     equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
     probability of the mirrored attitude when it was last checked. ``alike`` is the

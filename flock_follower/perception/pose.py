@@ -49,11 +49,10 @@ from flock_follower.perception.smear_fit import (
     descend,
     fit_smeared,
     seek,
-    smear_model,
     SmearFit,
-    SmearModel,
     SmearStart,
 )
+from flock_follower.perception.smear_print import smear_model, SmearModel
 from flock_follower.perception.square_pose import ippe, mirrored
 
 #: Edge errors below this, px, cannot decide between two attitudes.
@@ -125,7 +124,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         whole = _fit_whole(image, camera, sought, _smear_starts(
             image, camera, sought, expected.pose))
     if whole is not None and (found is None or blurred):
-        if check_mirrored or last is None or last.spacing is not None:
+        if check_mirrored or last is None or spacing is not None:
             return _of_smears(image, camera, sought, whole, expected)
         return _with_doubt(sought, whole, last.doubt)
     return None if found is None else _of_edges(

@@ -26,7 +26,6 @@ Lengths on a marker are in cells: (0, 0) is the middle of its first black cell, 
 
 from __future__ import annotations
 
-from functools import lru_cache
 import math
 from typing import Any, NamedTuple
 
@@ -34,7 +33,6 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, skew, Transform
-from flock_follower.neighbors_file import Marker
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edges import (
     cross,
@@ -44,105 +42,16 @@ from flock_follower.perception.edges import (
     within_reason,
 )
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import marker_code
-from flock_follower.perception.print_model import cell_code, median
-
-#: Samples per cell, each way; beyond the black border; and away from where a marker is expected
-#: up to which it is looked for.
-PER_CELL = 3
-MARGIN = 1
-REACH = 8
-#: Of the exposure, which lasts for 1.
-INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
-#: The mean over the instants, and the mean of what grows with them: (2, 13).
-_MEANS = (np.stack([np.ones_like(INSTANTS), INSTANTS]) / len(INSTANTS)).astype(np.float32)
-_TEXELS = 12  # of the print, per cell
-_WHITE = 3  # cells around, in the print
-#: Blur there is without motion, cells: of lenses, one taken to begin with, and out of focus.
-LENSES = np.array([0.07, 0.11, 0.17, 0.27, 0.4])  # with less, the instants were steps in the image
-FOCUSED = 3  # so many of them are
-_SHARP = 1
-#: Lengths, cells, of the smear vectors that are tried first, in steps of 45 degrees. None is 0,
-#: where the squares have no slope by the vector and the descent stays.
-_LENGTHS = (0.2, 0.5, 1.0, 1.45)
-
-
-class SmearModel:
-    """
-    The model of a print whose image is smeared by motion.
-
-    ``origin`` (3,) and ``axes`` (2, 3), m: place of (0, 0) on the body, and steps of one cell.
-    ``places`` (s, 2), cells, are the sample points, row by row; ``around`` are more of them.
-    ``on_body`` (s, 3), m: ``places`` on the body; ``middle`` (3,) of the marker; ``from_middle``
-    (s, 2), cells, how far off ``places`` are; ``across`` (s, 2) is -0.5 to 0.5 across the marker.
-    ``cell``, m, is the length of a cell.
-    ``printed`` (l, H, W, 3): whiteness, 0..1, and its derivatives per cell to the right and down,
-    for each of :data:`LENSES`.
-    ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
-    ``smeared`` (t, k, k) the samples under them. ``codes`` (w, b): all codewords of the dictionary
-    in all rotations, 0..1, the marker's own first; up to ``errors`` cells may be misread: half of
-    those that can be corrected.
-    ``cells``: number of cells along a side, with the black border.
-    """
-
-    def __init__(self, marker: Marker, dictionary: str) -> None:
-        printed = marker_code(dictionary, marker.marker_id)
-        self.cells = n = len(printed)
-        cell, R = marker.side_length / n, marker.T_body_marker.rotation
-        self.origin = marker.T_body_marker.apply(
-            0.5 * (n - 1) * cell * np.array([[-1.0, 1.0, 0.0]]))[0]
-        self.axes = cell * np.array([R[:, 0], -R[:, 1]])
-        self.cell = cell
-        self.places, self.around = _samples(n, MARGIN), _samples(n, MARGIN + REACH)
-        self.on_body = self.origin + self.places @ self.axes
-        self.middle = self.origin + 0.5 * (n - 1) * self.axes.sum(axis=0)
-        self.from_middle = np.abs(self.places - 0.5 * (n - 1))
-        self.across = self.places / (n - 1) - 0.5
-        white = np.pad(printed, _WHITE, constant_values=True).astype(float)
-        level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
-        self.printed: Any = np.array([_with_slopes(cv2.GaussianBlur(
-            level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
-        angles = np.arange(4) * np.pi / 4
-        self.smears = np.array([*(length * np.array([np.cos(a), np.sin(a)])
-                                  for length in _LENGTHS for a in angles),
-                                *np.zeros((len(LENSES) - FOCUSED, 2))])
-        self.lenses = (_SHARP,) * (len(_LENGTHS) * len(angles)) + tuple(
-            range(FOCUSED, len(LENSES)))
-        size = n * PER_CELL + 2 * MARGIN
-        self.smeared: Any = np.array([
-            smear_print(self.printed[lens], self.places, smear)[0]
-            for lens, smear in zip(self.lenses, self.smears)]).reshape(-1, size, size).astype(
-                np.float32)
-        code = cell_code(marker, dictionary)
-        self.codes = 0.5 + 0.5 * np.vstack([code.bits, code.others])
-        self.errors = max(code.errors // 2, 1)
-
-
-#: The model of a marker of a dictionary, made once.
-smear_model = lru_cache(maxsize=64)(SmearModel)
-
-
-def _with_slopes(level: Array) -> Any:
-    """Return how white a print is, and by how much more per cell to the right and down."""
-    down, right = np.gradient(level)
-    return np.dstack([level, _TEXELS * right, _TEXELS * down]).astype(np.float32)
-
-
-def _samples(cells: int, margin: int) -> Array:
-    """Return places (s, 2), cells, that cover a marker and a margin, samples, around it."""
-    along = (np.arange(-margin, cells * PER_CELL + margin) + 0.5) / PER_CELL - 0.5
-    return np.stack(np.meshgrid(along, along), axis=2).reshape(-1, 2)
-
-
-def smear_print(printed: Any, places: Array, smear: Array) -> tuple[Array, Array, Array]:
-    """Return how white samples are, (s,), and by place and by smear, (s, 2), per cell."""
-    at = places + INSTANTS[:, None, None] * smear
-    at = ((at + 0.5 + _WHITE) * _TEXELS - 0.5).astype(np.float32)
-    seen = cv2.remap(printed, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE).reshape(len(INSTANTS), -1)
-    mean, by_smear = _MEANS.dot(seen).reshape(2, -1, 3).astype(float)
-    return mean[:, 0], mean[:, 1:], by_smear[:, 1:]
-
+from flock_follower.perception.print_model import median
+from flock_follower.perception.smear_print import (
+    FOCUSED,
+    instants_of,
+    LENSES,
+    PER_CELL,
+    REACH,
+    smear_print,
+    SmearModel,
+)
 
 _LENS = 0.75  # px: blur there is without motion
 _AROUND = 0.8  # cells that are white beyond the black border, at least
@@ -362,7 +271,8 @@ def _linearized(image: GrayImage, camera: CameraModel, model: SmearModel, start:
     # What lies beyond the white around the marker is smeared into its rim.
     usable = inside & (model.from_middle + 0.5 * np.abs(smear) < 0.5 * model.cells + _AROUND
                        ).all(axis=1)
-    white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
+    white, by_place, by_smear = smear_print(
+        model.printed[lens], model.places, smear, LENSES[lens])
     design = np.empty((len(white), 14))
     # Gamma and over-exposure bend what would be straight; light falls unevenly.
     bent = white * (1.0 - white)
@@ -401,7 +311,7 @@ def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | N
     spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))
     left = float(weights.dot(last.residual**2))
     if (contrast < _MIN_CONTRAST or not left < (1.0 - _ALIKE**2) * spread
-            or not _shows_code(model, end.smear, last)):
+            or not _shows_code(model, end, last)):
         return None
     chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR), 1), 1.0)
     covariance = normal_covariance(last.information / (chi2 * _ALIKE_SAMPLES))
@@ -411,15 +321,16 @@ def _checked(model: SmearModel, end: SmearStart, last: _Descent) -> SmearFit | N
         left / max(float(weights.sum()), 1e-9)) / contrast, end.smear, end.lens)
 
 
-def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:
+def _shows_code(model: SmearModel, end: SmearStart, last: _Descent) -> bool:
     """Return whether no word suits the image better, and few cells were better turned."""
-    at = np.rint(model.places + INSTANTS[:, None, None] * smear).astype(int)
+    instants = instants_of(end.smear, LENSES[end.lens])
+    at = np.rint(model.places + instants[:, None, None] * end.smear).astype(int)
     inner, count = model.cells - 2, len(model.places)
     within = ((at >= 1) & (at <= inner)).all(axis=2)
     cell = (at[..., 1] - 1) * inner + at[..., 0] - 1
     index = cell * count + np.arange(count)
     share = np.bincount(index[within], minlength=inner * inner * count).reshape(
-        inner * inner, count) / len(INSTANTS)  # of each sample, how much is of each cell
+        inner * inner, count) / len(instants)  # of each sample, how much is of each cell
     own = model.codes[0]
     turned = (1.0 - 2.0 * own)[:, None] * share * last.light
     # What turning cells adds to the squares left, once the response is fitted anew.

@@ -31,7 +31,8 @@ from flock_follower.geometry import (
 )
 from flock_follower.neighbors_file import Marker
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.smear_fit import descend, fit_smeared, smear_model, SmearStart
+from flock_follower.perception.smear_fit import descend, fit_smeared, SmearStart
+from flock_follower.perception.smear_print import smear_model
 
 CAMERA = make_camera(width=240, height=180)
 CELL = SIDE / 6.0
