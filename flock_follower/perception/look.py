@@ -47,7 +47,7 @@ from flock_follower.perception.time_offset import MountedCamera
 
 #: A fit to a smeared marker starts from the estimate: after this time, s, without a measurement
 #: of another kind the marker is detected to confirm the fit.
-CONFIRM_PERIOD = 0.1
+CONFIRM_PERIOD = 0.2
 MAX_TURN = 0.3  # rad: a fit whose attitude differs by more from the detection's is replaced
 _VELOCITIES = np.arange(VELOCITY.start, VELOCITY.stop)
 
@@ -235,7 +235,7 @@ class Look:
             for index, marker in enumerate(sought.neighbor.markers):
                 middle = place.apply(marker.T_body_marker.translation)
                 for outline in corners[ids == marker.marker_id]:
-                    again = locate(image, self.model, sought, index, outline, prior)
+                    again = locate(image, self.model, sought, index, outline, prior, False)
                     if again is not None and angle(again.T_camera_body, place) > MAX_TURN and (
                             math.dist(again.T_camera_body.apply(marker.T_body_marker.translation),
                                       middle) < marker.side_length):

@@ -178,12 +178,13 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: PosePrior) -> Measurement | None:
+           expected: PosePrior, smeared: bool = True) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None if no pose suits it.
 
     :param index: of the marker among the neighbour's.
     :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
+    :param smeared: whether its whole print is fitted if its edges are smeared.
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
@@ -192,7 +193,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     near = [one for start in starts if (one := fit(image, camera, alone, start)) is not None]
     fits = [one for one in near if one.inliers > FOUND_INLIERS and _shown(image, one).all()]
     if not fits:
-        return None if any(map(_sharp, near)) else _without_edges(
+        return None if not smeared or any(map(_sharp, near)) else _without_edges(
             image, camera, sought, index, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
@@ -294,10 +295,14 @@ def _mirrored_body(sought: Target, index: int, pose: Transform) -> Transform | N
 
 def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
                     expected: PosePrior) -> Measurement:
-    """Return the measurement of the likelier of one or both attitudes of a smeared marker."""
+    """
+    Return the measurement of the likelier of one or both attitudes of a smeared marker.
+
+    The image decides so little that the expected attitude would confirm itself: it has no vote.
+    """
     least = min(each.rms for each in fits)
     best = choose([Hypothesis(each.pose, SMEAR_DEGREES * (each.rms / least)**2, each)
-                   for each in fits], expected)
+                   for each in fits], PosePrior(None, expected.up))
     return widened(_smear_measurement(sought, index, best.chosen.fit), best)
 
 
