@@ -36,11 +36,13 @@ from flock_follower.messages import MAX_JUMP
 from flock_follower.neighbors_file import MarkedNeighbor
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import NeighborFilter
+from flock_follower.perception.search import PORTIONS
 from flock_follower.perception.time_offset import MountedCamera
 
-#: Shortest time between two searches of whole images for a missing neighbour, s, and between two
-#: attempts to find a neighbour that another camera sees.
+#: Shortest time between two attempts to find a neighbour that another camera sees, s.
 SEARCH_PERIOD = 0.1
+#: A whole image is searched for a missing neighbour in portions, one for so much time, s.
+PORTION_PERIOD = 1.0 / 30.0
 #: Period of searches although no neighbour is missing, s: for further markers with a known id.
 SWEEP_PERIOD = 1.0
 #: A neighbour that a camera measured at most this time ago, s, is tracked by that camera.
@@ -120,7 +122,14 @@ class CameraSchedule:
 
     def search_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, for a missing neighbour."""
-        return abs(stamp - camera.searched) >= self._cameras * SEARCH_PERIOD - 1e-3
+        return self.portions(camera, stamp) > 0
+
+    def portions(self, camera: MountedCamera, stamp: float) -> int:
+        """Return how many portions of the image of a stamp, s, to search."""
+        if camera.searched == -math.inf:
+            return 1
+        waited = (abs(stamp - camera.searched) + 1e-3) / (self._cameras * PORTION_PERIOD)
+        return math.floor(min(waited, PORTIONS))
 
     def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, although none is missing."""

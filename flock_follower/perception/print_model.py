@@ -135,7 +135,8 @@ class CellCode:
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
     rows. ``bits`` (b,): +1 white, -1 black; up to ``errors`` of them may be misread. ``others``
     (w, b): all other codewords of the dictionary, in all rotations. ``windows``: cells that are
-    compared with one another under uneven light. ``by_cell`` takes pixels (c, 2) to how far, px,
+    compared with one another under uneven light. ``beside`` (b, c): 1 for the cells next to an
+    inner one. ``by_cell`` takes pixels (c, 2) to how far, px,
     it is from cell to cell along rows and columns, (2, c).
     """
 
@@ -159,6 +160,8 @@ class CellCode:
         self.windows = windows(self.grid, np.concatenate([
             self.bits > 0.0, np.zeros(self.border, dtype=bool),
             np.ones(len(order) - self.bits.size - self.border, dtype=bool)]))
+        apart = np.abs(self.grid[:self.bits.size, None] - self.grid).max(axis=2)
+        self.beside: Any = (apart == 1).astype(np.float32)
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
         self.by_cell = np.linalg.pinv(np.column_stack([self.grid, np.ones(len(self.grid))]))[:2]
 
@@ -217,9 +220,13 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> 
     saturated: Any = (brightness >= _SATURATED).any(axis=0)
     end = code.bits.size + code.border
     inner, border, around = slice(code.bits.size), slice(code.bits.size, end), slice(end, None)
-    # A reflex hides black cells. It cannot be told from paper that is saturated as well.
+    # A reflex hides black cells, and brightens those beside. It cannot be told from paper that is
+    # saturated as well, unless the marker was there before.
     hidden = saturated[inner] & (code.bits < 0.0)
-    hidden &= saturated[around].mean() <= _MOST_HIDDEN
+    if tracked:
+        hidden |= (code.bits < 0.0) & (colours[inner] > 0.0) & (code.beside.dot(saturated) > 0.0)
+    else:
+        hidden &= saturated[around].mean() <= _MOST_HIDDEN
     count = np.count_nonzero(hidden)
     bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.

@@ -22,6 +22,8 @@ leans by as much, and a position that is wrong by its distance from the marker.
 
 from __future__ import annotations
 
+from functools import lru_cache
+from itertools import pairwise
 import math
 from typing import NamedTuple
 
@@ -47,6 +49,8 @@ _MIN_LIKENESS = 0.7
 _OURS = 0.95
 #: The other border must leave unexplained (1 - correlation) this share at most of what ours does.
 _MAX_LEFT = 0.8
+#: Wide borders are searched for in two of so many searches of whole images.
+_ROUNDS = 8
 #: A neighbour that leans by more, rad, carries a turned print, or is about to crash.
 MAX_LEAN = math.radians(60.0)
 WRONG_BORDER, TURNED = 'print with another border', 'print turned'
@@ -54,22 +58,42 @@ WRONG_BORDER, TURNED = 'print with another border', 'print turned'
 REASONS = (WRONG_BORDER, TURNED)
 
 
+#: An outline, as a square.
+_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
+
+
+@lru_cache(maxsize=16)
+def _prints(dictionary: str, marker_id: int) -> tuple[Array, Array, list[int]]:
+    """
+    Return the prints of a marker with each border, as each of _OUTLINES would be found.
+
+    The places of their samples (n, 2) if the outline is the unit square, how white they are, (n,),
+    and at which sample each print but the first begins.
+    """
+    code = marker_code(dictionary, marker_id)[1:-1, 1:-1]
+    places, white = [], []
+    for border, inside in _OUTLINES:
+        cells = len(code) + 2 * border
+        along = ((np.arange(_SAMPLES * cells) + 0.5) / _SAMPLES - inside) / (cells - 2 * inside)
+        places.append(np.stack(np.meshgrid(along, along), axis=2).reshape(-1, 2))
+        white.append(np.kron(np.pad(code, border), np.ones((_SAMPLES, _SAMPLES))).ravel())
+    begins = np.cumsum([len(each) for each in white])[:-1].tolist()
+    return np.concatenate(places), np.concatenate(white), begins
+
+
 def border_cells(image: GrayImage, corners: Array, dictionary: str, marker_id: int) -> int:
     """Return the width of a marker's black border, cells; ``corners`` (4, 2), px, outline it."""
-    code = marker_code(dictionary, marker_id)[1:-1, 1:-1]
-    likeness = []
-    for border, inside in _OUTLINES:
-        printed = np.kron(np.pad(code, border), np.ones((_SAMPLES, _SAMPLES))).ravel()
-        cells = len(code) + 2 * border
-        near, far = inside, cells - inside
-        square = np.array([[near, near], [far, near], [far, far], [near, far]], dtype=np.float32)
-        rows, columns = (np.mgrid[:_SAMPLES * cells, :_SAMPLES * cells] + 0.5) / _SAMPLES
-        middles = np.stack([columns.ravel(), rows.ravel()], axis=1)
-        to_image = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
-        seen = grey_levels(image, cv2.perspectiveTransform(middles[None], to_image)[0])
-        likeness.append(float(np.corrcoef(seen, printed)[0, 1]) if seen.std() > 0.0 else 0.0)
-        if likeness[0] > _OURS:
-            break
+    places, white, begins = _prints(dictionary, marker_id)
+    to_image = cv2.getPerspectiveTransform(_SQUARE, corners.astype(np.float32))
+
+    def likeness_of(part: slice) -> float:
+        seen = grey_levels(image, cv2.perspectiveTransform(places[None, part], to_image)[0])
+        return float(np.corrcoef(seen, white[part])[0, 1]) if seen.std() > 0.0 else 0.0
+
+    parts = [slice(*ends) for ends in pairwise([0, *begins, len(white)])]
+    likeness = [likeness_of(parts[0])]
+    if likeness[0] <= _OURS:
+        likeness += [likeness_of(part) for part in parts[1:]]
     best = int(np.argmax(likeness))
     clear = likeness[best] > _MIN_LIKENESS and (
         1.0 - likeness[best] < _MAX_LEFT * (1.0 - likeness[0]))
@@ -96,6 +120,11 @@ def wrong_border(image: GrayImage, corners: Array, dictionary: str, marker: Mark
 def with_wide_borders(image: GrayImage, dictionary: str) -> Detections:
     """Return the markers with a border of two or three cells, and some with one."""
     return joined(*(everywhere(image, dictionary, border=border) for border in BORDERS[1:]))
+
+
+def border_sought(rounds: int) -> int:
+    """Return the border, cells, to search for if so many whole images were searched before."""
+    return BORDERS[rounds % _ROUNDS] if rounds % _ROUNDS < len(BORDERS) else BORDERS[0]
 
 
 def lean(R_camera_body: Array, up: Array) -> float:

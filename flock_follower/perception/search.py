@@ -56,15 +56,21 @@ _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astyp
 #: window finds outlines across the edge of a shadow, a wide one finds blurred and noisy outlines.
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
+#: A whole image is searched in so many portions, one in an image: quickly, and thoroughly with one
+#: window after the other, of which the widest serves at half the size: noise has more outlines.
+_PORTIONS = (((7, 1), 1.0), ((11, 3), 1.0), ((15, 1), 0.5))
+PORTIONS = 1 + len(_PORTIONS)
 _DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
 _STRAIGHT = 0.012  # share of the outline: corners by which it deviates less are none
 _HIDDEN = 0.35  # share of the visible area that a reflex may have hidden
 _SLIGHT = 0.05  # share of that: no reflex, but a blunt corner
+_MOST_CORNERS = 7  # of a hull: one with more is no square, whatever hides it
 #: A quadrilateral may be a marker if its cells, compared with their neighbours, correlate so much
 #: with the print. Of clutter, 99 % have less.
 _LIKENESS = 0.75
+_MOST_READ = 6  # of these are read cell by cell, the likest
 
 
 def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
@@ -107,8 +113,24 @@ def everywhere(image: GrayImage, dictionary: str,
     return _search(image, (0, 0, width, height), scale, dictionary, markers, border)
 
 
+def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number: int,
+            border: int = 1) -> Detections:
+    """
+    Return the markers that one portion of a search of the whole image finds.
+
+    :param number: below :data:`PORTIONS`; 0 is a quick search for all markers of the dictionary.
+    """
+    if number == 0:
+        return everywhere(image, dictionary, border=border)
+    height, width = image.shape
+    window, scale = _PORTIONS[number - 1]
+    return _search(image, (0, 0, width, height), 0.5 * scale if width >= LARGE else scale,
+                   dictionary, markers, windows=(window,))
+
+
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,
-            markers: Sequence[Marker] | None, border: int = 1) -> Detections:
+            markers: Sequence[Marker] | None, border: int = 1,
+            windows: Sequence[tuple[int, int]] = _WINDOWS) -> Detections:
     x0, y0, x1, y1 = region
     part = image[y0:y1, x0:x1]
     if scale != 1.0:
@@ -117,26 +139,25 @@ def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, d
                           else cv2.INTER_LINEAR)
     part = np.ascontiguousarray(part)
     found = (detect(part, dictionary, border) if markers is None
-             else _read(part, dictionary, markers))
+             else _read(part, dictionary, markers, windows))
     # Pixel centres are whole numbers: half a pixel off before scaling, and after.
     scales = np.array([part.shape[1] / (x1 - x0), part.shape[0] / (y1 - y0)])
     corners: Array = (found.corners + 0.5) / scales - 0.5 + np.array([x0, y0])
     return Detections(found.ids, corners)
 
 
-def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker]) -> Detections:
+def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker],
+          windows: Sequence[tuple[int, int]]) -> Detections:
     """Return the given markers in an image, the likest outline first."""
     logarithm = cv2.LUT(image, _LOGARITHM)
-    outlines = outwards(quadrilaterals(logarithm), 0.5)
+    outlines = outwards(quadrilaterals(logarithm, windows), 0.5)
     if not len(outlines):
         return NO_DETECTIONS
     cells = marker_cells(dictionary)
     square = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], dtype=np.float32)
     rows, columns = np.mgrid[-1:cells + 1, -1:cells + 1] + 0.5
-    middles = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
-    x, y, w = np.moveaxis(np.array([
-        cv2.getPerspectiveTransform(square, outline.astype(np.float32)).dot(middles)
-        for outline in outlines]), 1, 0)
+    middles = np.stack([columns.ravel() / cells, rows.ravel() / cells, np.ones(rows.size)])
+    x, y, w = np.moveaxis(_from_square(outlines).dot(middles), 1, 0)
     seen = _local(cv2.remap(logarithm, (x / w).astype(np.float32), (y / w).astype(np.float32),
                             cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ids: list[int] = []
@@ -147,7 +168,8 @@ def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker]) -> Detec
                                              for turn in range(4)])).T)
         code = cell_code(marker, dictionary)
         likest = likeness.max(axis=1)
-        for k in np.argsort(-likest)[:np.count_nonzero(likest > _LIKENESS)].tolist():
+        likely = min(np.count_nonzero(likest > _LIKENESS), _MOST_READ)
+        for k in np.argsort(-likest)[:likely].tolist():
             outline = np.roll(outlines[k], int(likeness[k].argmax()), axis=0)
             if any(known == marker.marker_id and math.dist(
                     other.mean(axis=0), outline.mean(axis=0)) < math.dist(*other[:2])
@@ -159,6 +181,27 @@ def _read(image: GrayImage, dictionary: str, markers: Sequence[Marker]) -> Detec
                 ids.append(marker.marker_id)
                 corners.append(outline)
     return Detections(np.array(ids, dtype=np.int64), np.reshape(corners, (-1, 4, 2)))
+
+
+def _from_square(outlines: Array) -> Array:
+    """
+    Return the homographies (n, 3, 3) from the unit square to quadrilaterals (n, 4, 2).
+
+    Heckbert, "Fundamentals of texture mapping and image warping", 1989: cv2 takes one at a time.
+    """
+    first, second, third, fourth = np.moveaxis(outlines, 1, 0)
+    skewed = first - second + third - fourth
+    along, down = second - third, fourth - third
+    area = along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0]
+    area = np.where(np.abs(area) > 1e-9, area, 1e-9)
+    g = (skewed[:, 0] * down[:, 1] - skewed[:, 1] * down[:, 0]) / area
+    h = (along[:, 0] * skewed[:, 1] - along[:, 1] * skewed[:, 0]) / area
+    found: Array = np.empty((len(outlines), 3, 3))
+    found[:, :2, 0] = second - first + g[:, None] * second
+    found[:, :2, 1] = fourth - first + h[:, None] * fourth
+    found[:, :2, 2] = first
+    found[:, 2, 0], found[:, 2, 1], found[:, 2, 2] = g, h, 1.0
+    return found
 
 
 def _local(brightness: Array) -> Array:
@@ -176,23 +219,29 @@ def _differences(side: int) -> Array:
     return np.array([(cell - cv2.blur(cell, (3, 3))).ravel() for cell in cells])
 
 
-def quadrilaterals(logarithm: GrayImage) -> Array:
+def quadrilaterals(logarithm: GrayImage,
+                   windows: Sequence[tuple[int, int]] = _WINDOWS) -> Array:
     """Return the quadrilaterals, (n, 4, 2), px, clockwise, that may be the outlines of markers."""
     smooth = cv2.blur(logarithm, (3, 3))
     found = []
-    for window, brush in _WINDOWS:
+    for window, brush in windows:
         dark = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C,
                                      cv2.THRESH_BINARY_INV, window, _DARKER)
-        dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((brush, brush), dtype=np.uint8))
+        if brush > 1:
+            dark = cv2.morphologyEx(
+                dark, cv2.MORPH_OPEN, np.ones((brush, brush), dtype=np.uint8))
         contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         holes = [] if tree is None else (tree[0, :, 3] >= 0).tolist()
         for contour, hole in zip(contours, holes):
-            if hole or sum(cv2.boundingRect(contour)[2:]) < _SHORTEST // 2:
+            if hole or len(contour) < 4 or (
+                    sum(cv2.boundingRect(contour)[2:]) < _SHORTEST // 2):
                 continue
             hull = cv2.convexHull(contour)
             length, area = cv2.arcLength(hull, True), cv2.contourArea(hull)
             if _SHORTEST < length < math.sqrt(_ROUNDEST * area):
                 outline = cv2.approxPolyDP(hull, _STRAIGHT * length, True)
+                if len(outline) > _MOST_CORNERS:
+                    continue
                 found += _squares(outline[:, 0].tolist(), _HIDDEN * area)
     return np.reshape(found, (-1, 4, 2)).astype(float)
 

@@ -200,8 +200,10 @@ class MountedCamera:
         """Stamps of the last whole images searched, s: for a missing neighbour; although none."""
         self.vain: dict[str, float] = {}
         """When a neighbour was last looked for without success, by the odometry's clock, s."""
-        self.thorough = False
-        """Whether the next search of a whole image is thorough."""
+        self.searched_near = False
+        """Whether the last image was searched thoroughly near an expected place."""
+        self.portion = 0
+        """Number of portions of whole images that were searched."""
         self.unchecked = dict.fromkeys(names, 0)
         """Number of images for which a neighbour's mirrored attitude need not be checked."""
         self.confirmed_at: dict[str, float] = {}

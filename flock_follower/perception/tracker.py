@@ -29,7 +29,6 @@ Once a second the whole image is searched even if none is missing: see ``hypothe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -281,26 +280,31 @@ class Tracker:
     def _detect(self, image: GrayImage, look: Look) -> None:
         """Look for the neighbours that are not measured yet."""
         camera, dictionary = look.camera, self.config.dictionary
+        due = self._schedule.search_due(camera, look.stamp)
         for thorough in (False, True):
             for name in [n for n in look.near if n not in look.measured and (
                     not thorough or n in look.anywhere)]:
                 pose = look.expected[name].pose
-                if pose is not None:
+                if pose is not None and not (thorough and due and camera.searched_near):
                     look.sighting.stage = 'roi'
                     self._locate(search.near(image, look.model, dictionary,
                                              self._targets[name].neighbor, pose, thorough),
                                  'roi', image, look)
-        if not look.missing or not self._schedule.search_due(camera, look.stamp):
+        # One image has time for a thorough search near by, or for a portion of the whole image.
+        near = any(look.expected[name].pose is not None for name in look.missing
+                   if name in look.near)
+        camera.searched_near = near and not (due and camera.searched_near)
+        if not look.missing or not due or camera.searched_near:
             return
-        # The first time both ways: quickly, and if need be thoroughly; then they take turns.
-        for thorough in (False, True) if camera.searched == -math.inf else (camera.thorough,):
+        for _ in range(self._schedule.portions(camera, look.stamp)):
             if look.missing:
                 markers = [m for n in look.missing for m in self._targets[n].neighbor.markers]
-                self._locate(search.everywhere(image, dictionary, markers if thorough else None),
-                             'full', image, look)
-                camera.thorough = not thorough
-        if any(self._filters[name].newest is None for name in look.missing):
-            self._locate(prints.with_wide_borders(image, dictionary), 'full', image, look)
+                unseen = any(self._filters[name].newest is None for name in look.missing)
+                rounds, number = divmod(camera.portion, search.PORTIONS)
+                self._locate(search.portion(
+                    image, dictionary, markers, number, prints.border_sought(rounds) if unseen
+                    else prints.BORDERS[0]), 'full', image, look)
+                camera.portion += 1
         look.sighting.stage, camera.searched = 'full', look.stamp
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look) -> None:
@@ -315,7 +319,9 @@ class Tracker:
             if name not in look.expected or look.shown(corners, name, marker):
                 continue
             expected = look.expected[name]
-            fault = prints.wrong_border(image, corners, self.config.dictionary, marker)
+            # A neighbor that is tracked has shown its border.
+            fault = prints.wrong_border(image, corners, self.config.dictionary, marker) if (
+                expected.pose is None) else None
             measurement = None if fault else locate(
                 image, look.model, self._targets[name], neighbor.markers.index(marker), corners,
                 expected)

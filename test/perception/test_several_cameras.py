@@ -31,7 +31,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
-from flock_follower.perception.camera_schedule import SEARCH_PERIOD
+from flock_follower.perception.camera_schedule import PORTION_PERIOD, SEARCH_PERIOD
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import marker_corners
 from flock_follower.perception.measurement import Measurement
@@ -136,7 +136,7 @@ def test_a_tracked_neighbor_is_not_looked_for_where_it_is_not_expected(
     drone = Drone(front=FRONT, back=BACK)
     drone.see('front', 0.0, ahead(2.0, 0.0))
     tracked = watched(monkeypatch, tracker_module, 'track')
-    whole = watched(monkeypatch, tracker_module.search, 'everywhere')
+    whole = watched(monkeypatch, tracker_module.search, 'portion')
     for k in range(1, 19):
         assert drone.see('front', 0.05 * k, ahead(2.0, 0.0, 0.05 * k)).estimates
         drone.feed(0.05 * k + 0.01)
@@ -162,12 +162,11 @@ def test_an_image_older_than_that_of_another_camera_is_not_used() -> None:
 
 def test_more_cameras_search_no_more_whole_images(monkeypatch: pytest.MonkeyPatch) -> None:
     drone = Drone(front=FRONT, left=LEFT, back=BACK)
-    whole = watched(monkeypatch, tracker_module.search, 'everywhere')
+    portions = watched(monkeypatch, tracker_module.search, 'portion')
     for k in range(60):
         for name in drone.mountings:
             drone.see(name, k / 30.0)
-    # Each one's first time in both ways.
-    assert len(whole) == pytest.approx(2.0 / SEARCH_PERIOD + 3, abs=3)
+    assert len(portions) == pytest.approx(2.0 / PORTION_PERIOD, abs=3)
 
 
 def test_a_neighbour_that_leaves_all_images_is_searched_for_in_all_and_found() -> None:

@@ -32,8 +32,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometrySample
-from flock_follower.perception import tracker as tracker_module
-from flock_follower.perception.camera_schedule import SEARCH_PERIOD
+from flock_follower.perception import search, tracker as tracker_module
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
 from flock_follower.perception.measurement import Measurement
@@ -141,23 +140,23 @@ def test_the_cheapest_stage_that_finds_the_neighbour_is_used(image: GrayImage) -
     np.testing.assert_allclose(found['leader'].position, aside(-0.5).translation, atol=0.02)
 
 
-@pytest.mark.parametrize(('rate', 'every'), [(30.0, 3), (7.0, 1)])
-def test_whole_images_are_searched_at_a_limited_rate_in_turns(
-        monkeypatch: pytest.MonkeyPatch, rate: float, every: int) -> None:
-    drone, done = hovering(period=1.0 / rate), list[tuple[float, bool]]()
-    everywhere = tracker_module.search.everywhere
+@pytest.mark.parametrize(('rate', 'every', 'most'), [(60.0, 2, 1), (30.0, 1, 1), (7.0, 1, 4)])
+def test_whole_images_are_searched_in_portions_at_a_limited_rate(
+        monkeypatch: pytest.MonkeyPatch, rate: float, every: int, most: int) -> None:
+    drone, done = hovering(period=1.0 / rate), list[tuple[float, int]]()
+    portion = search.portion
 
-    def watched(image: GrayImage, dictionary: str, markers: Any = None) -> Any:
-        done.append((drone.stamp, markers is not None))
-        return everywhere(image, dictionary, markers)
+    def watched(image: GrayImage, dictionary: str, markers: Any, number: int,
+                border: int) -> Any:
+        done.append((drone.stamp, number))
+        return portion(image, dictionary, markers, number, border)
 
-    monkeypatch.setattr(tracker_module.search, 'everywhere', watched)
+    monkeypatch.setattr(search, 'portion', watched)
     stages = [drone.see(EMPTY).stage for _ in range(21)]
     assert stages == ['track' if k % every else 'full' for k in range(21)]
-    # The first image is searched in both ways.
+    assert [number for _, number in done] == [k % search.PORTIONS for k in range(len(done))]
     stamps = [stamp for stamp, _ in done]
-    assert stamps[0] == stamps[1] and np.diff(stamps[1:]).min() > SEARCH_PERIOD - 1e-3
-    assert [thorough for _, thorough in done] == [k % 2 == 1 for k in range(len(done))]
+    assert {stamps.count(stamp) for stamp in stamps[1:]} == {most}
 
 
 def test_the_mirror_image_of_a_clear_attitude_is_checked_now_and_then(
@@ -251,9 +250,9 @@ def test_a_print_on_a_wall_is_not_taken_for_a_hidden_leader(image: GrayImage, kn
 def test_a_detection_without_a_pose_is_rejected_with_the_reason(
         monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
     monkeypatch.setattr(tracker_module, 'locate', lambda *_: None)
-    sighting = hovering().see(image)  # the first image is searched in both ways
+    sighting = hovering().see(image)
     assert sighting.estimates == {}
-    assert sighting.rejections == [('no pose suits the marker', 'leader, 0')] * 2
+    assert sighting.rejections == [('no pose suits the marker', 'leader, 0')]
 
 
 @pytest.mark.parametrize(('rpy', 'ahead'), [
