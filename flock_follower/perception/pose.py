@@ -75,6 +75,8 @@ PLAIN_BLUR = 0.2
 PLAIN_INLIERS = 0.9
 #: If edges are blurred by more than this share of a cell (1 sigma), the whole print says more.
 RUN_TOGETHER = 0.25
+#: If a print that is followed smeared is blurred by more than this, cells, it has no edges to fit.
+EDGELESS = 0.3
 #: So many samples of a smeared print count to decide between two attitudes. Most of what is left
 #: are errors of the model, which are alike for neighboring samples.
 SMEAR_DEGREES = 40.0
@@ -145,11 +147,9 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
     if not starts and not smeared:
         return None, None
     whole = None
-    blurred = len(sought.model.codes) == 1 and any(
-        start.blur > RUN_TOGETHER for _, start in starts)
-    if blurred:
+    if smeared:
         whole = _fit_whole(image, camera, sought, starts)
-        if whole is not None and whole.fit.blur > RUN_TOGETHER:
+        if whole is not None and whole.fit.blur > EDGELESS:
             return None, whole
     place = starts[0][1].pose if starts else pose
     found, sharp = _fit_shown(image, camera, sought.model,
@@ -158,7 +158,7 @@ def _fit_around(image: GrayImage, camera: CameraModel, sought: Target, pose: Tra
         return None, None
     if found is not None:  # from afar it may have settled early
         return fit(image, camera, found.lines.model, found.pose, found.spacing) or found, whole
-    return None, whole if blurred else _fit_whole(image, camera, sought, starts)
+    return None, whole if smeared else _fit_whole(image, camera, sought, starts)
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,

@@ -123,7 +123,8 @@ _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
 #: Further places at which a cell is read, in cells from its middle.
 _BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
-_MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide
+_MOST_HIDDEN = 0.3  # share of the inner cells that a reflex may hide,
+_MOST_HIDDEN_TRACKED = 0.4  # and of a tracked marker
 _MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
@@ -227,13 +228,13 @@ def _shows_in_uneven_light(brightness: Array, code: CellCode, tracked: bool) -> 
         hidden |= (code.bits < 0.0) & (colours[inner] > 0.0) & (code.beside.dot(saturated) > 0.0)
     else:
         hidden &= saturated[around].mean() <= _MOST_HIDDEN
-    count = np.count_nonzero(hidden)
+    count, most = np.count_nonzero(hidden), _MOST_HIDDEN_TRACKED if tracked else _MOST_HIDDEN
     bits = np.where(hidden, 0.0, colours[inner])
     # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
     wrong = _wrong((bits * code.bits)[~hidden])
     # Codewords differ by more than twice the errors: hidden cells leave a difference.
     return (wrong < (0.5 if count and not tracked else max(0.5 * code.errors, 1.0))
-            and count <= _MOST_HIDDEN * len(hidden) and (tracked or count <= 2 * code.errors)
+            and count <= most * len(hidden) and (tracked or count <= 2 * code.errors)
             and _is_word(bits, code)
             and np.count_nonzero(colours[border] < 0.0) >= _MIN_BORDER * code.border
             and np.count_nonzero(colours[around] > 0.0) >= _MIN_AROUND * len(colours[around]))

@@ -85,11 +85,6 @@ class SmearStart(NamedTuple):
     smear: Array
     lens: int
 
-    @property
-    def blur(self) -> float:
-        """Return the standard deviation of the blur along the smear, cells."""
-        return _blur(self.smear, self.lens)
-
 
 class SmearFit(NamedTuple):
     """
@@ -110,11 +105,7 @@ class SmearFit(NamedTuple):
     @property
     def blur(self) -> float:
         """Return the standard deviation of the blur along the smear, cells."""
-        return _blur(self.smear, self.lens)
-
-
-def _blur(smear: Array, lens: int) -> float:
-    return math.sqrt(float(smear.dot(smear)) / 12.0 + float(LENSES[lens])**2)
+        return math.sqrt(float(self.smear.dot(self.smear)) / 12.0 + float(LENSES[self.lens])**2)
 
 
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
