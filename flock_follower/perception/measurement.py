@@ -113,8 +113,8 @@ class Measurement(NamedTuple):
     ``spacing``, px, of the brightness profiles, None without profiles: of a smeared print.
     ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 if both are
     equal, infinite if several markers decide it, None if it was not checked. ``doubt`` is the
-    probability of the mirrored attitude when it was last checked. ``alike`` is the
-    share of the covariance that is of errors alike from image to image.
+    probability of the mirrored attitude when it was last checked. ``alike`` is the share of the
+    covariance that is of errors alike from image to image.
     """
 
     name: str
@@ -131,7 +131,7 @@ class Measurement(NamedTuple):
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:
     """Return a measurement with mean and covariance of both poses, and the margin of the best."""
-    measurement = measurement._replace(margin=best.margin, doubt=best.share)
+    measurement = measurement._replace(margin=best.margin, doubt=min(best.share, 1.0 - best.share))
     if best.other is None or not best.share > 1e-6:
         return measurement
     pose, other = measurement.T_camera_body, best.other.pose

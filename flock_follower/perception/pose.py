@@ -126,9 +126,8 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         whole = _fit_whole(image, camera, sought, _smear_starts(
             image, camera, sought, expected.pose))
     if whole is not None and (found is None or blurred):
-        if check_mirrored or last is None or spacing is not None:
-            return _of_smears(image, camera, sought, whole, expected)
-        return _with_doubt(sought, whole, last.doubt)
+        return _of_smears(image, camera, sought, whole, expected) if check_mirrored else (
+            _with_doubt(sought, whole, last))
     return None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
 
@@ -306,14 +305,17 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
     return widened(_smear_measurement(sought, index, best.chosen.fit), best)
 
 
-def _with_doubt(sought: Target, found: _Whole, doubt: float) -> Measurement:
-    """Return the measurement of a smeared marker whose mirrored attitude is not fitted."""
+def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Measurement:
+    """Return the measurement of a smeared marker whose mirrored attitude is as likely as last."""
+    pose = found.fit.pose
     measurement = _smear_measurement(sought, found.index, found.fit)
-    other = _mirrored_body(sought, found.index, found.fit.pose)
-    if other is None:
+    other = _mirrored_body(sought, found.index, pose)
+    if other is None or last is None:
         return measurement
-    both = (Hypothesis(pose, 0.0) for pose in (found.fit.pose, other))
-    return widened(measurement, Choice(next(both), 0.0, next(both), doubt))._replace(margin=None)
+    turned = angle(other, last.T_camera_body) < angle(pose, last.T_camera_body)
+    return widened(measurement, Choice(
+        Hypothesis(pose, 0.0), 0.0, Hypothesis(other, 0.0),
+        1.0 - last.doubt if turned else last.doubt))._replace(margin=None)
 
 
 def _smear_measurement(sought: Target, index: int, found: SmearFit) -> Measurement:

@@ -57,9 +57,8 @@ _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astyp
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
 #: A whole image is searched in so many portions, one in an image: quickly, and thoroughly with one
-#: window after the other, of which the widest serves at half the size: noise has more outlines.
-_PORTIONS = (((7, 1), 1.0), ((11, 3), 1.0), ((15, 1), 0.5))
-PORTIONS = 1 + len(_PORTIONS)
+#: window after the other.
+PORTIONS = 1 + len(_WINDOWS)
 _DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
@@ -100,17 +99,18 @@ def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Marke
                    neighbor.markers if thorough else None)
 
 
-def everywhere(image: GrayImage, dictionary: str,
-               markers: Sequence[Marker] | None = None, border: int = 1) -> Detections:
+def everywhere(image: GrayImage, dictionary: str, markers: Sequence[Marker] | None = None,
+               border: int = 1, windows: Sequence[tuple[int, int]] = _WINDOWS) -> Detections:
     """
     Return the markers in an image.
 
     :param markers: those to look for thoroughly; None: all of the dictionary, quickly.
     :param border: of a quick search, see ``markers.detect``.
+    :param windows: of a thorough search, as _WINDOWS.
     """
     height, width = image.shape
     scale = 0.5 if width >= LARGE else 1.0
-    return _search(image, (0, 0, width, height), scale, dictionary, markers, border)
+    return _search(image, (0, 0, width, height), scale, dictionary, markers, border, windows)
 
 
 def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number: int,
@@ -122,10 +122,7 @@ def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number
     """
     if number == 0:
         return everywhere(image, dictionary, border=border)
-    height, width = image.shape
-    window, scale = _PORTIONS[number - 1]
-    return _search(image, (0, 0, width, height), 0.5 * scale if width >= LARGE else scale,
-                   dictionary, markers, windows=(window,))
+    return everywhere(image, dictionary, markers, windows=_WINDOWS[number - 1:number])
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,

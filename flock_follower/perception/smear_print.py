@@ -145,7 +145,8 @@ def instants_of(smear: Array, lens: float) -> Array:
 
 @lru_cache(maxsize=16)
 def _instants(count: int) -> Array:
-    return (np.arange(count) + 0.5) / count - 0.5
+    # As far apart as they must be for the variance of an exposure that lasts for 1.
+    return ((np.arange(count) + 0.5) / count - 0.5) * (count / math.sqrt(count**2 - 1.0))
 
 
 @lru_cache(maxsize=16)

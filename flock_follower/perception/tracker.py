@@ -49,9 +49,17 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.look import Look, reported, row_delay, Sighting, straightened, View
+from flock_follower.perception.look import (
+    Look,
+    MAX_TURN,
+    reported,
+    row_delay,
+    Sighting,
+    straightened,
+    View,
+)
 from flock_follower.perception.markers import Detections
-from flock_follower.perception.measurement import Measurement, PosePrior
+from flock_follower.perception.measurement import angle, Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -64,9 +72,10 @@ from flock_follower.perception.range_tracking import Ranging, RangingParams
 from flock_follower.perception.time_offset import MountedCamera
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
-#: and otherwise in one of so many; of a smeared print in one of so many.
+#: and otherwise in one of so many; of a smeared print in one of so many, if its probability was
+#: below SETTLED.
 MARGIN, MIRRORED_EVERY = 100.0, 30
-SMEARED_EVERY = 3
+SMEARED_EVERY, SETTLED = 3, 0.05
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -254,12 +263,22 @@ class Tracker:
             return
         found = look.confirmed(image, found, self._targets[name], self.config.dictionary)
         look.measured[name] = found
-        unchecked = look.camera.unchecked
+        unchecked, last = look.camera.unchecked, look.camera.measured.get(name)
         if found.margin is not None:
-            unchecked[name] = SMEARED_EVERY - 1 if found.spacing is None else (
-                MIRRORED_EVERY - 1 if found.margin > MARGIN else 0)
+            unchecked[name] = self._images_unchecked(found, look.expected[name])
+        elif found.spacing is None and last is not None and last.spacing is not None:
+            unchecked[name] = 0  # its edges decided until now
         elif unchecked[name]:
             unchecked[name] -= 1
+
+    def _images_unchecked(self, found: Measurement, expected: PosePrior) -> int:
+        """Return in how many images the mirrored attitude need not be looked at again."""
+        assert found.margin is not None
+        if found.spacing is not None:
+            return MIRRORED_EVERY - 1 if found.margin > MARGIN else 0
+        settled = found.doubt < SETTLED and expected.pose is not None and (
+            angle(found.T_camera_body, expected.pose) < 0.5 * MAX_TURN)
+        return SMEARED_EVERY - 1 if settled else 0
 
     def _candidates(self, look: Look) -> Iterator[tuple[str, PosePrior]]:
         """Yield the name and the expected pose of each candidate in view."""

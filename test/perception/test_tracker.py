@@ -32,7 +32,8 @@ from flock_follower.geometry import (
 )
 from flock_follower.neighbors_file import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.odometry.buffer import Missing, OdometrySample
-from flock_follower.perception import search, tracker as tracker_module
+from flock_follower.perception import search
+from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.look import reported
 from flock_follower.perception.measurement import Measurement
