@@ -133,9 +133,9 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
 
 
 class _Whole(NamedTuple):
-    """A fit to the whole print of a marker, by its index among the neighbour's."""
+    """A fit to the whole print of a marker, by its number among the neighbour's."""
 
-    index: int
+    number: int
     fit: SmearFit
 
 
@@ -308,8 +308,8 @@ def _choose_smeared(sought: Target, index: int, fits: list[SmearFit],
 def _with_doubt(sought: Target, found: _Whole, last: Measurement | None) -> Measurement:
     """Return the measurement of a smeared marker whose mirrored attitude is as likely as last."""
     pose = found.fit.pose
-    measurement = _smear_measurement(sought, found.index, found.fit)
-    other = _mirrored_body(sought, found.index, pose)
+    measurement = _smear_measurement(sought, found.number, found.fit)
+    other = _mirrored_body(sought, found.number, pose)
     if other is None or last is None:
         return measurement
     turned = angle(other, last.T_camera_body) < angle(pose, last.T_camera_body)

@@ -20,7 +20,7 @@ Detection in each image has up to three stages, the cheapest first:
 =======  ==========================================================================
 track    edges are fitted where the filter expects each neighbour's markers
 roi      a neighbour not found that way is detected near its expected place
-full     those missing even then are detected in the whole image, at a limited rate
+full     those missing even then are detected in the whole image, a portion in each image
 =======  ==========================================================================
 
 Once a second the whole image is searched even if none is missing: see ``hypotheses``.
