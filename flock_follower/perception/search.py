@@ -57,8 +57,10 @@ _LOGARITHM = np.rint(np.interp(_LOGARITHM, _LOGARITHM[[0, -1]], [0, 255])).astyp
 #: The brush cuts off the dark rim of a shadow that crosses the paper.
 _WINDOWS = ((7, 1), (31, 1), (11, 3))
 #: A whole image is searched in so many portions, one in an image: quickly, and thoroughly with one
-#: window after the other.
-PORTIONS = 1 + len(_WINDOWS)
+#: window after the other, then at half the size with one that is as wide: a covered marker may
+#: have an outline only there.
+_HALVED = (15, 1)
+PORTIONS = 2 + len(_WINDOWS)
 _DARKER = 7  # in the logarithm: what is darker than the mean of the window by more, is dark
 _SHORTEST = 40  # px, of an outline
 _ROUNDEST = 32.0  # squared length over area; of a square 16
@@ -122,7 +124,11 @@ def portion(image: GrayImage, dictionary: str, markers: Sequence[Marker], number
     """
     if number == 0:
         return everywhere(image, dictionary, border=border)
-    return everywhere(image, dictionary, markers, windows=_WINDOWS[number - 1:number])
+    if number <= len(_WINDOWS):
+        return everywhere(image, dictionary, markers, windows=_WINDOWS[number - 1:number])
+    height, width = image.shape
+    return _search(image, (0, 0, width, height), 0.25 if width >= LARGE else 0.5, dictionary,
+                   markers, windows=(_HALVED,))
 
 
 def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,

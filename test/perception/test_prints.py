@@ -34,7 +34,7 @@ from flock_follower.perception.markers import marker_code
 from flock_follower.perception.tracker import camera_mounting
 
 CAMERA = make_camera(width=320, height=240)
-MOST_IMAGES = 9  # at 30 Hz, until a print is used or refused: 0.3 s
+MOST_IMAGES = 11  # at 30 Hz, until a print is used or refused
 CASES = [('DICT_4X4_50', 0, 2), ('DICT_5X5_100', 33, 3), ('DICT_APRILTAG_36h11', 3, 2)]
 
 
