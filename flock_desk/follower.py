@@ -41,8 +41,8 @@ from flock_follower.flock.exchange import Sharing
 from flock_follower.gate.gate import Gate
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
 from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.gate.velocity_check import AUTOPILOT, ODOM
-from flock_follower.geometry import Array, yaw_from_quaternion
+from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport, ODOM
+from flock_follower.geometry import Array
 from flock_follower.messages import (
     ACCELERATION,
     from_acceleration,
@@ -208,7 +208,7 @@ class Follower:
     def estimate(self, time: int, velocity: Array) -> None:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
-        self._control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
+        self._control.take_motion(AUTOPILOT, MotionReport(velocity), 0.0, self._seconds())
 
     def attitude(self, time: int, quaternion: Array, rates: Array) -> OdometryState | None:
         """
@@ -217,7 +217,7 @@ class Follower:
         :returns: the motion without odometry, while that is flown on.
         """
         self.advance(time)
-        motion = self._control.update_attitude(
+        motion = self._control.take_attitude(
             quaternion, rates, self._seconds(), self._seconds())
         if motion is None or self._bridge_ended is not None:
             return None
@@ -229,7 +229,7 @@ class Follower:
     def height(self, time: int, altitude: float, height: float) -> None:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
-        self._control.update_height(altitude, self._seconds())
+        self._control.take_height(altitude, self._seconds())
         if not self._control.heights.referenced:
             self._control.heights.refer(height, self._seconds())
 
@@ -442,9 +442,8 @@ class Follower:
         if state is not None:  # the newest since the last cycle: no other counts
             received = self._seconds(self._gate_received)
             age = stamp_age(state.stamp, self._gate_received)
-            if refused := control.update_velocity(
-                    self._source, state.velocity, age, received,
-                    yaw=yaw_from_quaternion(state.quaternion), position=state.position):
+            if refused := control.take_motion(
+                    self._source, MotionReport.from_odometry(state), age, received):
                 self._listener.rejected(f'odom {refused}', '')
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start

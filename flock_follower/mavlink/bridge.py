@@ -29,11 +29,12 @@ from numpy.typing import ArrayLike
 
 from flock_follower.bridge_state import NO_AUTOPILOT
 from flock_follower.gate.flight_end import EndParams, FlightEnd, HOLD
-from flock_follower.gate.gate import AcceptedCommand, Gate
+from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Cause, FELL_SILENT, Phase, STICK, UNKNOWN
 from flock_follower.gate.setpoint_rules import NONE, Setpoint
-from flock_follower.gate.vehicle_status import VehicleStatus
-from flock_follower.gate.velocity_check import AUTOPILOT
+from flock_follower.gate.situation import AcceptedCommand
+from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
+from flock_follower.gate.velocity_check import AUTOPILOT, MotionReport
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import commands, estimator_health
 from flock_follower.mavlink.commands import NOT_RECEIVED, Request
@@ -115,7 +116,7 @@ class Bridge:
         """The request by which the bridge itself ended the flight last, if any."""
         self.ground_station = GroundStationReport()
         self._reports = report_to_gcs
-        gate.fused = forwarder is not None
+        gate.autopilot = gate.autopilot._replace(fused=forwarder is not None)
         self._wind_compensation = wind_compensation
         self._start = self._streaming_since = now
         self._last_sent = -math.inf
@@ -195,19 +196,20 @@ class Bridge:
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         if position is not None and position.time == now:
             gps = self.telemetry.gps
-            if refused := self.distrusted(now) or self.gate.update_velocity(
-                    AUTOPILOT, position.velocity, self._age(position, now), now,
-                    position=position.position, std=0.0 if gps is None else gps.accuracy):
+            report = MotionReport(position.velocity, position=position.position,
+                                  std=0.0 if gps is None else gps.accuracy)
+            if refused := self.distrusted(now) or self.gate.take_motion(
+                    AUTOPILOT, report, self._age(position, now), now):
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
         if attitude is not None and attitude.time == now:
             time = now - self._age(attitude, now)
-            self.gate.update_yaw(AUTOPILOT, yaw_from_quaternion(attitude.quaternion), time)
-            motion = self.gate.update_attitude(
+            self.gate.motion.take_yaw(AUTOPILOT, yaw_from_quaternion(attitude.quaternion), time)
+            motion = self.gate.take_attitude(
                 attitude.quaternion, attitude.angular_velocity, time, now)
             self.motion = None if motion is None else (motion, time)
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
-                refused := self.gate.update_height(altitude.altitude, now, altitude.source)):
+                refused := self.gate.take_height(altitude.altitude, now, altitude.source)):
             self.link.ignored[f'{altitude.source} {refused}'] += 1
         if battery is not None and battery.time == now:
             self.end.take_battery(battery.remaining, now)
@@ -228,9 +230,10 @@ class Bridge:
         """Send the messages due at ``now``: a setpoint, HEARTBEAT, commands and requests."""
         status = self.telemetry.status
         if (dialect := self.telemetry.dialect) is not None:
-            self.gate.hover_thrust = dialect.hover_thrust
-            self.gate.compensates_wind = self._wind_compensation == 'always' or (
-                self._wind_compensation == 'auto' and not dialect.compensates_wind)
+            self.gate.autopilot = AutopilotTraits(
+                dialect.hover_thrust, self._wind_compensation == 'always' or (
+                    self._wind_compensation == 'auto' and not dialect.compensates_wind),
+                self.forwarder is not None)
         if status is not None:
             self._take_status(status, now)
             self._refer_height(status, now)
@@ -305,7 +308,7 @@ class Bridge:
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
-            self.gate.active_since, self.gate.command_time,
+            self.gate.active_since, self.gate.commands.received,
             self.gate.handover(now) if flies else '', now)
         if moved := self.sticks.moved and self.housekeeping.watches_sticks():
             why, action = STICK.text, HOLD

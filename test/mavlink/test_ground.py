@@ -22,6 +22,7 @@ from flock_follower.gate.gate import Gate
 from flock_follower.gate.permission import Permission
 from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import VehicleStatus
+from flock_follower.gate.velocity_check import MotionReport
 
 pytestmark = pytest.mark.slow
 OURS = VehicleStatus(True, 'OFFBOARD', True)
@@ -41,9 +42,9 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
     ended = []
     for k in range(60):
         now = 1.0 + 0.05 * k
-        control.update_velocity('odom', np.zeros(3), 0.0, now)
+        control.take_motion('odom', MotionReport(np.zeros(3)), 0.0, now)
         if height is not None:
-            control.update_height(50.0, now)
+            control.take_height(50.0, now)
             if k == 0:
                 control.heights.refer(height, now)
         control.take_status(OURS, now, airborne=k < 20)

@@ -44,7 +44,7 @@ from flock_follower.messages import to_array
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 
-OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'update_velocity', 'forward',
+OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'take_motion', 'forward',
          'receive', 'cycle', 'stop')
 POSCTL, OFFBOARD = 3 << 16, 6 << 16
 SERVICES = {'offboard': SetBool, 'arm': SetBool, 'takeoff': Trigger, 'land': Trigger}
@@ -240,7 +240,7 @@ def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(
 def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_bench):
     bench = make_bench()
     bench.odometry(late=150_000_000)
-    known = bench.bridge.gate._sources['odom']
+    known = bench.bridge.gate.motion.odometry
     bench.wait(lambda: known.velocity_time > 0.0)
     # Both the velocity and the yaw: lost odometry brakes no later for having been polled.
     for age in (known.velocity_time, known.yaw()[1]):

@@ -294,7 +294,7 @@ class BridgeReport:
                 f'{math.hypot(*place.offset.tolist()):.2f}'),
             'displacement_check': (
                 'height only: the autopilot fuses the odometry, which proves nothing'
-                if gate.fused else 'odometry against the autopilot, and height')}
+                if gate.autopilot.fused else 'odometry against the autopilot, and height')}
 
     def _link_values(self, now: float) -> dict[str, object]:
         """Return rates, the share of a serial line in use, and counters."""

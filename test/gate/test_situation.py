@@ -1,0 +1,105 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Situations as values: whatever one holds, its setpoint is safe, and a line of text keeps it."""
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from situations import situation
+
+from flock_follower.command_messages import Command
+from flock_follower.gate.envelope import GateLimits, Location
+from flock_follower.gate.obstacle import Obstacle
+from flock_follower.gate.permission import MODE_TIMEOUT
+from flock_follower.gate.relative_flight import Relative
+from flock_follower.gate.setpoint_rules import BRAKE, COMMAND, decide, LEVEL, NONE
+from flock_follower.gate.situation import Held, Situation
+from flock_follower.gate.velocity_check import (
+    AUTOPILOT,
+    FUTURE_TOLERANCE,
+    known_motion,
+    ODOM,
+    SourceMotion,
+)
+from flock_follower.messages import OLDEST_MARKER, RELATIVE_MAX
+
+ANY = st.floats() | st.floats(-4.0, 4.0)
+AGE = st.sampled_from([0.0, 0.05, 0.15, 0.29, 0.31, 0.51, 1.5, 5.0, -0.05, -0.5]) | st.floats()
+VECTOR = st.tuples(ANY, ANY, ANY)
+LIMITS = st.builds(GateLimits, a_max=st.floats(1.5, 20.0), v_max=st.floats(0.1, 5.0),
+                   relative_flight=st.booleans())
+MOTION = st.builds(SourceMotion, VECTOR, AGE, ANY, AGE)
+MOSTLY = st.sampled_from([True, True, True, False])
+SITUATIONS = st.builds(
+    lambda limits, lowered, odom, autopilot, source, since, **more: situation(
+        GateLimits(a_max=lowered * limits.a_max, v_max=limits.v_max,
+                   relative_flight=limits.relative_flight),
+        known_motion(limits, odom, autopilot, source, since, since), full=limits, **more),
+    LIMITS, st.sampled_from([1.0, 1.0, 0.7]), MOTION, MOTION, st.sampled_from([ODOM, AUTOPILOT]),
+    st.sampled_from([-math.inf, -math.inf, 0.1, 0.7]) | st.floats(),
+    command=st.none() | st.builds(
+        Command, VECTOR, ANY, ANY, st.none() | VECTOR.map(np.array), relative=st.booleans()),
+    command_age=AGE, source_age=AGE, armed=MOSTLY, airborne=MOSTLY, link_age=AGE, mode_age=AGE,
+    withheld=st.sampled_from(['', '', '', 'offboard was left']),
+    unplaced=st.sampled_from(['', '', '', 'height stale']),
+    place=st.builds(Location, st.none() | ANY, ANY,
+                    st.none() | st.tuples(ANY, ANY).map(np.array)),
+    held=st.builds(Held, st.none() | ANY, st.none() | ANY), offset=VECTOR.map(np.array),
+    relative=st.builds(Relative, ANY, st.booleans()))
+
+
+def fresh(age, longest):
+    return -FUTURE_TOLERANCE <= age <= longest
+
+
+@settings(max_examples=150, deadline=None)
+@given(SITUATIONS)
+def test_any_situation_sends_nothing_unsafe_unpermitted_or_stale(given):
+    setpoint, limits, report = decide(given), given.limits, given.report
+    assert setpoint.kind in (COMMAND, BRAKE, LEVEL, NONE)
+    assert np.all(np.isfinite(setpoint.acceleration))
+    assert setpoint.yaw is None or math.isfinite(setpoint.yaw)
+    assert np.linalg.norm(setpoint.acceleration) <= given.start_limits.a_max
+    assert (setpoint.cause is None) == (setpoint.kind == COMMAND)
+    if given.withheld:
+        assert (setpoint.kind, setpoint.cause) == (NONE, Obstacle.WITHHELD)
+    if not report.armed or setpoint.kind == NONE:
+        assert not setpoint.acceleration.any()
+    if not report.airborne:
+        assert setpoint.acceleration[2] <= 0.0
+    if setpoint.kind == COMMAND:
+        assert report.armed and report.link_age <= limits.link_timeout
+        assert report.mode_age <= MODE_TIMEOUT and given.unplaced is None
+        assert fresh(given.command_age, limits.planner_timeout)
+        if given.command.command.relative:
+            assert limits.relative_flight and fresh(given.source_age, OLDEST_MARKER)
+            assert np.linalg.norm(setpoint.acceleration[:2]) <= (
+                RELATIVE_MAX + np.linalg.norm(given.offset[:2]))
+        else:
+            assert given.known.velocity is not None and given.known.contradiction is None
+
+
+@settings(max_examples=50, deadline=None)
+@given(SITUATIONS)
+def test_situation_read_from_its_line_decides_the_same(given):
+    line = given.to_json()
+    assert '\n' not in line
+    again = Situation.from_json(line)
+    assert again.to_json() == line
+    setpoint, before = decide(again), decide(given)
+    assert setpoint._replace(acceleration=None) == before._replace(acceleration=None)
+    np.testing.assert_array_equal(setpoint.acceleration, before.acceleration)
