@@ -232,7 +232,7 @@ class BridgeUnderFire:
             self._restarts, self._taken_over = restarts, -math.inf
         if phase is not Phase.TAKEN_OVER:
             self._free = True
-        elif not permission.cause.pilot:  # a failsafe bars nothing, a pilot after it does
+        elif not permission.taker.pilot:  # a failsafe bars nothing, a pilot after it does
             self._free, self._taken_over = True, -math.inf
         elif self._free:
             self._free, self._taken_over = False, self.now

@@ -41,7 +41,6 @@ ROOMS = {
     'messages': ('', 'numpy'),
     'command_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
-    'bridge_keys': ('', ''),
     'bridge_state': ('', ''),
     'topic_names': ('messages', ''),
     # The markers by name and size alone: the planner reads the file, too.
@@ -58,11 +57,11 @@ ROOMS = {
     'mavlink': ('bridge_state gate messages odometry parameters', 'numpy pymavlink'),
     'bags': ('parameters', 'mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
-    'checks': ('bags bridge_keys messages neighbors_file odometry parameters perception '
+    'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
                'topic_names', 'cv2 numpy'),
     'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
-    'follow': ('check checks nodes', ''),
-    'support': ('bridge_keys bridge_state gate mavlink messages odometry parameters',
+    'follow': ('bridge_state check checks nodes', ''),
+    'support': ('bridge_state gate mavlink messages odometry parameters',
                 'ROS numpy'),
     'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
               'parameters perception planner support topic_names', 'ROS numpy yaml'),

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from flock_follower.gate.gate import Gate
-from flock_follower.gate.permission import Permission
+from flock_follower.gate.permission import Cause, Permission
 from flock_follower.gate.setpoint_rules import NONE
 from flock_follower.gate.vehicle_status import VehicleStatus
 from flock_follower.gate.velocity_check import MotionReport
@@ -50,4 +50,4 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
         control.take_status(OURS, now, airborne=k < 20)
         ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
-    assert control.permission == Permission(reason='on the ground')
+    assert control.permission == Permission(reason='on the ground', cause=Cause.LANDED)

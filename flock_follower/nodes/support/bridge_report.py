@@ -35,7 +35,9 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower import bridge_state
-from flock_follower.bridge_keys import (
+from flock_follower.bridge_state import (
+    ARMED,
+    FLYING,
     LINK_FAULT,
     MISSING,
     NO_ANSWERS,
@@ -47,11 +49,9 @@ from flock_follower.bridge_keys import (
     UNREAD,
 )
 from flock_follower.gate.permission import (
-    FELL_SILENT,
+    Cause,
     MODE_TIMEOUT,
-    MODE_UNKNOWN,
     Phase,
-    TWO_COMMAND,
 )
 from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink import estimator_health
@@ -261,8 +261,8 @@ class BridgeReport:
             UNANSWERED: ', '.join(bridge.link.questions.unknown(now)),
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
             'firmware': str(bridge.housekeeping.parameters.version or ''),
-            'mode': status.mode if status else '', 'armed': status.armed if status else '',
-            'flying': '' if flying is None else flying, 'state': bridge.state(now),
+            'mode': status.mode if status else '', ARMED: status.armed if status else '',
+            FLYING: '' if flying is None else flying, 'state': bridge.state(now),
             'handed_over': bridge.end.why, LINK_FAULT: bridge.link.transport.fault,
             REFUSED: bridge.refusal(now) if bridge.alive(now) else ''}
         if unready is not None:
@@ -324,7 +324,7 @@ class BridgeReport:
                 return f'cannot send on {transport.url}: {transport.fault}'
             age = telemetry.mode_age(now)
             return self._bridge.housekeeping.unreceived(now) or ('' if age <= MODE_TIMEOUT else (
-                f'{MODE_UNKNOWN}: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s'))
+                f'mode unknown: neither HEARTBEAT nor CURRENT_MODE for {age:.1f} s'))
         received = telemetry.message_time
         if transport.fault:
             return f'no autopilot on {transport.url}: {transport.fault}'
@@ -398,7 +398,7 @@ class BridgeReport:
                            f'{transport.url}: {transport.fault or "is blocked"}')
         permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not self._takes_off(now)
-        silent = permission.reason.startswith(FELL_SILENT)
+        silent = permission.cause is Cause.SILENT
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if silent else WARN
@@ -426,9 +426,10 @@ class BridgeReport:
         return requested or telemetry.flying(now) is False
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        reason = self._bridge.gate.permission.reason
-        if reason.startswith(TWO_COMMAND):
-            return ERROR, f'{reason}; the bridge brakes until mavlink_bridge/offboard true'
+        permission = self._bridge.gate.permission
+        if permission.cause is Cause.CONTESTED:
+            return ERROR, (f'{permission.reason}; the bridge brakes until '
+                           'mavlink_bridge/offboard true')
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 
