@@ -67,7 +67,8 @@ from flock_follower.checks.processor import children, LoadMeter
 from flock_follower.geometry import Array, quaternion_to_matrix
 from flock_follower.mavlink.link import IDS
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 

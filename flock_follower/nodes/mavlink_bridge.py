@@ -74,8 +74,9 @@ from flock_follower.nodes.support.even_clock import EvenClock
 from flock_follower.nodes.support.inputs import best_effort, LATCHED_QOS, OwnOdometry
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shared_memory_size
 from flock_follower.nodes.support.output import never_block_output
+from flock_follower.nodes.support.process import run
 from flock_follower.nodes.support.publisher_thread import PublisherThread
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import filled
 
 # Not only the newest: otherwise a second commanding node would not be detected.

@@ -50,7 +50,8 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.cameras import cameras, CameraValues
 from flock_follower.perception.camera import CameraModel, marked_rectified
 from flock_follower.perception.images import compute_in_one_thread

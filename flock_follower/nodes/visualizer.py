@@ -48,7 +48,8 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.diagnostics import STEADY
 from flock_follower.nodes.support.inputs import best_effort
-from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.process import run
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 

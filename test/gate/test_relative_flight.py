@@ -89,6 +89,7 @@ COMPONENT = ANY | st.floats(-3.0, 3.0) | st.floats(-1e300, 1e300)
        st.sampled_from([1.5, 2.5, 20.0]), st.booleans())
 @example((0.0, 0.0, -1.0), 0.0, 0.9, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 @example((0.0, 0.0, 1.0), 0.0, 9.6, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
+@example((1.5, 0.0, 0.0), 0.0, 5.0, 0.0, 1.0, 0.1, (0.0, 0.0, 0.0), 2.5, True)
 def test_whatever_is_asked_the_acceleration_is_small_and_heads_into_the_heights(
         wanted, yaw, height, climb, lasted, marker_age, offset, a_max, airborne):
     limits = GateLimits(relative_flight=True, a_max=a_max)
