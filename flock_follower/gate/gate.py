@@ -33,7 +33,7 @@ from flock_follower.command_messages import Command
 from flock_follower.gate import disturbance, envelope, setpoint_rules
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
-from flock_follower.gate.motion_sources import begun, MotionSources
+from flock_follower.gate.motion_sources import MotionSources, onset
 from flock_follower.gate.obstacle import Refusal
 from flock_follower.gate.permission import Permission, Phase
 from flock_follower.gate.relative_flight import RelativeFlight
@@ -86,7 +86,7 @@ class Flight:
     """Time from which its height has been missing, s."""
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         """Return whether the vehicle is armed, as far as it is known."""
         return self.status is not None and self.status.armed
 
@@ -157,7 +157,7 @@ class Gate:
     def flies(self) -> bool:
         """Return whether the vehicle, as far as known, flies our setpoints."""
         # A lost link leaves it flying them: the last report counts.
-        return self._flight.armed and self.permission.flies
+        return self._flight.is_armed and self.permission.flies
 
     @property
     def active_since(self) -> float:
@@ -202,7 +202,7 @@ class Gate:
 
     def take_height(self, altitude: float, now: float, sensor: str = '') -> str:
         """Take an altitude, m, of a barometer or another sensor; return '' or the refusal."""
-        known = self.motion.known(self.limits, now)
+        known = self.motion.known_motion(self.limits, now)
         # Also of an invalid source: a constant error is estimated and removed.
         velocity = None if self.relative.reckoning else known.velocity or known.braking
         refused = self.heights.take(altitude, None if velocity is None else float(
@@ -228,7 +228,7 @@ class Gate:
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None if one is not fresh."""
-        return self.motion.known(self.limits, now).turned
+        return self.motion.known_motion(self.limits, now).turned
 
     def contradiction(self, now: float) -> str:
         """Return the contradiction between odom and the autopilot as text, or ''."""
@@ -259,7 +259,7 @@ class Gate:
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
-        velocity = self.motion.known(self.limits, now).braking
+        velocity = self.motion.known_motion(self.limits, now).braking
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def place(self, now: float) -> Location:
@@ -299,16 +299,16 @@ class Gate:
         flight = self._flight
         self._notice_landing(now)
         # In flight only a lasting landed report counts: a false one must not remove thrust.
-        report = Report(flight.armed, flight.airborne is True or flight.was_active,
+        report = Report(flight.is_armed, flight.airborne is True or flight.was_active,
                         link_age, mode_age)
         active = self.permission.phase is Phase.ACTIVE
-        flight.active_since = begun(flight.active_since, active, now)
+        flight.active_since = onset(flight.active_since, active, now)
         withheld = withheld or self.withheld
-        engaged = flight.armed and flight.status is not None and (
+        engaged = flight.is_armed and flight.status is not None and (
             flight.status.offboard) and not withheld
         # While nothing is received the height is missing, too, without a fault of its sensor.
         heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
-        flight.heightless_since = begun(flight.heightless_since, heightless, now)
+        flight.heightless_since = onset(flight.heightless_since, heightless, now)
         situation = self._observe(report, withheld, engaged, bool(distrusted), now)
         setpoint = setpoint_rules.decide(situation)
         self._record(situation, setpoint, engaged)
@@ -354,7 +354,7 @@ class Gate:
     def _notice_landing(self, now: float) -> None:
         height = self.place(now).height
         down = self._flight.airborne is False and (height is None or height < LANDED_HEIGHT)
-        self._flight.landed_since = begun(self._flight.landed_since, down, now)
+        self._flight.landed_since = onset(self._flight.landed_since, down, now)
         if now - self._flight.landed_since >= LANDED_TIME:
             self.permit(self.permission.landed())
 

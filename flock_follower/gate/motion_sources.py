@@ -49,7 +49,7 @@ from flock_follower.geometry import Array
 VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 
 
-def begun(since: float, holds: bool, now: float) -> float:
+def onset(since: float, holds: bool, now: float) -> float:
     """Return the time from which a condition holds, s; infinite while it does not."""
     return min(since, now) if holds else math.inf
 
@@ -78,7 +78,7 @@ class MotionSources:
         if self._choice in (ODOM, AUTOPILOT):
             return self._choice
         # Once odometry was received, losing it must brake: the autopilot's own estimate often
-        # rests on that odometry, and drifts metres without it.
+        # rests on that odometry, and drifts meters without it.
         return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
 
     @property
@@ -122,7 +122,7 @@ class MotionSources:
         yaws = [self._sources[source].yaw() for source in (AUTOPILOT, ODOM)]
         return next((yaw for yaw, time in yaws if now - time <= max_age), None)
 
-    def known(self, limits: GateLimits, now: float) -> KnownMotion:
+    def known_motion(self, limits: GateLimits, now: float) -> KnownMotion:
         """Return what is known of the motion at ``now``, s."""
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
         _, yaw_time = odom.yaw()
@@ -141,18 +141,18 @@ class MotionSources:
         :param distrusted: whether the velocity of the autopilot is invalid.
         :param fused: whether the autopilot's estimate rests on our odometry.
         """
-        self._distrusted_since = begun(self._distrusted_since, distrusted, now)
-        known, before = self.known(limits, now), self._comparison.disagreeing_for(now)
+        self._distrusted_since = onset(self._distrusted_since, distrusted, now)
+        known, before = self.known_motion(limits, now), self._comparison.disagreeing_for(now)
         self._comparison.take(known.difference, limits.velocity_tolerance, engaged, now)
         # An estimate that rests on our odometry, or on no sensor, is no evidence.
         proves = not fused and not distrusted
         self.displaced = None if known.source != ODOM else displaced(
             self._sources[ODOM], self._sources[AUTOPILOT] if proves else None,
             known.turned or 0.0, self._height_path, now)
-        self._displaced_since = begun(
+        self._displaced_since = onset(
             self._displaced_since, engaged and self.displaced is not None, now)
         return known if self._comparison.disagreeing_for(now) == before else (
-            self.known(limits, now))
+            self.known_motion(limits, now))
 
     def displaced_too_long(self, now: float) -> bool:
         """Return whether displacements have differed for so long that the vehicle must stop."""
@@ -160,7 +160,7 @@ class MotionSources:
 
     def contradiction(self, limits: GateLimits, now: float) -> str:
         """Return the contradiction between odom and the autopilot as text, or ''."""
-        known = self.known(limits, now)
+        known = self.known_motion(limits, now)
         cause, turned = known.contradiction, math.degrees(known.turned or 0.0)
         if cause is Obstacle.YAWS_DISAGREE:
             return (f'{cause.value} by {turned:.0f} deg: their frames are not aligned, commands '

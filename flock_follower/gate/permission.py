@@ -224,11 +224,11 @@ class Permission:
                 return now.left(status)
             return Permission(reason=f'given back ({now.reason})', cause=Cause.GIVEN_BACK)
         if now.phase is Phase.READY and (not status.armed or airborne is False):
-            return _grounded(status)
+            return _end_on_ground(status)
         if not status.offboard:
             return now.left(status) if now.obeyed else now
         if now.phase is Phase.ACTIVE:
-            return now if status.armed else _grounded(status)
+            return now if status.armed else _end_on_ground(status)
         if airborne is None:
             return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
         return replace(now, phase=Phase.ACTIVE, reason='', cause=None, obeyed=True)
@@ -238,7 +238,7 @@ def _left_reason(mode: str, taker: Taker) -> str:
     return f'offboard was left for {mode}: {taker.text}'
 
 
-def _grounded(status: VehicleStatus) -> Permission:
+def _end_on_ground(status: VehicleStatus) -> Permission:
     """Return the permission of a vehicle that stands, or is disarmed."""
     if not status.armed:
         return Permission(reason='disarmed', cause=Cause.DISARMED)

@@ -109,20 +109,20 @@ class Situation:
 
     def to_json(self) -> str:
         """Return the situation as one line of JSON, with NaN and Infinity as in Python."""
-        return json.dumps(_plain(self))
+        return json.dumps(_plain_value(self))
 
     @classmethod
     def from_json(cls, line: str) -> Situation:
         """Return the situation of a line of ``to_json``; equal bit for bit, arrays as arrays."""
-        situation: Situation = _typed(cls, json.loads(line))
+        situation: Situation = _read_value(cls, json.loads(line))
         return situation
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     if isinstance(value, enum.Enum):
         return value.name
     if is_dataclass(value) or hasattr(value, '_fields'):
-        return {name: _plain(getattr(value, name)) for name in _names(type(value))}
+        return {name: _plain_value(getattr(value, name)) for name in _names(type(value))}
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
@@ -130,13 +130,13 @@ def _names(kind: Any) -> Iterator[str]:
     return (field.name for field in fields(kind)) if is_dataclass(kind) else iter(kind._fields)
 
 
-def _typed(hint: Any, plain: Any) -> Any:
-    """Return a value of a type, or of one of a union of types, from what ``_plain`` made of it."""
+def _read_value(hint: Any, plain: Any) -> Any:
+    """Return a value of a type, or of one type of a union, from its ``_plain_value``."""
     kinds = get_args(hint) or (hint,)
     if isinstance(plain, Mapping):
         kind = next(kind for kind in kinds if is_dataclass(kind) or hasattr(kind, '_fields'))
         hints = get_type_hints(kind)
-        return kind(**{name: _typed(hints[name], each) for name, each in plain.items()})
+        return kind(**{name: _read_value(hints[name], each) for name, each in plain.items()})
     if isinstance(plain, str) and (
             kind := next((k for k in kinds if isinstance(k, enum.EnumMeta)), None)):
         return kind[plain]

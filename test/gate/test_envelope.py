@@ -176,7 +176,7 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         setpoint, _ = gate.decide(now)
         sent.append(setpoint)
         command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
-        sent.append(judge_situation(limits, gate.motion.known(limits, now), command=command,
+        sent.append(judge_situation(limits, gate.motion.known_motion(limits, now), command=command,
                                     command_age=0.0, airborne=False, place=gate.place(now)))
     assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0

@@ -38,7 +38,7 @@ from flock_follower.bridge_state import (
     UNPROVEN,
     UNREAD,
 )
-from flock_follower.gate.motion_sources import begun
+from flock_follower.gate.motion_sources import onset
 from flock_follower.gate.permission import Cause, MODE_TIMEOUT, Phase
 from flock_follower.gate.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink import estimator_health
@@ -49,7 +49,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WAR
 from flock_follower.nodes.support.remote_parameters import WatchedParameters
 from flock_follower.nodes.support.runtime import FlockNode
 
-SILENCE = 3.0  # s without an autopilot after which the node reports it
+REPORTED_SILENCE = 3.0  # s without an autopilot after which the node reports it
 STUCK = 0.2  # s without a setpoint that was due
 HEIGHTS_DIFFER = 1.0  # m: a larger difference of barometer and estimate is reported
 #: Limits that should be equal in planner and bridge.
@@ -76,7 +76,7 @@ class BridgeProblems:
             self._setpoint_problem, self._publisher_problem,
             *(partial(_problem, level, reason) for level, reason in (
                 (ERROR, self._link_fault), (ERROR, bridge.link.identity.conflict),
-                (ERROR, self._ended), (ERROR, self._forwarding_fault),
+                (ERROR, self._end_requests), (ERROR, self._forwarding_fault),
                 (WARN, self._estimate_fault), (WARN, bridge.housekeeping.too_slow),
                 (WARN, lambda _: bridge.housekeeping.watch.obstacle()),
                 (WARN, bridge.gate.contradiction), (WARN, bridge.gate.thrust_error),
@@ -87,7 +87,7 @@ class BridgeProblems:
     def take(self, cycle: Cycle, now: float) -> None:
         """Take the newest cycle, in the setpoint thread."""
         due = cycle.setpoint.kind != NONE and not cycle.sent
-        self._stuck_since = begun(self._stuck_since, due, now)
+        self._stuck_since = onset(self._stuck_since, due, now)
         self._last = cycle
 
     def _vehicle_values(self, now: float) -> dict[str, object]:
@@ -172,23 +172,23 @@ class BridgeProblems:
             return f'no autopilot on {transport.url}: {transport.fault}'
         if math.isfinite(received):
             return f'autopilot lost on {transport.url}, silent for {now - received:.1f} s'
-        return '' if now - self._start < SILENCE else (
+        return '' if now - self._start < REPORTED_SILENCE else (
             f'no autopilot on {transport.url}: {self._bridge.link.silence()}')
 
     def _estimate_fault(self, now: float) -> str:
         telemetry = self._bridge.telemetry
-        if now - self._start < SILENCE or not self._bridge.alive(now):
+        if now - self._start < REPORTED_SILENCE or not self._bridge.alive(now):
             return ''
         missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
-                   if newest is None or now - newest.time > SILENCE]
+                   if newest is None or now - newest.time > REPORTED_SILENCE]
         if missing:
             return f'the autopilot sends no {" and no ".join(missing)}: is its estimator ready?'
         distrusted = self._bridge.distrusted(now)
         return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
-    def _ended(self, now: float) -> str:
+    def _end_requests(self, now: float) -> str:
         """Return the requests by which the bridge itself ends this flight, and their results."""
         status = self._bridge.status(now)
         return '' if status is not None and not status.armed else '; '.join(
