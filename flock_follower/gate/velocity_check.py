@@ -269,7 +269,11 @@ SPACING: Final[float] = 0.1
 
 
 class Path:
-    """The positions (3,), m, of one source, without jumps; times are monotonic, s."""
+    """
+    The positions (3,), m, of one source, without jumps; times are monotonic, s.
+
+    Jumps are judged here by one rule for both sources: the autopilot's position counts none.
+    """
 
     def __init__(self) -> None:
         self.position: Array | None = None
