@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command
+from flock_follower.command_messages import Command, ODOMETRY_GAP
 from flock_follower.gate import disturbance, envelope, setpoint_rules, velocity_check
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
@@ -337,7 +337,8 @@ class Gate:
                 '' if command is not None and command.command.relative else self._displaced),
             held=self._held or Held(), relative=self.relative.permission(
                 -math.inf if command is None else command.source_time, now),
-            offset=self._disturbance.offset(self.compensates_wind))
+            offset=self._disturbance.offset(self.compensates_wind),
+            retreat=self._retreat(known, now))
         sends = setpoint.kind != setpoint_rules.NONE
         self._flown = setpoint.acceleration if engaged and airborne and sends else None
         self._commanded = setpoint.kind == setpoint_rules.COMMAND
@@ -376,6 +377,16 @@ class Gate:
         altitude = float(odom.position[2] + odom.velocity[2] * (now - odom.velocity_time))
         height = place.height + self._command.command.altitude - altitude
         return min(max(height, self.limits.height_min), self.limits.height_max)
+
+    def _retreat(self, known: KnownMotion, now: float) -> Array | None:
+        """Return the velocity (3,), m/s, to brake to, if odometry is lost and a neighbor came."""
+        command, lost_since = self._command, self._sources[ODOM].velocity_time
+        lost = known.source == ODOM and known.velocity is None and not known.contradiction
+        # The planner outlived the odometry, so the odometry ended the commands.
+        if not lost or command is None or not lost_since < command.time <= now <= (
+                lost_since + ODOMETRY_GAP):
+            return None
+        return command.command.retreat
 
     def _known(self, now: float) -> KnownMotion:
         odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]

@@ -113,7 +113,7 @@ class Held(NamedTuple):
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, mode_age: float, armed: bool, airborne: bool,
            withheld: str, place: Location, unplaced: str, held: Held, relative: Relative,
-           offset: ArrayLike) -> Setpoint:
+           offset: ArrayLike, retreat: ArrayLike | None = None) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason if it is not the command.
 
@@ -135,6 +135,7 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     :param held: yaw and height to keep without a command.
     :param relative: whether a command may rest on the marker alone.
     :param offset: the acceleration (3,), m/s^2, that offsets the disturbance.
+    :param retreat: velocity (3,), m/s, to brake to, as odometry is lost; None: to a hover.
     """
     yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
     if withheld:
@@ -160,7 +161,8 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         # Without the offset of the thrust a level vehicle sinks or climbs.
         level = _with_offset(np.zeros(3), offset * [0.0, 0.0, float(airborne)], full.a_max, None)
         return Setpoint(LEVEL, reason, _grounded(level, airborne), yaw, '')
-    nominal = brake(estimated.vector, full.a_max, limits.brake_time + estimated.margin)
+    kept = limit_norm(np.zeros(3) if retreat is None else retreat, full.v_max)
+    nominal = brake(estimated.vector - kept, full.a_max, limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         # A late rate makes the height swing, unless 1 / (2 w) is at least e times its age.
         frequency = min(HEIGHT_FREQUENCY, 0.5 / (estimated.margin + LATE_FACTOR * USUAL_AGE))
