@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.command_messages import Command
+from flock_follower.command_messages import Command, ODOMETRY_GAP
 from flock_follower.gate import disturbance, envelope, setpoint_rules
 from flock_follower.gate.disturbance import DisturbanceObserver, HeightWatch
 from flock_follower.gate.envelope import GateLimits, HeightEstimator, Location
@@ -40,7 +40,13 @@ from flock_follower.gate.relative_flight import RelativeFlight
 from flock_follower.gate.setpoint_rules import Setpoint
 from flock_follower.gate.situation import AcceptedCommand, Held, Report, Situation
 from flock_follower.gate.vehicle_status import AutopilotTraits, VehicleStatus
-from flock_follower.gate.velocity_check import finite_vector, MotionReport, ODOM, refusal
+from flock_follower.gate.velocity_check import (
+    finite_vector,
+    KnownMotion,
+    MotionReport,
+    ODOM,
+    refusal,
+)
 from flock_follower.geometry import Array
 from flock_follower.messages import OdometryState
 from flock_follower.ranges import first_reason, THRUST_OFFSET_MAX
@@ -333,7 +339,8 @@ class Gate:
             now, self.limits, self.start_limits, known, report, command, withheld,
             Refusal(lost) if lost else None if relative else displaced, place,
             self._flown.held or Held(), self.relative.permission(now),
-            self._disturbance.offset(self.autopilot.needs_wind_offset))
+            self._disturbance.offset(self.autopilot.needs_wind_offset),
+            self._retreat(known, now))
         return situation
 
     def _record(self, situation: Situation, setpoint: Setpoint, engaged: bool) -> None:
@@ -375,6 +382,16 @@ class Gate:
     def _within_heights(self, height: float) -> float:
         """Return the height, m, within the envelope that is nearest to one."""
         return min(max(height, self.limits.height_min), self.limits.height_max)
+
+    def _retreat(self, known: KnownMotion, now: float) -> Array | None:
+        """Return the velocity (3,), m/s, to brake to, if odometry is lost and a neighbor came."""
+        command, lost_since = self.commands.newest, self.motion.odometry.velocity_time
+        lost = known.source == ODOM and known.velocity is None and not known.contradiction
+        # The planner outlived the odometry, so the odometry ended the commands.
+        if not lost or command is None or not lost_since < command.time <= now <= (
+                lost_since + ODOMETRY_GAP):
+            return None
+        return command.command.retreat
 
     def _hold(self, place: Location, engaged: bool, now: float) -> None:
         """Store the yaw and height that braking holds, and the origin of the radius."""

@@ -129,7 +129,9 @@ def decide(situation: Situation) -> Setpoint:
         # Without the offset of the thrust a level vehicle sinks or climbs.
         level = _with_offset(np.zeros(3), offset * [0.0, 0.0, float(airborne)], full.a_max, None)
         return _no_command(LEVEL, refusal, yaw, _grounded(level, airborne))
-    nominal = brake(estimated.vector, full.a_max, situation.limits.brake_time + estimated.margin)
+    retreat = np.zeros(3) if situation.retreat is None else situation.retreat
+    nominal = brake(estimated.vector - limit_norm(retreat, full.v_max), full.a_max,
+                    situation.limits.brake_time + estimated.margin)
     if place.height is not None and held.height is not None and airborne:
         # A late rate makes the height swing, unless 1 / (2 w) is at least e times its age.
         frequency = min(HEIGHT_FREQUENCY, 0.5 / (estimated.margin + LATE_FACTOR * USUAL_AGE))

@@ -96,6 +96,8 @@ class Situation:
     """Whether a command may rest on the marker alone."""
     offset: ArrayLike
     """The acceleration (3,), m/s^2, that offsets the disturbance."""
+    retreat: ArrayLike | None = None
+    """Velocity (3,), m/s, to brake to, as odometry is lost; None: to a hover."""
 
     @property
     def command_age(self) -> float:

@@ -86,6 +86,34 @@ def test_a_command_older_than_the_planner_timeout_by_its_stamp_is_replaced_by_br
     np.testing.assert_allclose(decision.acceleration, [-0.4 / 0.3, 0, 0])
 
 
+def lost_odometry(command_time, now, autopilot=(-0.4, 0.0, 0.0), retreat=(-1.0, 0.0, 0.0)):
+    """Return the decision of a gate whose odometry ended at 10 s, beside a leader that came."""
+    gate = fresh_gate(limits=GateLimits(v_max=2.0))
+    command = Command(FORWARD, 1.0, retreat=np.array(retreat))
+    assert gate.take_command(command, 0.0, command_time) == ''
+    if autopilot is not None:
+        gate.take_motion('autopilot', MotionReport(autopilot), 0.0, now)
+    return decide(gate, now)
+
+
+def test_without_odometry_it_goes_on_backing_away_from_a_neighbor_that_came():
+    for now in (10.31, 12.99):
+        decision = lost_odometry(10.25, now)
+        assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
+        np.testing.assert_allclose(decision.acceleration, [-0.6 / 0.3, 0, 0])
+
+
+@pytest.mark.parametrize(('command_time', 'now', 'autopilot', 'retreat', 'acceleration'), [
+    (10.25, 13.01, (-0.4, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.4 / 0.3),  # too long ago
+    (9.95, 10.31, (-0.4, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.4 / 0.3),  # the planner failed first
+    (10.25, 10.31, (-0.4, 0.0, 0.0), (math.nan, 0.0, 0.0), 0.4 / 0.3),
+    (10.25, 10.31, None, (-1.0, 0.0, 0.0), 0.0),  # without any velocity: level
+    (10.25, 10.31, (-1.9, 0.0, 0.0), (-9.0, 0.0, 0.0), -0.1 / 0.3)])  # at most v_max
+def test_the_retreat_without_odometry_ends(command_time, now, autopilot, retreat, acceleration):
+    decision = lost_odometry(command_time, now, autopilot, retreat)
+    np.testing.assert_allclose(decision.acceleration, [acceleration, 0, 0], atol=1e-6)
+
+
 @pytest.mark.parametrize(('age', 'reason'), [
     (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
 def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):

@@ -55,7 +55,8 @@ LIMITS = st.builds(GateLimits, a_max=st.floats(1.5, 20.0), v_max=st.floats(0.1, 
 SLOW = SourceMotion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 MOTION = mostly(SLOW, st.builds(SourceMotion, VECTOR, age(0.02), ANY, age(0.02)))
 COMMANDS = mostly(Command((1.0, 0.3, 0.1), 1.0), st.none() | st.builds(
-    Command, VECTOR, ANY, ANY, st.none() | VECTOR.map(np.array), relative=st.booleans()))
+    Command, VECTOR, ANY, ANY, st.none() | VECTOR.map(np.array), relative=st.booleans(),
+    retreat=st.none()))
 SITUATIONS = st.builds(
     lambda limits, lowered, odom, autopilot, source, since, **more: situation(
         GateLimits(a_max=max(lowered * limits.a_max, 1.5), v_max=limits.v_max,
@@ -71,7 +72,7 @@ SITUATIONS = st.builds(
     place=mostly(Location(2.0), st.builds(
         Location, st.none() | ANY, ANY, st.none() | st.tuples(ANY, ANY).map(np.array))),
     held=st.builds(Held, st.none() | ANY, st.none() | ANY),
-    offset=mostly(np.zeros(3), VECTOR.map(np.array)),
+    offset=mostly(np.zeros(3), VECTOR.map(np.array)), retreat=st.none() | VECTOR.map(np.array),
     relative=mostly(Relative(5.0), st.builds(Relative, ANY, st.booleans())))
 
 

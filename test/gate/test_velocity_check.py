@@ -216,7 +216,7 @@ def test_displacements_that_differ_beyond_their_deviations_are_reported(
     why = displaced(odom, None if height else autopilot, 0.0,
                     autopilot.path if height else Path(), 4.0)
     assert bool(why) == contradicts
-    assert not why or ('barometer' in why) == height
+    assert not why or ('barometer' in why.detail) == height
 
 
 def test_the_yaw_nearest_to_a_time_is_returned_and_old_ones_are_forgotten():
