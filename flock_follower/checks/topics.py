@@ -66,7 +66,7 @@ def check_topics(seen: Observations) -> Iterator[Finding]:
     elif seen.gaps:
         yield _gaps(seen)
     for name in (seen.image_name, 'camera_info', 'odom'):
-        yield _needed(seen, name)
+        yield _check_published(seen, name)
     late = float(seen.value('planner', 'odom_timeout', 0.3))
     yield from _stream(
         seen, 'images', seen.topic(seen.image_name), rates=(10.0, 3.0), latencies=(0.2, 0.4),
@@ -138,7 +138,7 @@ def _gaps(seen: Observations) -> Finding:
         'recording')
 
 
-def _needed(seen: Observations, name: str) -> Finding:
+def _check_published(seen: Observations, name: str) -> Finding:
     """Check that a topic is published, and that messages arrive."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
     what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
