@@ -55,7 +55,7 @@ MODELS: dict[Model, str] = {
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
-MEANINGS = '''
+MEANINGS = """
 min r2, max r2  least and greatest squared distance between two agents, and its time (of edges, if
                 the flock has a neighbor graph)
 mean distance   of all pairs at the end
@@ -66,7 +66,7 @@ order           at the end: length of the mean of the unit velocities; 1: one di
 W               L plus a potential of the distances; decreases under the law if there is no leader;
                 inf: a pair is outside the band
 band            kept: sqrt(d0) < distance < sqrt(d1) at all times, for every pair or edge
-'''
+"""
 Row = tuple[str, ...]
 SAMPLE_PERIOD = 0.005  # s, of the paper's simulations
 FLOCK_DURATION = 20.0  # s, of the larger flock
