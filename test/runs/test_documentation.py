@@ -57,8 +57,7 @@ def test_every_file_module_and_command_that_a_page_names_exists(page):
         assert called <= {*re.findall(r'^([\w.-]+):', makefile, re.M)} | ELSEWHERE, line
     for name in re.findall(r'ros2 run flock_follower (\w+)', text):
         assert f"'{name} = flock_" in setup, name
-    for name in re.findall(r'^    (?:.venv/bin/flock_follower|flock_follower|start_node) (\w+)', text,
-                           re.M):
+    for name in re.findall(r'^    (?:(?:.venv/bin/)?flock_follower|start_node) (\w+)', text, re.M):
         assert name in PROGRAMS, name
     for name, arguments in re.findall(r'ros2 launch flock_follower (\S+?)`?((?: \w+:=\S+)*)$',
                                       text, re.M):
