@@ -8,7 +8,7 @@
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style, types and names
-#   make site      build the pages of docs/ as a site, with every link checked (build/site)
+#   make site      build the pages of docs/ as a site, with every link checked, and print the field card (build/site)
 #   make px4-events  write flock_follower/mavlink/px4_events.txt from the sources of PX4, after `make px4_sitl` there: PX4='1.16=FOLDER 1.18=FOLDER'
 #   make bless     make the present result of the sample bag the golden one (test/frozen)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen

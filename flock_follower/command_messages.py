@@ -69,7 +69,7 @@ class Command(NamedTuple):
     """Whether it rests on the marker alone, without odometry; its frame is then ``RELATIVE``."""
     retreat: Array | None = None
     """Velocity (3,), m/s, to brake to if odometry is lost: away from a neighbor that comes. None
-    without such a neighbour."""
+    without such a neighbor."""
 
     def ages(self, now: int) -> tuple[float, float]:
         """Return the ages of the command and of its image, s, at a time, ns."""

@@ -236,7 +236,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
             vehicle.append(f'leader_truth_connection:={external.leader_truth}')
     return {
         'relative_pose': [],
-        'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
+        'planner': [*limits, f'K:={flight.K}', f'beta:={flight.beta}', f'd0:={flight.d0}',
+                    f'd1:={flight.d1}',
                     # No wider than the gate's, which would be a warning.
                     f'altitude_min:={max(flight.altitude_min, GateLimits.height_min)}'],
         'mavlink_bridge': [*limits, *envelope, *bridge],
