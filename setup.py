@@ -35,6 +35,8 @@ setup(
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
         (os.path.join('share', package_name, 'deploy'), sorted(glob('deploy/*'))),
     ],
+    # The live page: no build step makes it.
+    package_data={'flock_follower': ['view/static/*']},
     install_requires=['setuptools'],
     zip_safe=False,
     python_requires='>=3.10',
@@ -49,7 +51,8 @@ setup(
                     'cluster': ['distributed'],
                     # Where there is no ROS; on a robot apt and rosdep bring all of it.
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
-                                'ros-jazzy-common-interfaces==5.3.6', 'matplotlib', 'numpy>=1.26',
+                                'ros-jazzy-common-interfaces==5.3.6', 'aiohttp', 'matplotlib',
+                                'numpy>=1.26',
                                 'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags',
                                 'mcap', 'scipy', 'tqdm'],
                     'test': ['hypothesis', 'pytest']},
@@ -64,6 +67,7 @@ setup(
             'black_box = flock_follower.nodes.black_box:main',
             'simulator = flock_desk.simulator_node:main',
             'visualizer = flock_follower.nodes.visualizer:main',
+            'view = flock_follower.nodes.view:main',
             'demo = flock_desk.demo:main',
             'fly = flock_desk.fly:main',
             'evaluate = flock_desk.evaluate:main',
