@@ -105,14 +105,15 @@ class View(FlockNode):
         self._distances: list[Range] = []
         self._pending: tuple[bytes, Any] | None = None
         """The image of the last turn, and its class: its estimates have come meanwhile."""
-        self._calibration, self._model = b'', None
+        self._calibration = b''
+        self._model: CameraModel | None = None
         self._perception = RemoteParameters(self, PERCEPTION, self._take_parameters)
         self._ask_at = 0.0  # s: when relative_pose may be asked again
         self._static = StaticChild(self)
         self._configure(CameraValues(''), SourceParams())
         self._buttons: deque[str] = deque(maxlen=4)
         self._calls: dict[str, tuple[Any, float]] = {}
-        self._clients = {
+        self._callers = {
             button: self.create_client(Trigger if value is None else SetBool, service)
             for button, (service, value) in CALLS.items()} if values['control'] else {}
         take = self._flight
@@ -207,7 +208,7 @@ class View(FlockNode):
             self._send_picture(*image)
         if self._server.greets:
             self._server.send_history(self._flight.history(now))
-        self._server.send_state(self._flight.page(now))
+        self._server.send_state(self._flight.page(time.monotonic()))
 
     def _watch(self, watched: bool) -> None:
         """Subscribe to what only an open page needs, or no more."""
@@ -242,9 +243,9 @@ class View(FlockNode):
                      in self.get_subscriber_names_and_types_by_node(PERCEPTION, space)
                      if types[0] in BY_TYPE and (types[0] == ODOMETRY or not self._camera.name)
                      and not topic.endswith(MOTION_TOPIC)}
-            names |= found
             if COMPRESSED_IMAGES in found:
-                names |= {RAW_IMAGES: found[COMPRESSED_IMAGES], 'compressed': 'yes'}
+                names |= {RAW_IMAGES: found.pop(COMPRESSED_IMAGES), 'compressed': 'yes'}
+            names |= found
         return names
 
     def _take_parameters(self, values: dict[str, Any]) -> None:
@@ -327,14 +328,14 @@ class View(FlockNode):
             request = Trigger.Request() if value is None else SetBool.Request(data=value)
             self.get_logger().info(f'{button}: pressed on the page')
             self._calls[button] = (
-                self._clients[button].call_async(request), now + ANSWER_TIMEOUT)
+                self._callers[button].call_async(request), now + ANSWER_TIMEOUT)
 
     def _take_answers(self, now: float) -> None:
         """Pass on answers to buttons."""
         for button, (future, end) in list(self._calls.items()):
             if future.done():
                 success, text = future.result().success, future.result().message
-            elif now > end or not self._clients[button].service_is_ready():
+            elif now > end or not self._callers[button].service_is_ready():
                 success, text = False, f'no answer of {CALLS[button][0]}'
             else:
                 continue

@@ -83,7 +83,7 @@ def outlines(shape: Shape) -> list[Array]:
         return [corners[[i, j]] for i, j in _EDGES]
     if shape.kind == ELLIPSOID:
         # Three great ellipses.
-        found = []
+        found: list[Array] = []
         for turn in _TURNS:
             ring = shadow(np.eye(3), turn @ shape.size)
             flat = np.hstack([ring, np.zeros((len(ring), 1))])
