@@ -51,6 +51,7 @@ from flock_follower.messages import (
     MOTION_TOPIC,
     NANOSECONDS,
     ODOMETRY,
+    OdometryState,
     stamp_to_nanoseconds,
 )
 from flock_follower.nodes.support.diagnostics import STEADY
@@ -110,9 +111,10 @@ class View(FlockNode):
         self._perception = RemoteParameters(self, PERCEPTION, self._take_parameters)
         self._ask_at = 0.0  # s: when relative_pose may be asked again
         self._static = StaticChild(self)
-        self._configure(CameraValues(''), SourceParams())
+        self._configure(CameraValues(''), 'raw', SourceParams())
         self._buttons: deque[str] = deque(maxlen=4)
-        self._calls: dict[str, tuple[Any, float]] = {}
+        self._calls: list[tuple[str, Any, float]] = []
+        """Each button that was pressed, the future of its answer, and when none is awaited."""
         self._callers = {
             button: self.create_client(Trigger if value is None else SetBool, service)
             for button, (service, value) in CALLS.items()} if values['control'] else {}
@@ -220,7 +222,7 @@ class View(FlockNode):
             self._open = [self._listen(kind, topic, take, best_effort(depth))
                           for topic, kind, take, depth in (
                 (names['odom'], Odometry, self._take_odometry, 50),
-                (MOTION_TOPIC, Odometry, self._take_odometry, 5),
+                (MOTION_TOPIC, Odometry, lambda m: self._use(from_odometry(m)), 5),
                 ('neighbors', Odometry, lambda m: flight.take_neighbor(
                     from_odometry(m), time.monotonic()), 20),
                 ('neighbors/heard', Odometry, lambda m: flight.take_neighbor(
@@ -236,15 +238,17 @@ class View(FlockNode):
     def _names(self) -> dict[str, str]:
         """Return the names of our topics as relative_pose has them, ours without it."""
         names = {'odom': 'odom', 'camera_info': self._camera.camera_info,
-                 RAW_IMAGES: self._camera.image, 'compressed': ''}
+                 RAW_IMAGES: self._camera.images(self._transport),
+                 'compressed': 'yes' if self._transport == 'compressed' else ''}
         space = self.get_namespace()
         if (PERCEPTION, space) in self.get_node_names_and_namespaces():
             found = {BY_TYPE[types[0]]: topic for topic, types
                      in self.get_subscriber_names_and_types_by_node(PERCEPTION, space)
                      if types[0] in BY_TYPE and (types[0] == ODOMETRY or not self._camera.name)
                      and not topic.endswith(MOTION_TOPIC)}
-            if COMPRESSED_IMAGES in found:
-                names |= {RAW_IMAGES: found.pop(COMPRESSED_IMAGES), 'compressed': 'yes'}
+            for ours, compressed in ((RAW_IMAGES, ''), (COMPRESSED_IMAGES, 'yes')):
+                if ours in found:
+                    names |= {RAW_IMAGES: found.pop(ours), 'compressed': compressed}
             names |= found
         return names
 
@@ -253,14 +257,16 @@ class View(FlockNode):
         try:
             known = values.get(NAMES) is not None
             self._configure(cameras(values)[0] if known else CameraValues(''),
+                            values.get('image_transport', 'raw'),
                             filled(SourceParams(), values, 'odom_'))
         except (KeyError, ValueError) as error:
             self.diagnostics.reject('parameters of relative_pose', str(error))
         if self._open:
             self._watch(True)
 
-    def _configure(self, camera: CameraValues, source: SourceParams) -> None:
-        self._camera, self._source = camera, OdometrySource(source)
+    def _configure(self, camera: CameraValues, transport: str, source: SourceParams) -> None:
+        self._camera, self._transport = camera, transport
+        self._source = OdometrySource(source)
         self._mounting = camera_mounting(camera.position, camera.rpy)
         self._placed_child = any(source.child_position) or any(source.child_rpy)
         self._calibration, self._model = b'', None
@@ -297,7 +303,13 @@ class View(FlockNode):
             self._placed_child = True
             self._source.place_child(child)
         state = self._source.take(message, self.get_clock().now().nanoseconds)
-        if state is None or not self._flight.take_odometry(state, time.monotonic()):
+        self._source.new_events()  # relative_pose reports them
+        if state is not None:
+            self._use(state)
+
+    def _use(self, state: OdometryState) -> None:
+        """Take the own state."""
+        if not self._flight.take_odometry(state, time.monotonic()):
             return
         self._epoch = self._epoch or state.stamp
         self._odometry.add(OdometrySample(
@@ -322,25 +334,24 @@ class View(FlockNode):
                     {pair.key: pair.value for pair in status.values}))
 
     def _call(self, button: str, now: float) -> None:
-        """Call the service of a button, unless its answer is still awaited."""
+        """Call the service of a button: at each press, the answer to the last may be lost."""
         value = CALLS[button][1]
-        if button not in self._calls:
-            request = Trigger.Request() if value is None else SetBool.Request(data=value)
-            self.get_logger().info(f'{button}: pressed on the page')
-            self._calls[button] = (
-                self._callers[button].call_async(request), now + ANSWER_TIMEOUT)
+        request = Trigger.Request() if value is None else SetBool.Request(data=value)
+        self.get_logger().info(f'{button}: pressed on the page')
+        self._calls.append((
+            button, self._callers[button].call_async(request), now + ANSWER_TIMEOUT))
 
     def _take_answers(self, now: float) -> None:
         """Pass on answers to buttons."""
-        for button, (future, end) in list(self._calls.items()):
+        calls, self._calls = self._calls, []
+        for button, future, end in calls:
             if future.done():
-                success, text = future.result().success, future.result().message
+                response = future.result()
+                self._server.send_answer(button, response.success, response.message)
             elif now > end or not self._callers[button].service_is_ready():
-                success, text = False, f'no answer of {CALLS[button][0]}'
+                self._server.send_answer(button, False, f'no answer of {CALLS[button][0]}')
             else:
-                continue
-            del self._calls[button]
-            self._server.send_answer(button, success, text)
+                self._calls.append((button, future, end))
 
 
 def _access(values: dict[str, Any]) -> Access:

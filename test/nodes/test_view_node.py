@@ -203,25 +203,28 @@ def test_names_and_mounting_are_those_of_relative_pose(rig: Rig) -> None:
             ('position', [0.0, 0.2, 0.0]), ('rpy', [0.0, 0.0, float(name == 'left')]),
             ('rectified', False), ('time_offset', 0.0), ('readout_time', 0.0))}})
     assert {'left/mono', 'left/info'} <= rig.topics()
+    rig.node._perception.take({**rig.node._perception.values, 'image_transport': 'compressed'})
+    assert 'left/mono/compressed' in rig.topics()
     other.destroy_node()
 
 
 @pytest.mark.parametrize(('button', 'request_type', 'wanted'), [
     ('brake', SetBool, SetBool.Request(data=False)), ('land', Trigger, Trigger.Request())])
-def test_a_button_calls_its_service_once_and_shows_the_answer(
+def test_each_press_of_a_button_calls_its_service_and_shows_the_answer(
         rig: Rig, button: str, request_type: Any, wanted: Any) -> None:
     client = rig.node._callers[button]
     assert client.srv_type is request_type
     called: list[Any] = []
-    future = Future()
-    client.call_async = lambda request: called.append(request) or future
+    futures = [Future(), Future()]
+    client.call_async = lambda request: called.append(request) or futures[len(called) - 1]
     client.service_is_ready = lambda: True
     for _ in range(2):
         rig.node._press(button)
         rig.show()
-    assert called == [wanted] and not rig.pages.answers
-    future.set_result(request_type.Response(success=False, message='refused: <b>'))
-    rig.show()
+    assert called == [wanted, wanted] and not rig.pages.answers
+    futures[1].set_result(request_type.Response(success=False, message='refused: <b>'))
+    for _ in range(2):
+        rig.show()
     assert rig.pages.answers == [(button, False, 'refused: <b>')]
 
 

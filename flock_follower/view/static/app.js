@@ -102,9 +102,10 @@ function showDistance({name, m, stale}, band) {
   $('needle').style.left = `${100 * (m || 0) / most}%`;
 }
 
-function showBridge({bridge, limits, limited_by: limited, setpoint, battery}) {
+function showBridge({ages, bridge, limits, limited_by: limited, setpoint, battery}) {
   $('bridge-card').dataset.bridge = bridge.state;
-  show('bridge', bridge.lost ? 'BRIDGE LOST' : bridge.state);
+  const never = ages.find(([source]) => source === 'bridge state')[1] === null;
+  show('bridge', never ? 'NO BRIDGE' : bridge.lost ? 'BRIDGE LOST' : bridge.state);
   show('bridge-reason', bridge.reason);
   show('vehicle', [bridge.autopilot && `${bridge.autopilot} ${bridge.firmware}`.trim(), bridge.mode,
     bridge.armed && (bridge.armed === 'True' ? 'armed' : 'disarmed'),
