@@ -439,5 +439,6 @@ def test_a_flight_starts_the_live_page_unless_view_is_no(monkeypatch, variable, 
 
     monkeypatch.setenv('VIEW', variable)
     start_view(Group(), 'one', 'port:=1')
-    assert started == [(('view', 'flock_follower.nodes.view', [
-        '--ros-args', '-r', '__ns:=/one', '-p', 'port:=1']), {'show': True, 'ends': True})][:starts]
+    arguments = ['--ros-args', '-r', '__ns:=/one', '-p', 'port:=1']
+    assert started == [(('view', 'flock_follower.nodes.view', arguments),
+                        {'show': True, 'ends': True})][:starts]
