@@ -24,7 +24,8 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=['flock_*']),
-    package_data={'flock_desk': ['data/*'], 'flock_follower.mavlink': ['*.txt']},
+    package_data={'flock_desk': ['data/*'], 'flock_follower.mavlink': ['*.txt'],
+                  'flock_follower.view': ['static/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
@@ -35,8 +36,6 @@ setup(
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
         (os.path.join('share', package_name, 'deploy'), sorted(glob('deploy/*'))),
     ],
-    # The live page: no build step makes it.
-    package_data={'flock_follower': ['view/static/*']},
     install_requires=['setuptools'],
     zip_safe=False,
     python_requires='>=3.10',
@@ -52,9 +51,8 @@ setup(
                     # Where there is no ROS; on a robot apt and rosdep bring all of it.
                     'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
                                 'ros-jazzy-common-interfaces==5.3.6', 'aiohttp', 'matplotlib',
-                                'numpy>=1.26',
-                                'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags',
-                                'mcap', 'scipy', 'tqdm'],
+                                'numpy>=1.26', 'opencv-python-headless>=4.7', 'pymavlink',
+                                'pyyaml', 'rosbags', 'mcap', 'scipy', 'tqdm'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [

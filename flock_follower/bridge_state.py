@@ -38,7 +38,7 @@ NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = BRIDGE_STATES = (
 TOPIC = 'mavlink_bridge/state'
 #: Where the vehicle was armed, in the frame of the odometry; latched.
 ARMED_AT_TOPIC = 'mavlink_bridge/armed_at'
-SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
+SILENCE_MAX = 1.0  # s: two of the bridge's repetitions may get lost
 _LONGEST_REASON = 200  # characters
 
 
@@ -71,6 +71,6 @@ def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     if reported is None or math.isinf(age):
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (if another program flies '
                            'the commands, set require_bridge:=false)')
-    if not age <= SILENCE:  # written so that NaN fails
+    if not age <= SILENCE_MAX:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
     return reported

@@ -77,7 +77,8 @@ from flock_follower.view.parameter_table import VIEW
 from flock_follower.view.picture import draw_picture
 
 SPECS = VIEW
-PERIOD, IDLE_PERIOD = 0.1, 1.0  # s between two turns, with an open page and without
+PERIOD = 0.1  # s between two turns with an open page
+IDLE_PERIOD = 1.0  # s between two turns without
 NICENESS = 10  # what flies goes first
 ASK_PERIOD = 2.0  # s between two requests for the parameters of relative_pose
 ANSWER_TIMEOUT = 20.0  # s for the answer of a service: a landing is confirmed before
@@ -169,7 +170,7 @@ class View(FlockNode):
 
         def keep(data: bytes) -> None:  # an image is decoded in the next turn
             self._pending = data, kind
-            self._flight.heard('image', time.monotonic())
+            self._flight.note('image', time.monotonic())
 
         return self.create_subscription(
             kind, topic, keep if kind in (Image, CompressedImage) else deliver, qos,

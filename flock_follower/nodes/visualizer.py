@@ -16,7 +16,7 @@
 The visualizer node: the flight as markers for RViz and Foxglove.
 
 Publishes ``visualizer/markers`` in the frame of ``odom`` while a viewer subscribes: the follower
-with its state and command, and each neighbour with its velocity, the ellipsoid of its position and
+with its state and command, and each neighbor with its velocity, the ellipsoid of its position and
 the planner's band about it. No other node waits for it.
 """
 

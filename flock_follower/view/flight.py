@@ -28,16 +28,24 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.bridge_state import BridgeState, effective_state, parse, SILENCE
+from flock_follower.bridge_state import BridgeState, effective_state, parse, SILENCE_MAX
 from flock_follower.command_messages import Command
 from flock_follower.geometry import quaternion_to_matrix, Transform
 from flock_follower.messages import OdometryChoice, OdometryState
-from flock_follower.view.scene import band, draw, ELLIPSOID, FORGOTTEN, Shape, TEXT, UNSEEN
+from flock_follower.view.scene import (
+    band,
+    draw,
+    ELLIPSOID,
+    FORGOTTEN_AFTER,
+    Shape,
+    TEXT,
+    UNSEEN_AFTER,
+)
 
 #: s of silence after which a source is stale, by its name on the page.
 LIMITS: Final[Mapping[str, float]] = {
     'image': 1.0, 'odometry': 0.5, 'estimate': 0.5, 'distance': 0.5, 'command': 0.5,
-    'relative_pose': 2.5, 'planner': 2.5, 'mavlink_bridge': 2.5, 'bridge state': SILENCE,
+    'relative_pose': 2.5, 'planner': 2.5, 'mavlink_bridge': 2.5, 'bridge state': SILENCE_MAX,
     'battery': 10.0}
 #: Sources whose silence is no fault by itself: nothing is commanded or seen before a flight.
 SPORADIC: Final = ('image', 'estimate', 'distance', 'command', 'battery')
@@ -50,12 +58,12 @@ RATES: Final = (('images', 'relative_pose', 'image_raw_hz'),
                 ('setpoints', 'mavlink_bridge', 'stream_hz'),
                 ('estimate, p95 ms', 'relative_pose', 'latency_p95_ms'),
                 ('command, p95 ms', 'mavlink_bridge', 'latency_p95_ms'))
-HISTORY = 60.0  # s of distance and tracks
+HISTORY_LENGTH = 60.0  # s of distance and tracks
 TRACK_PERIOD = 0.2  # s between two points of a track
 NEIGHBORS_MAX = 16  # more names than a flock has come from a fault
 ESTIMATES = 16  # of each neighbor kept: half a second of images
 LONGEST_TEXT = 400  # characters
-WARNINGS_MAX = 20
+WARNINGS_MAX = 20  # on a page
 LEVELS: Final = ('ok', 'warn', 'error', 'error')  # of diagnostic_msgs; the last is STALE
 LOST, NEVER = 'PLANNER LOST', 'NO PLANNER'
 OUTLINE: Final = 24  # points of an ellipse
@@ -97,7 +105,7 @@ class Flight:
 
     # Messages.
 
-    def heard(self, source: str, now: float) -> None:
+    def note(self, source: str, now: float) -> None:
         """Note that a source, a key of ``LIMITS``, has sent something."""
         self._times[source] = now
 
@@ -109,14 +117,14 @@ class Flight:
             self._tracks.clear()  # places in another frame
             self._neighbors.clear()
         self.own = state
-        self.heard('odometry', now)
+        self.note('odometry', now)
         self._follow('', state, now)
         return True
 
     def take_neighbor(self, state: OdometryState, now: float, seen: bool = True) -> None:
         """Take the state of a neighbor, seen by the camera or received from others."""
         if seen:
-            self.heard('estimate', now)
+            self.note('estimate', now)
         name = state.child
         if name not in self._neighbors and len(self._neighbors) >= NEIGHBORS_MAX:
             return
@@ -126,7 +134,7 @@ class Flight:
     def take_command(self, command: Command, now: float) -> None:
         """Take a command of the planner."""
         self.command = command
-        self.heard('command', now)
+        self.note('command', now)
 
     def take_state(self, word: str) -> None:
         """Take the latched state of the planner, which tells nothing of the planner's life."""
@@ -135,34 +143,34 @@ class Flight:
     def take_bridge(self, text: str, now: float) -> None:
         """Take ``mavlink_bridge/state``."""
         self._bridge = parse(text)
-        self.heard('bridge state', now)
+        self.note('bridge state', now)
 
     def take_report(self, node: str, report: Report) -> None:
         """Take the diagnostics of a node."""
         self._reports[node] = report
         if node in LIMITS:
-            self.heard(node, report.time)
+            self.note(node, report.time)
 
     def take_battery(self, battery: Battery) -> None:
         """Take the state of the battery."""
         self._battery = battery
-        self.heard('battery', battery.time)
+        self.note('battery', battery.time)
 
     def take_distance(self, name: str, distance: float, now: float) -> None:
         """Take the distance to the neighbor that the planner faces, m, sent at ``now``."""
         if not math.isfinite(distance):
             return
         self._distance = name, distance
-        self.heard('distance', now)
+        self.note('distance', now)
         self._distances.append((now, distance))
-        while now - self._distances[0][0] > HISTORY:
+        while now - self._distances[0][0] > HISTORY_LENGTH:
             self._distances.popleft()
 
     def _follow(self, name: str, state: OdometryState, now: float) -> None:
         track = self._tracks.setdefault(name, deque())
         if not track or now - track[-1][0] >= TRACK_PERIOD:
             track.append((now, *state.position[:2].tolist()))
-            while now - track[0][0] > HISTORY:
+            while now - track[0][0] > HISTORY_LENGTH:
                 track.popleft()
 
     # What a page shows.
@@ -193,7 +201,7 @@ class Flight:
     def neighbors(self, now: float) -> list[tuple[OdometryState, float]]:
         """Return the newest state of each neighbor with its age, s."""
         return [(states[-1][0], now - states[-1][1]) for states in self._neighbors.values()
-                if now - states[-1][1] <= FORGOTTEN]
+                if now - states[-1][1] <= FORGOTTEN_AFTER]
 
     def neighbors_at(self, stamp: int) -> list[tuple[OdometryState, float]]:
         """
@@ -205,16 +213,16 @@ class Flight:
         for states in self._neighbors.values():
             state = min((s for s, _ in states), key=lambda s: abs(s.stamp - stamp))
             ahead = (stamp - state.stamp) * 1e-9
-            if abs(ahead) <= UNSEEN:
+            if abs(ahead) <= UNSEEN_AFTER:
                 state = state._replace(position=state.position + ahead * state.velocity)
-            if abs(ahead) <= FORGOTTEN:
+            if abs(ahead) <= FORGOTTEN_AFTER:
                 found.append((state, max(0.0, ahead)))
         return found
 
     def scene(self, now: float) -> list[Shape]:
         """Return the shapes of the newest states."""
         command = None if self.command is None else (self.command, self.age('command', now))
-        own = None if self.age('odometry', now) > FORGOTTEN else self.own
+        own = None if self.age('odometry', now) > FORGOTTEN_AFTER else self.own
         state, reason = self.planner_state(now)
         return draw(own, self.neighbors(now), command, {
             **self.planner_values(now), 'state': state, 'reason': reason})
@@ -254,7 +262,7 @@ class Flight:
             'scene': [from_above(shape) for shape in self.scene(now)]})
 
     def history(self, now: float) -> dict[str, Any]:
-        """Return the distances and tracks of the last ``HISTORY`` s."""
+        """Return the distances and tracks of the last ``HISTORY_LENGTH`` s."""
         self._forget(now)
         return clean({'t': now, 'distances': list(self._distances),
                       'tracks': {name: list(track) for name, track in self._tracks.items()}})
@@ -262,13 +270,13 @@ class Flight:
     def _forget(self, now: float) -> None:
         """Forget neighbors and tracks that are too old to be shown."""
         for name, states in list(self._neighbors.items()):
-            if now - states[-1][1] > HISTORY:
+            if now - states[-1][1] > HISTORY_LENGTH:
                 del self._neighbors[name]
                 self._tracks.pop(name, None)
         for track in self._tracks.values():
-            while track and now - track[0][0] > HISTORY:
+            while track and now - track[0][0] > HISTORY_LENGTH:
                 track.popleft()
-        while self._distances and now - self._distances[0][0] > HISTORY:
+        while self._distances and now - self._distances[0][0] > HISTORY_LENGTH:
             self._distances.popleft()
 
     def _place(self, name: str, now: float) -> list[float] | None:

@@ -31,7 +31,7 @@ from flock_follower.view.scene import ARROW, BOX, COLORS, ELLIPSOID, LINE, Shape
 WIDTH = 640  # px: a wider image is reduced, for the link and the processor
 QUALITY = 70  # of the JPEG: 640x480 px take about 40 kB
 FONT = 0.6  # scale of OpenCV's font: letters 13 px high
-FAR = 16384.0  # px: a line with a point farther outside is not drawn
+FARTHEST_PIXEL = 16384.0  # px: a line with a point farther outside is not drawn
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 _SIGNS: Final = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5)
                           for z in (-0.5, 0.5)])
@@ -101,14 +101,14 @@ def _color(paint: str, white: float = 0.0) -> Any:
 
 def _line(canvas: Canvas, pixels: Array, color: Any) -> None:
     """Draw the segments between pixels (n, 2) whose ends are in front of the camera."""
-    if (np.abs(pixels) < FAR).all():
+    if (np.abs(pixels) < FARTHEST_PIXEL).all():
         fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
         cv2.polylines(canvas, [fixed], False, color, 2, cv2.LINE_AA, _SHIFT)
 
 
 def _text(canvas: Canvas, at: Array, text: str, color: Any) -> None:
     """Write ASCII text, dark-edged, centered above a pixel; what does not fit is moved inside."""
-    if not (np.abs(at) < FAR).all():
+    if not (np.abs(at) < FARTHEST_PIXEL).all():
         return
     plain = text.encode('ascii', 'replace').decode()
     (width, height), _ = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, FONT, 1)

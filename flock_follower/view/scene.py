@@ -36,18 +36,20 @@ from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 
 #: Kinds of shapes.
 BOX, ARROW, LINE, ELLIPSOID, TEXT = 'box', 'arrow', 'line', 'ellipsoid', 'text'
-DEGENERATE = 1e-3  # m: the shortest length drawn, viewers refuse sizes of zero
+MIN_LENGTH = 1e-3  # m: the shortest length drawn, viewers refuse sizes of zero
 DEVIATIONS = 2.0  # of the ellipsoids
 VELOCITY_TIME = 1.0  # s: an arrow of velocity ends where it leads in this time
 ACCELERATION_SCALE = 0.5  # m of arrow per m/s^2
-UNSEEN = 0.25  # s without an image of it after which a neighbor is drawn in grey
-FORGOTTEN = 10.0  # s after which it is drawn no more
+UNSEEN_AFTER = 0.25  # s without an image of it after which a neighbor is drawn in gray
+FORGOTTEN_AFTER = 10.0  # s after which it is drawn no more
 SILENT = 0.5  # s after which a command is drawn no more
-ABOVE: Final = np.array([0.0, 0.0, 0.3])  # m: the place of a label
+LABEL_OFFSET: Final = np.array([0.0, 0.0, 0.3])  # m: the place of a label
 BODY_SIZE = (0.35, 0.35, 0.1)  # m
 TEXT_SIZE = (0.0, 0.0, 0.15)  # m: the height
 ARROW_SIZE = (0.04, 0.08, 0.1)  # m: width of the shaft, width and length of the head
-LINE_WIDTH, EDGE_WIDTH, ACTIVE_WIDTH = 0.02, 0.015, 0.05  # m
+LINE_WIDTH = 0.02  # m
+EDGE_WIDTH = 0.015  # m: of an edge of the band
+ACTIVE_WIDTH = 0.05  # m: of the one that the guard holds
 #: A level circle of radius 1 m, (49, 3).
 RING: Final = np.array([[math.cos(a), math.sin(a), 0.0] for a in np.linspace(0.0, math.tau, 49)])
 
@@ -56,7 +58,7 @@ Color = tuple[float, float, float, float]
 
 #: The colors by the paint of a shape; states of the planner are paints, too.
 COLORS: Final[Mapping[str, Color]] = {
-    'seen': (0.2, 0.5, 1.0, 0.9), 'grey': (0.7, 0.7, 0.7, 0.9),
+    'seen': (0.2, 0.5, 1.0, 0.9), 'gray': (0.7, 0.7, 0.7, 0.9),
     'ellipsoid': (0.2, 0.5, 1.0, 0.25), 'edge': (1.0, 1.0, 1.0, 0.6),
     'inner': (0.95, 0.3, 0.2, 0.7), 'outer': (0.2, 0.8, 0.9, 0.7),
     'command': (0.3, 0.9, 0.3, 1.0), 'guarded': (1.0, 0.55, 0.0, 1.0),
@@ -100,7 +102,7 @@ def draw(own: OdometryState | None, neighbors: Iterable[tuple[OdometryState, flo
     return shapes
 
 
-def guarded(report: Mapping[str, str]) -> list[str]:
+def guard_reasons(report: Mapping[str, str]) -> list[str]:
     """Return the guard's reasons among the limits of the planner's command."""
     return [reason for reason in REASONS if reason in report.get('limits', '')]
 
@@ -118,13 +120,13 @@ def _neighbor(own: OdometryState | None, state: OdometryState, age: float,
               report: Mapping[str, str]) -> list[Shape]:
     """Return a neighbor, its velocity, ellipsoid, edge of the graph, and band."""
     name, at, velocity = state.child, state.position, VELOCITY_TIME * state.velocity
-    if age > FORGOTTEN:
+    if age > FORGOTTEN_AFTER:
         return []
-    paint, label = ('seen', name) if age <= UNSEEN else (
-        'grey', f'{name}, not seen for {age:.1f} s')
+    paint, label = ('seen', name) if age <= UNSEEN_AFTER else (
+        'gray', f'{name}, not seen for {age:.1f} s')
     shapes = [Shape(name, BOX, paint, BODY_SIZE, at, state.quaternion),
-              Shape(f'{name} name', TEXT, paint, TEXT_SIZE, at + ABOVE, text=label)]
-    if np.linalg.norm(velocity) > DEGENERATE:
+              Shape(f'{name} name', TEXT, paint, TEXT_SIZE, at + LABEL_OFFSET, text=label)]
+    if np.linalg.norm(velocity) > MIN_LENGTH:
         shapes.append(Shape(f'{name} velocity', ARROW, paint, ARROW_SIZE,
                             points=[at, at + velocity]))
     if np.all(np.isfinite(state.pose_covariance[:3, :3])):
@@ -134,7 +136,7 @@ def _neighbor(own: OdometryState | None, state: OdometryState, age: float,
     if own is not None:
         shapes.append(Shape(f'{name} edge', LINE, 'edge', (LINE_WIDTH, 0.0, 0.0),
                             points=[own.position, at]))
-    active = guarded(report)
+    active = guard_reasons(report)
     return shapes + [
         Shape(f'{name} {key}', LINE, paint,
               (ACTIVE_WIDTH if reason in active else EDGE_WIDTH, 0.0, 0.0),
@@ -147,13 +149,13 @@ def _neighbor(own: OdometryState | None, state: OdometryState, age: float,
 def _follower(own: OdometryState, command: tuple[Command, float] | None,
               report: Mapping[str, str]) -> list[Shape]:
     """Return the follower with its state and its command."""
-    active, state = guarded(report), report.get('state', 'no planner')
-    paint, at = state if state in COLORS else 'grey', own.position
+    active, state = guard_reasons(report), report.get('state', 'no planner')
+    paint, at = state if state in COLORS else 'gray', own.position
     label = [state, *(f'guard: {reason}' for reason in active)]
     if state != 'TRACK':
         label.append(report.get('reason', ''))
     shapes = [Shape('follower', BOX, paint, BODY_SIZE, at, own.quaternion),
-              Shape('state', TEXT, paint, TEXT_SIZE, at + ABOVE,
+              Shape('state', TEXT, paint, TEXT_SIZE, at + LABEL_OFFSET,
                     text='\n'.join(filter(None, label)))]
     if command is not None and command[1] <= SILENT:
         tip = at + ACCELERATION_SCALE * np.asarray(command[0].acceleration, float)
@@ -167,6 +169,6 @@ def ellipsoid(name: str, center: Array, covariance: Array) -> Shape:
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]
-    size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), DEGENERATE)
+    size = np.maximum(2.0 * DEVIATIONS * np.sqrt(np.maximum(variances, 0.0)), MIN_LENGTH)
     return Shape(name, ELLIPSOID, 'ellipsoid', tuple(size.tolist()), center,
                  matrix_to_quaternion(axes))

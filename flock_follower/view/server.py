@@ -57,7 +57,8 @@ PAGES_MAX = 24
 ANSWERS_MAX = 8  # that wait for a slow page
 LONGEST_REQUEST = 1024  # bytes of a message from a page
 HEARTBEAT = 5.0  # s: a page that answers no ping within half of it is gone
-START_TIMEOUT, STOP_TIMEOUT = 5.0, 0.5  # s
+START_TIMEOUT = 5.0  # s until the address is bound
+STOP_TIMEOUT = 0.5  # s for open pages to be closed
 BUTTONS: Final = ('brake', 'land')
 REFUSALS: Final = {
     HOST: 'This page does not answer to the host name in the address. Open the address that the '
@@ -186,7 +187,7 @@ class PageServer:
 
     def application(self) -> web.Application:
         """Return the application, which is this server without its address."""
-        application = web.Application(middlewares=[self._checked])
+        application = web.Application(middlewares=[self._check_access])
         for path in FILES:
             application.router.add_get(path, self._serve_file)
         application.router.add_get('/ws', self._serve_page)
@@ -198,17 +199,17 @@ class PageServer:
     def _cookie(self) -> str:
         return f'flock_follower_{self.port}'  # browsers do not tell ports apart
 
-    def _offered(self, request: web.Request) -> str:
+    def _read_token(self, request: web.Request) -> str:
         """Return the token that a request offers; a cookie of an earlier start is none."""
         given = request.query.get('token', '')
         cookie = request.cookies.get(self._cookie, '')
         return given or (cookie if self.access.matches(cookie) else '')
 
     @web.middleware
-    async def _checked(self, request: web.Request, handler: Callable[
+    async def _check_access(self, request: web.Request, handler: Callable[
             [web.Request], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
         """Refuse what the rules of access refuse; turn a token in the address into a cookie."""
-        host, offered = request.headers.get(hdrs.HOST, ''), self._offered(request)
+        host, offered = request.headers.get(hdrs.HOST, ''), self._read_token(request)
         if request.path == '/ws':
             refused = self.access.refuse_socket(
                 host, request.headers.get(hdrs.ORIGIN, ''), offered)
@@ -232,7 +233,7 @@ class PageServer:
             return web.Response(status=503, text=f'{PAGES_MAX} pages are open already\n')
         socket = web.WebSocketResponse(
             heartbeat=HEARTBEAT, max_msg_size=LONGEST_REQUEST, compress=False)
-        page = _Page(self._offered(request), socket)
+        page = _Page(self._read_token(request), socket)
         page.answers.append(_message('about', {
             **self._about, 'control': self.access.refuse_button(page.token)}))
         self._pages.add(page)

@@ -150,7 +150,7 @@ def test_the_estimate_is_drawn_where_the_camera_sees_it(rig: Rig, compressed: bo
         rig.node._names = lambda: {'odom': 'odom', 'camera_info': 'camera_info',
                                    'image_raw': 'image_raw/compressed', 'compressed': 'yes'}
     rig.show()
-    grey = np.full((480, 640), 90, np.uint8)
+    gray = np.full((480, 640), 90, np.uint8)
     k = [400.0, 0.0, 320.0, 0.0, 400.0, 240.0, 0.0, 0.0, 1.0]
     rig.give('camera_info', CameraInfo(width=640, height=480, k=k, d=[0.0] * 5,
                                        distortion_model='plumb_bob'))
@@ -158,9 +158,9 @@ def test_the_estimate_is_drawn_where_the_camera_sees_it(rig: Rig, compressed: bo
         rig.place('odom', 'base_link', (5.0, 0.0, 1.0), stamp)
     # 2 m ahead of the camera, which is 0.1 m ahead of the body, and 0.5 m to the left.
     rig.place('neighbors', 'leader', (7.1, 0.5, 1.0))
-    image = (CompressedImage(format='png', data=cv2.imencode('.png', grey)[1].tobytes())
+    image = (CompressedImage(format='png', data=cv2.imencode('.png', gray)[1].tobytes())
              if compressed else
-             Image(width=640, height=480, step=640, encoding='mono8', data=grey.tobytes()))
+             Image(width=640, height=480, step=640, encoding='mono8', data=gray.tobytes()))
     image.header.stamp = nanoseconds_to_stamp(STAMP)
     rig.give('image_raw/compressed' if compressed else 'image_raw', image)
     rig.show()

@@ -36,9 +36,9 @@ from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.view.scene import (
     ACCELERATION_SCALE,
     COLORS,
-    DEGENERATE,
     DEVIATIONS,
     ellipsoid,
+    MIN_LENGTH,
 )
 
 LEADER, OTHER, OWN = (2.0, 0.0, 1.5), (3.0, 1.0, 1.5), (0.0, 0.0, 1.5)
@@ -148,4 +148,4 @@ def test_an_ellipsoid_has_the_covariance_it_is_made_of(values: list[float]) -> N
     shape = ellipsoid('x', np.zeros(3), root @ root.T)
     axes = quaternion_to_matrix(shape.quaternion)
     again = axes @ np.diag(np.square(np.array(shape.size) / (2.0 * DEVIATIONS))) @ axes.T
-    np.testing.assert_allclose(again, root @ root.T, atol=max(DEGENERATE**2, 1e-6))
+    np.testing.assert_allclose(again, root @ root.T, atol=max(MIN_LENGTH**2, 1e-6))

@@ -31,7 +31,7 @@ from flock_follower.view.flight import (
     clean,
     Flight,
     from_above,
-    HISTORY,
+    HISTORY_LENGTH,
     LIMITS,
     LOST,
     NEIGHBORS_MAX,
@@ -67,7 +67,7 @@ def flight(**planner: str) -> Flight:
         NOW, 0, 'running', {'autopilot': 'PX4', 'limited_by': 'v_max', 'setpoint': 'command'}))
     made.take_distance('leader', 2.0, NOW)
     made.take_battery(Battery(NOW, 0.78, 15.8))
-    made.heard('image', NOW)
+    made.note('image', NOW)
     return made
 
 
@@ -140,7 +140,7 @@ def test_the_history_is_that_of_the_last_minute() -> None:
         made.take_odometry(state('base_link', (second, 0.0, 0.0)), NOW + second)
     history = made.history(NOW + 100.0)
     for times in ([t for t, _ in history['distances']], [t for t, *_ in history['tracks']['']]):
-        assert min(times) >= NOW + 100.0 - HISTORY and max(times) == NOW + 99.0
+        assert min(times) >= NOW + 100.0 - HISTORY_LENGTH and max(times) == NOW + 99.0
     assert 'leader' not in history['tracks']  # not seen for that long
 
 
@@ -168,7 +168,7 @@ def test_what_is_drawn_into_an_image_is_its_own_estimate_else_carried_to_its_sta
         return float(np.asarray(box.position)[0]), box.paint
     assert drawn(0.1) == (pytest.approx(2.1), 'seen')
     assert drawn(0.3) == (pytest.approx(2.3), 'seen')
-    assert drawn(1.0) == (pytest.approx(2.2), 'grey')  # not seen since: where it was
+    assert drawn(1.0) == (pytest.approx(2.2), 'gray')  # not seen since: where it was
     assert made.picture_scene(20 * 10**9) == []
 
 

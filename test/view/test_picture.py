@@ -27,18 +27,18 @@ from flock_follower.view.scene import ARROW, BOX, draw, ELLIPSOID, Shape, TEXT
 
 CAMERA = CameraModel([[400.0, 0, 320.0], [0, 400.0, 240.0], [0, 0, 1]], [0] * 5, '', 640, 480)
 WIDE = CameraModel([[800.0, 0, 640.5], [0, 800.0, 480.5], [0, 0, 1]], [0] * 5, '', 1280, 960)
-GREY = np.full((480, 640), 100, np.uint8)
+GRAY = np.full((480, 640), 100, np.uint8)
 HERE = Transform(np.eye(3), np.zeros(3))
 
 
 def colored(jpeg: bytes) -> np.ndarray:
-    """Return where a picture is not grey, (n, 2) as x, y."""
+    """Return where a picture is not gray, (n, 2) as x, y."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
     return np.argwhere(np.ptp(image, axis=2) > 60)[:, ::-1]
 
 
 @pytest.mark.parametrize(('camera', 'image'), [
-    (CAMERA, GREY), (WIDE, np.full((960, 1280), 100, np.uint8))])
+    (CAMERA, GRAY), (WIDE, np.full((960, 1280), 100, np.uint8))])
 def test_a_box_is_drawn_where_the_camera_sees_it_at_any_size_of_image(
         camera: CameraModel, image: np.ndarray) -> None:
     box = Shape('leader', BOX, 'seen', (0.4, 0.4, 0.4), (0.5, 0.25, 2.0))
@@ -59,13 +59,13 @@ def test_nothing_is_drawn_without_a_pose_or_behind_the_camera() -> None:
     ahead = box._replace(position=(0.0, 0.0, 2.0))
     for camera, pose, shapes in ((CAMERA, HERE, [box, label, arrow]), (None, HERE, [ahead]),
                                  (CAMERA, None, [ahead])):
-        assert not len(colored(draw_picture(GREY, camera, pose, shapes)))
+        assert not len(colored(draw_picture(GRAY, camera, pose, shapes)))
 
 
 def test_text_from_the_wire_is_drawn_inside_the_image() -> None:
     for text in ('leader', 'ä\n\x00' * 50):
         label = Shape('name', TEXT, 'seen', (0.0, 0.0, 0.1), (-1.6, -1.2, 2.0), text=text)
-        assert len(colored(draw_picture(GREY, CAMERA, HERE, [label])))
+        assert len(colored(draw_picture(GRAY, CAMERA, HERE, [label])))
 
 
 def test_an_image_of_another_size_than_the_calibration_is_refused() -> None:
