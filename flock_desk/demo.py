@@ -130,7 +130,7 @@ def fly(bag: Path, out: Path, params: PlannerParams) -> tuple[dict[str, int | No
             '--param-file', str(resource('config/px4.params')),
             '--log', str(out / 'autopilot.npz')])
         start(processes, parameters, [*RECORDED, STATE])
-        start_view(processes, '', 'image_transport:=compressed')
+        start_view(processes)
         processes.wait_for_log('recorder', 'recording')
         processes.ask('mavlink_bridge/offboard')
         processes.ask('planner/engage')

@@ -204,19 +204,15 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
             show=show and simulates, ends=simulates)
 
 
-def start_view(processes: Processes, namespace: str = '', *values: str) -> None:
+def start_view(processes: Processes, namespace: str = '') -> None:
     """
     Start the live page, unless the variable VIEW of the environment is ``no``.
 
     It prints its address, or one line if it cannot serve: the flight goes on without it.
-
-    :param values: its parameters, as ``NAME:=VALUE``.
     """
     if os.environ.get('VIEW') != 'no':
-        renamed = ['-r', f'__ns:=/{namespace}'] if namespace else []
-        processes.start(VIEW, 'flock_follower.nodes.view', [
-            '--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
-            show=True, ends=True)
+        renamed = ['--ros-args', '-r', f'__ns:=/{namespace}'] if namespace else []
+        processes.start(VIEW, 'flock_follower.nodes.view', renamed, show=True, ends=True)
 
 
 def simulators_of(processes: Processes) -> list[subprocess.Popen[bytes]]:

@@ -438,7 +438,7 @@ def test_a_flight_starts_the_live_page_unless_view_is_no(monkeypatch, variable, 
             started.append((arguments, options))
 
     monkeypatch.setenv('VIEW', variable)
-    start_view(Group(), 'one', 'port:=1')
-    arguments = ['--ros-args', '-r', '__ns:=/one', '-p', 'port:=1']
+    start_view(Group(), 'one')
+    arguments = ['--ros-args', '-r', '__ns:=/one']
     assert started == [(('view', 'flock_follower.nodes.view', arguments),
                         {'show': True, 'ends': True})][:starts]
