@@ -40,6 +40,7 @@
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
 #   RUNS=20             how often `make flights` flies each scenario
+#   VIEW=no             `make demo` and `make fly` start no live page (default: http://127.0.0.1:8090)
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
@@ -50,6 +51,9 @@ $(if $(filter jazzy kilted,$(ROS)),,$(error ROS = $(ROS): must be jazzy or kilte
 VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
 VENV := .venv$(patsubst %,-%,$(filter-out jazzy,$(ROS)))$(patsubst %,-opencv-%,$(filter-out 5,$(VISION)))
+VIEW ?= yes
+$(if $(filter yes no,$(VIEW)),,$(error VIEW = $(VIEW): must be yes or no))
+export VIEW
 TESTS ?= test
 MARKERS ?=
 SCENARIO ?= indoor

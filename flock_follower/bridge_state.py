@@ -56,7 +56,7 @@ ARMED: Final = 'armed'
 #: Whether the autopilot reports that the vehicle is in the air.
 FLYING: Final = 'flying'
 
-SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
+SILENCE_MAX = 1.0  # s: two of the bridge's repetitions may get lost
 #: Begins the reason after an autopilot was received; the state before follows.
 LOST: Final = 'lost, '
 _LONGEST_REASON = 200  # characters
@@ -102,6 +102,6 @@ def effective_state(reported: BridgeState | None, age: float) -> BridgeState:
     if reported is None or math.isinf(age):
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} (if another program flies '
                            'the commands, set require_bridge:=false)')
-    if not age <= SILENCE:  # written so that NaN fails
+    if not age <= SILENCE_MAX:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing received on {TOPIC} for {age:.1f} s')
     return reported

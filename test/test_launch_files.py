@@ -98,6 +98,9 @@ def test_nodes_are_started_by_choice_again_and_with_the_command_given() -> None:
         name: [*END_WITH_LAUNCH, *(['taskset', '-c', '3'] if name == 'mavlink_bridge' else [])]
         for name in nodes}
     assert ('odom', '/vio/odom') in nodes['visualizer'].remappings
+    nodes, _ = launched(FOLLOWER, view='true')
+    assert nodes.keys() == {*SPECS, 'view'}
+    assert not nodes['view'].respawn  # if its port is busy, it would be refused for ever
 
 
 def column(**arguments: str) -> list[dict[str, str]]:
@@ -112,7 +115,8 @@ def test_a_column_gives_out_namespaces_ids_and_ports() -> None:
     assert column(followers='3', seed='7') == [
         {'namespace': f'follower_{i}', 'system': str(i), 'scenario': 'indoor',
          'seed': str(6 + i), 'port': str(14539 + i),
-         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else ''} for i in (1, 2, 3)]
+         'leader_topic': f'/follower_{i - 1}/truth/motion' if i > 1 else '',
+         **({'view': 'false'} if i > 1 else {})} for i in (1, 2, 3)]
     for followers in ('0', '9', 'two'):
         with pytest.raises(ValueError, match=r'must be an integer in \[1, 8\]'):
             column(followers=followers)

@@ -61,10 +61,13 @@ ROOMS = {
                'topic_names', 'cv2 numpy'),
     'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
     'follow': ('bridge_state check checks nodes', ''),
+    # The page of a flight, without ROS: what it shows, and its server.
+    'view': ('bridge_state command_messages messages odometry parameters perception planner',
+             'aiohttp cv2 numpy'),
     'support': ('bridge_state gate mavlink messages odometry parameters',
                 'ROS numpy'),
     'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
-              'parameters perception planner support topic_names', 'ROS numpy yaml'),
+              'parameters perception planner support topic_names view', 'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink'),
     'external': ('mavlink', 'numpy pymavlink'),

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 from itertools import pairwise
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -60,6 +61,7 @@ MARGIN = 1.5  # s beyond the duration: the simulator receives the engagement a l
 GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 COUNTER_PERIOD = 1.2  # s in which every node publishes its counters once more
+VIEW = 'view'
 T = TypeVar('T')
 
 
@@ -141,6 +143,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
                 fleet[i - 1] if i else '', i + 1)
             start(processes, parameters, RECORDED,
                   namespace, show=i == 0)
+        start_view(processes, fleet[0])
         try:
             for namespace in reversed(fleet):  # the first one flies off when it is engaged
                 prefix = f'/{namespace}/' if namespace else ''
@@ -169,6 +172,8 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         if any(simulator.returncode for simulator in simulators_of(processes)):
             raise RuntimeError('the simulator failed')
         exit_codes = processes.stop_all()
+        for of_each in cores, exit_codes:
+            of_each.pop(VIEW, None)  # the page is no part of the flight
         for recorder, code in exit_codes.items():
             if code == 1 and recorder.endswith('recorder'):
                 raise RuntimeError(f'the recorder failed: {processes.last_line(recorder)}')
@@ -197,6 +202,17 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
             'flock_desk.simulator_node' if simulates else f'flock_follower.nodes.{node}',
             ['--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
             show=show and simulates, ends=simulates)
+
+
+def start_view(processes: Processes, namespace: str = '') -> None:
+    """
+    Start the live page, unless the variable VIEW of the environment is ``no``.
+
+    It prints its address, or one line if it cannot serve: the flight goes on without it.
+    """
+    if os.environ.get('VIEW') != 'no':
+        renamed = ['--ros-args', '-r', f'__ns:=/{namespace}'] if namespace else []
+        processes.start(VIEW, 'flock_follower.nodes.view', renamed, show=True, ends=True)
 
 
 def simulators_of(processes: Processes) -> list[subprocess.Popen[bytes]]:

@@ -139,19 +139,17 @@ class Perceiver:
         :raises ValueError: if it is unusable; no image is processed until a usable one comes.
         """
         roi = message.roi
-        window = (roi.x_offset, roi.y_offset, roi.width or message.width,
-                  roi.height or message.height, max(message.binning_x, 1),
-                  max(message.binning_y, 1))
         calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
-                       message.distortion_model, message.width, message.height, window)
+                       message.distortion_model, message.width, message.height,
+                       roi.x_offset, roi.y_offset, roi.width, roi.height,
+                       message.binning_x, message.binning_y)
         known = self._cameras[camera]
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()
         try:
-            known.model = CameraModel.from_calibration(
-                message.k, message.d, message.distortion_model, message.width, message.height,
-                message.p, rectified=self.tracker.cameras[camera].rectified).scaled(*window)
+            known.model = CameraModel.from_info(
+                message, self.tracker.cameras[camera].rectified)
         except ValueError as error:
             known.fault = str(error)
             raise

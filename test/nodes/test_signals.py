@@ -56,7 +56,7 @@ NODES = {
     'relative_pose': ['--ros-args', '-p', 'image_transport:=compressed'], 'planner': [],
     'flock': ['--ros-args', '-p', 'vehicle_name:=one'],
     'replay': [str(resource('bags/sample')), '--ros-args', '-p', 'loop:=true'],
-    'visualizer': [], 'black_box': [],
+    'visualizer': [], 'black_box': [], 'view': ['--ros-args', '-p', 'port:=0'],
     'simulator': ['--ros-args', '-p', f'connection:=127.0.0.1:{free_udp_port()}']}
 
 
