@@ -67,6 +67,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
+from flock_follower.pose_messages import POSE
 
 
 @dataclass
@@ -377,6 +378,9 @@ class Follower:
                 self._listener.rejected(*rejection)
             for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
                 self._publish_neighbor(perceiver, image.stamp_ns, name, estimate)
+            if self._make is not None:
+                for topic, pose in perceiver.poses(self._make, seen):
+                    self._listener.publish(topic, POSE, self._now, pose)
             if seen.usable:
                 self._see_frame(image.stamp_ns)
             self._listener.image(ImageOutcome(

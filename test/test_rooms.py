@@ -40,6 +40,7 @@ SHARED = {'fast_dds', 'files', 'geometry', 'ranges', 'settings', 'signals', 'who
 ROOMS = {
     'messages': ('', 'numpy'),
     'command_messages': ('messages', 'numpy'),
+    'pose_messages': ('messages', 'numpy'),
     'flocking': ('', 'numpy'),
     'bridge_state': ('', ''),
     'topic_names': ('messages', ''),
@@ -51,7 +52,7 @@ ROOMS = {
     'flock': ('flocking messages', 'numpy'),
     'planner': ('bridge_state command_messages flock flocking messages neighbors_file odometry '
                 'parameters', 'numpy'),
-    'perception': ('messages neighbors_file odometry parameters', 'cv2 numpy'),
+    'perception': ('messages neighbors_file odometry parameters pose_messages', 'cv2 numpy'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'gate': ('bridge_state command_messages messages planner', 'numpy'),
     'mavlink': ('bridge_state gate messages odometry parameters', 'numpy pymavlink'),
@@ -64,13 +65,14 @@ ROOMS = {
     'support': ('bridge_state gate mavlink messages odometry parameters',
                 'ROS numpy'),
     'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
-              'parameters perception planner support topic_names', 'ROS numpy yaml'),
+              'parameters perception planner pose_messages support topic_names',
+              'ROS numpy yaml'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink'),
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'follower': ('command_messages flock gate messages perception planner', ''),
+    'follower': ('command_messages flock gate messages perception planner pose_messages', ''),
     'sensors': ('scenarios', 'numpy'),
     'closed_loop': ('camera external flock flocking follower gate mavlink messages odometry '
                     'perception planner scenarios sensors vehicles', 'numpy'),

@@ -18,7 +18,9 @@ The perception node: images and own odometry in, the neighbors' states out.
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbor measured in an image,
-stamped like the image, the same as NAME/duplicate for another object with the marker of NAME,
+stamped like the image; the measured pose of NAME in the camera's optical frame as
+``neighbors/NAME/pose``; its pose in the frame of ``odom`` on ``/tf`` if tf2_msgs is installed; the
+same as NAME/duplicate for another object with the marker of NAME,
 ``neighbors/frames`` for every image processed, with or without a neighbor,
 and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
 several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
@@ -32,8 +34,9 @@ import sys
 import time
 from typing import Any
 
-from geometry_msgs.msg import AccelWithCovarianceStamped
+from geometry_msgs.msg import AccelWithCovarianceStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
@@ -47,7 +50,7 @@ from flock_follower.messages import (
     OdometryState,
     read_stamp,
 )
-from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.conversions import make, message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, OwnOdometry
 from flock_follower.nodes.support.process import run
@@ -62,6 +65,7 @@ from flock_follower.perception.parameter_table import tracker
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.prints import Fault
 from flock_follower.perception.range_tracking import Ranged
+from flock_follower.pose_messages import pose_topic, TRANSFORMS, transforms
 
 POLL_PERIOD = 0.1  # s between two looks at odometry if no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at if no odometry comes
@@ -133,6 +137,10 @@ class RelativePose(FlockNode):
         self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', QoSProfile(depth=10))
+        self._poses = {pose_topic(n.name): self.create_publisher(
+            PoseWithCovarianceStamped, pose_topic(n.name), QoSProfile(depth=10))
+            for n in self._tracker.config.neighbors}
+        self._transforms = self._transform_publisher() if self._values['publish_tf'] else None
         self._frames = self.create_publisher(Header, 'neighbors/frames', QoSProfile(depth=1))
         self.diagnostics.checks += [self._sight_problem, self._duplicate_problem]
         self.diagnostics.sources.append(self._learned)
@@ -140,6 +148,14 @@ class RelativePose(FlockNode):
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=STEADY)
         self._overdue.cancel()
+
+    def _transform_publisher(self) -> Publisher | None:
+        """Return the publisher of /tf; None if tf2_msgs is not installed, as in PyPI's runtime."""
+        try:
+            return self.create_publisher(message_class(TRANSFORMS), '/tf', QoSProfile(depth=100))
+        except ValueError:
+            self.get_logger().info('tf2_msgs is not installed: nothing is published on /tf')
+            return None
 
     def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:
         """Take the calibration of a camera."""
@@ -204,13 +220,18 @@ class RelativePose(FlockNode):
         try:
             while (seen := self._perceiver.process(
                     time.monotonic(), time.monotonic, self._shown)) is not None:
-                image, sighting = seen.image, seen.sighting
+                image, sighting, states = seen.image, seen.sighting, []
                 for name, estimate in (*sighting.estimates.items(),
                                        *sighting.duplicates.items()):
                     state, acceleration = self._perceiver.messages(
                         make, image.stamp_ns, name, estimate)
                     self._accelerations.publish(acceleration)  # first: the state needs it
                     self._neighbors.publish(state)
+                    states += [state] if name in sighting.estimates else []
+                for topic, pose in self._perceiver.poses(make, seen):
+                    self._poses[topic].publish(pose)
+                if states and self._transforms is not None:
+                    self._transforms.publish(transforms(make, states, self.get_namespace()))
                 if seen.usable:  # after the estimates: the planner has them when it receives this
                     self._frames.publish(Header(
                         stamp=image.message.header.stamp, frame_id=self._perceiver.frame))

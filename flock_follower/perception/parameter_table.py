@@ -55,6 +55,9 @@ RELATIVE_POSE = [
     Spec('max_wait', 0.35,
          'longest time for which an image waits for odometry of its stamp; less if odometry '
          'usually comes sooner', Range(0.0, 1.0, 's')),
+    Spec('publish_tf', True,
+         "publish each neighbor's pose on /tf, from the frame of odom to its name, if tf2_msgs is "
+         'installed'),
     *specs_of(FilterParams()),
     *specs_of(RangingParams()),
     *specs_of(SourceParams(), 'odom_'),

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from flock_follower.messages import (
@@ -40,6 +40,7 @@ from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
+from flock_follower.pose_messages import pose_topic, pose_with_covariance
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 WAITS = 50  # images over which the wait for odometry is observed
@@ -94,6 +95,7 @@ class _Calibrated:
         self.model: CameraModel | None = None
         self.fault = 'none came yet'
         self.calibration: tuple[Any, ...] = ()
+        self.frame = ''  # of the camera, optical
 
 
 class Perceiver:
@@ -145,6 +147,7 @@ class Perceiver:
         calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
                        message.distortion_model, message.width, message.height, window)
         known = self._cameras[camera]
+        known.frame = message.header.frame_id
         if calibration == known.calibration:
             return False
         known.model, known.calibration = None, ()
@@ -241,6 +244,14 @@ class Perceiver:
             twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance,
         ), acceleration(make, stamp, name, estimate.child_acceleration,
                         estimate.child_acceleration_covariance)
+
+    def poses(self, make: Make, seen: Processed) -> Iterator[tuple[str, Any]]:
+        """Yield the topic and PoseWithCovarianceStamped of each pose measured in an image."""
+        image = seen.image
+        header = getattr(image.message, 'header', None)  # pixels have none
+        frame = self._cameras[image.camera].frame if header is None else header.frame_id
+        for name, measured in seen.sighting.poses.items():
+            yield pose_topic(name), pose_with_covariance(make, image.stamp_ns, frame, *measured)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""

@@ -50,7 +50,16 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import CameraSchedule, Sought
 from flock_follower.perception.hypotheses import Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.look import Look, reported, row_delay, Sighting, straightened, View
+from flock_follower.perception.look import (
+    DIRECTION_ERROR,
+    Look,
+    MeasuredPose,
+    reported,
+    row_delay,
+    Sighting,
+    straightened,
+    View,
+)
 from flock_follower.perception.markers import Detections
 from flock_follower.perception.measurement import Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
@@ -381,6 +390,11 @@ class Tracker:
             self._learn(camera, measurement, placed)
         sighting.measurements[name] = measurement
         sighting.estimates[name] = self._estimate(self._filters[name], look, placed)
+        if outcome is not UpdateOutcome.POSITION_ONLY:
+            sighting.poses[name] = MeasuredPose.of(
+                measurement, placed.view.T_smooth_camera.inverse() @ placed.T_smooth_body,
+                camera.noise.scales, DIRECTION_ERROR / float(look.model.matrix[0, 0]),
+                camera.noise.distance)
 
     def _estimate(self, track_filter: NeighborFilter, look: Look, placed: _Placed) -> Estimate:
         """Return the state of a track at the image's stamp, in odom."""
