@@ -41,6 +41,11 @@ def pose_topic(name: str) -> str:
     return f'neighbors/{name}/pose'
 
 
+def child_frame(name: str, namespace: str) -> str:
+    """Return the frame of a neighbor on /tf."""
+    return '/'.join(filter(None, [namespace.strip('/'), name]))
+
+
 def pose_with_covariance(make: Make, stamp: int, frame: str, pose: Transform,
                          covariance: Array) -> Any:
     """
@@ -68,8 +73,7 @@ def transforms(make: Make, states: Iterable[Any], namespace: str = '') -> Any:
         stamped, pose = make(TRANSFORM), state.pose.pose
         stamped.header.stamp = state.header.stamp
         stamped.header.frame_id = state.header.frame_id
-        stamped.child_frame_id = '/'.join(filter(None, [
-            namespace.strip('/'), state.child_frame_id]))
+        stamped.child_frame_id = child_frame(state.child_frame_id, namespace)
         set_vector(stamped.transform.translation, to_array(pose.position))
         turn = pose.orientation
         set_quaternion(stamped.transform.rotation, [turn.x, turn.y, turn.z, turn.w])

@@ -62,8 +62,8 @@ ROOMS = {
                'topic_names', 'cv2 numpy'),
     'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
     'follow': ('bridge_state check checks nodes', ''),
-    'support': ('bridge_state gate mavlink messages odometry parameters',
-                'ROS numpy'),
+    'support': ('bridge_state gate mavlink messages odometry parameters perception '
+                'pose_messages', 'ROS numpy'),
     'nodes': ('bags bridge_state checks command_messages flock gate mavlink messages odometry '
               'parameters perception planner pose_messages support topic_names',
               'ROS numpy yaml'),

@@ -32,9 +32,10 @@ FLIGHT_NAMES: Final = frozenset({
     'leader_acceleration_max', 'leader_lost_action', 'leader_speed_max', 'link_timeout', 'm',
     'max_wait', 'neighbors_file', 'odom_child_position', 'odom_child_rpy', 'odom_std',
     'odom_timeout', 'odom_twist_frame', 'odometry_rate', 'perception_timeout', 'planner_timeout',
-    'predict_timeout', 'radius', 'radius_max', 'range_noise', 'readout_time', 'rectified',
-    'relative_flight', 'relative_timeout', 'report_to_gcs', 'require_bridge', 'require_failsafe',
-    'resume_timeout', 'retreat_max', 'scan_rate', 'signing_key_file', 'source_system',
+    'predict_timeout', 'publish_tf', 'radius', 'radius_max', 'range_noise', 'readout_time',
+    'rectified', 'relative_flight', 'relative_timeout', 'report_to_gcs', 'require_bridge',
+    'require_failsafe', 'resume_timeout', 'retreat_max', 'scan_rate', 'signing_key_file',
+    'source_system',
     'stick_override', 'stream_rate', 'tag_position', 'takeoff_height', 'target_system', 'tau',
     'telemetry_rate', 'time_offset', 'time_offset_mode', 'v_max', 'velocity_disagreement',
     'velocity_source', 'wind_compensation', 'yaw_disagreement', 'yaw_mode', 'yaw_rate_max'})

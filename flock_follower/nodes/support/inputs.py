@@ -61,7 +61,7 @@ class StaticChild:
     """The frames of ``/tf_static``; none if tf2_msgs is not installed, as in the PyPI runtime."""
 
     def __init__(self, node: Node) -> None:
-        self._frames = StaticFrames()
+        self.frames = StaticFrames()
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
@@ -75,13 +75,13 @@ class StaticChild:
         """Take a TFMessage."""
         for stamped in message.transforms:
             turn = stamped.transform.rotation
-            self._frames.add(
+            self.frames.add(
                 stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
                     to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
 
     def transform(self, child: str) -> Transform | None:
         """Return ``T_base_child``; None if it is unknown, or base_link itself."""
-        return None if child in ('', BASE) else self._frames.pose(child, BASE)
+        return None if child in ('', BASE) else self.frames.pose(child, BASE)
 
 
 class OwnOdometry:
