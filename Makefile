@@ -58,6 +58,7 @@ OUTPUT ?=
 TRUTH ?=
 FORWARD ?=
 LEADER ?=
+DETECTOR ?=
 DURATION ?= 0
 # Frozen flights are 25 runs of each scenario, unless RUNS is given.
 FROZEN_RUNS := $(if $(RUNS),--runs $(RUNS))
@@ -87,6 +88,7 @@ demo: setup
 fly: setup
 	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) \
 		--output $(or $(OUTPUT),build/fly) \
+		$(if $(DETECTOR),--detector $(DETECTOR)) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 

@@ -30,6 +30,7 @@ several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
 from functools import partial
 import sys
 import time
@@ -136,9 +137,13 @@ class RelativePose(FlockNode):
         """Whether a neighbor has a marker: else no image is needed."""
         self._cameras = {camera.name: _Camera(self, camera, self._values['image_transport'])
                          for camera in cameras(self._values)}
-        self._own = OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited)
-        self._poll_motion = self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
-                                      required=False, awaited=self._awaited)
+        self._polls: list[Callable[[], None]] = []
+        """Take the odometry that waits, and before it the motion that is flown on without it."""
+        if not self._tracker.alone:
+            self._polls = [
+                self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
+                          required=False, awaited=self._awaited),
+                OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited).poll]
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
@@ -190,9 +195,9 @@ class RelativePose(FlockNode):
             self._tracker.ranging.waiting or self._perceiver.sources.waiting)
 
     def poll_odom(self) -> None:
-        """Take the odometry that waits, and before it the motion that is flown on without it."""
-        self._poll_motion()
-        self._own.poll()
+        """Take the own motion that waits."""
+        for poll in self._polls:
+            poll()
 
     def _take_motion(self, message: Odometry, arrival: int) -> None:
         self._use_odometry(from_odometry(message), arrival)

@@ -197,9 +197,22 @@ class Perceiver:
         :param stamp: its stamp, ns.
         """
         image = PendingImage(now, stamp, self._seconds(stamp), message, camera)
+        if self.tracker.alone:
+            self._stand_still(image)
         insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
         most = MOST_PENDING * len(self._cameras)
         return self._pending.pop(0) if len(self._pending) > most else None
+
+    def _stand_still(self, image: PendingImage) -> None:
+        """Take the camera itself as the origin at the stamp of an image."""
+        header = getattr(image.message, 'header', None)
+        self.frame = self._cameras[image.camera].frame if header is None else header.frame_id
+        rest = np.zeros(3)
+        last = image.stamp + self.tracker.cameras[image.camera].readout_time
+        for stamp in sorted({image.stamp, last}):
+            if self.tracker.feed_odometry(OdometrySample(
+                    stamp, rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest)):
+                self._pending.clear()
 
     def process(self, now: float, clock: Callable[[], float] = lambda: 0.0,
                 shown: Callable[[str], bool] = lambda _: False) -> Processed | None:

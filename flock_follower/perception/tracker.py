@@ -115,11 +115,14 @@ class Tracker:
     its stamp. A single camera has the name ''. All times of filters are by the odometry's clock.
 
     :param cameras: by name; of a single one its place on the body (optical) is enough.
+    :param alone: whether there is no odometry: every image is then taken from the origin, by a
+        camera of unknown attitude, and all states are relative to the camera.
     """
 
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
-                 ranging_params: RangingParams | None = None) -> None:
+                 ranging_params: RangingParams | None = None, alone: bool = False) -> None:
+        self.alone = alone
         self.config = config
         params = filter_params or FilterParams()
         if isinstance(cameras, Transform):
@@ -285,8 +288,14 @@ class Tracker:
         if isinstance(view, Missing):
             return view
         return Look(stamp, exposed, camera, model, view, *sought, {
-            name: view.prior(self._filters[name].predict(self._time(name, camera, exposed)))
+            name: self._prior(view, self._filters[name].predict(
+                self._time(name, camera, exposed)))
             for name in {*sought.near, *sought.anywhere}})
+
+    def _prior(self, view: View, estimate: Estimate | None) -> PosePrior:
+        """Return the expected pose; without odometry, the upward direction is unknown."""
+        prior = view.prior(estimate)
+        return prior._replace(up=None) if self.alone else prior
 
     def _view(self, camera: MountedCamera, exposed: float) -> View | Missing:
         """Return the view of a camera at a time by its clock, s."""
@@ -319,7 +328,7 @@ class Tracker:
         """Yield the name and the expected pose of each candidate in view."""
         for name in self._marked:
             for candidate in self._hypotheses[name].candidates:
-                expected = look.view.prior(candidate.track.predict(
+                expected = self._prior(look.view, candidate.track.predict(
                     self._time(name, look.camera, look.exposed)))
                 if expected.pose is not None and self._schedule.in_view(
                         name, look.model, expected.pose):
