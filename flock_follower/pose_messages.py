@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+import struct
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ import numpy as np
 from flock_follower.geometry import Array, canonical_quaternion, Transform
 from flock_follower.messages import (
     Make,
+    ODOMETRY,
     read_stamp,
     set_quaternion,
     set_stamp,
@@ -32,6 +35,8 @@ from flock_follower.messages import (
 )
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+#: Types of the poses of other detectors, the best first.
+POSE_TYPES = (POSE, 'geometry_msgs/msg/PoseStamped', ODOMETRY)
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
@@ -112,3 +117,15 @@ def from_pose(message: Any) -> PoseState:
         place, turn = pose.position, pose.orientation
     return PoseState(read_stamp(message.header.stamp), message.header.frame_id, to_array(place),
                      np.array([turn.x, turn.y, turn.z, turn.w]), covariance)
+
+def stamp_of(data: bytes) -> int:
+    """
+    Return the stamp, ns, of the bytes of a message that begins with a header.
+
+    :raises ValueError: if there is none.
+    """
+    try:
+        seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
+    except (struct.error, IndexError):
+        raise ValueError('a message without a header') from None
+    return read_stamp(SimpleNamespace(sec=seconds, nanosec=nanoseconds))

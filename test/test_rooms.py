@@ -59,7 +59,7 @@ ROOMS = {
     'bags': ('parameters', 'mcap numpy rosbags yaml'),
     'flight_parameters': ('mavlink parameters perception planner', ''),
     'checks': ('bags bridge_state messages neighbors_file odometry parameters perception '
-               'topic_names', 'cv2 numpy'),
+               'pose_messages topic_names', 'cv2 numpy'),
     'check': ('bags checks flight_parameters nodes parameters topic_names', ''),
     'follow': ('bridge_state check checks nodes', ''),
     'support': ('bridge_state gate mavlink messages odometry parameters perception '
@@ -78,8 +78,9 @@ ROOMS = {
                     'perception planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop command_messages flocking flocks follower gate '
-             'mavlink messages neighbors_file odometry parameters perception planner scenarios '
-             'topic_names', 'PIL cv2 distributed matplotlib numpy tqdm yaml'),
+             'mavlink messages neighbors_file odometry parameters perception planner '
+             'pose_messages scenarios topic_names',
+             'PIL cv2 distributed matplotlib numpy tqdm yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags bridge_state camera checks closed_loop external flight_parameters '
                    'flocks mavlink messages neighbors_file nodes parameters perception '

@@ -62,8 +62,8 @@ RELATIVE_POSE = [
          'longest time for which an image waits for odometry of its stamp; less if odometry '
          'usually comes sooner', Range(0.0, 1.0, 's')),
     Spec('odometry', 'odom',
-         'none: a detector alone, of a camera whose motion is unknown: neighbors are in its optical '
-         'frame, velocities relative to it', ('odom', 'none')),
+         'none: a detector alone, of a camera whose motion is unknown: neighbors are in its '
+         'optical frame, velocities relative to it', ('odom', 'none')),
     Spec('publish_tf', True,
          "publish each neighbor's pose on /tf, from the frame of odom to its name, if tf2_msgs is "
          'installed'),

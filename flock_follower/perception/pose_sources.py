@@ -50,7 +50,7 @@ OLDEST_POSE = 1.0
 SAME_IMAGE = 1e-3
 MOST_WAITING = 100  # poses, and frames: a bound on memory
 LATENCIES = 50  # number of poses over which their latency is observed
-LATE_FACTOR, LATE_MARGIN = 1.5, 0.03  # a pose is late after 1.5 x the longest latency + 0.03 s
+LATE_MARGIN = 0.03  # s beyond the longest latency, after which a frame has no pose
 #: Variance, rad^2, of an attitude that is not used: the filter takes the axes of odom instead.
 AXES_VARIANCE = 1e-4
 BASE = 'base_link'
@@ -207,7 +207,7 @@ class PoseSources:
 
     def _due_frames(self, now: float) -> Iterator[int]:
         wait = self._max_wait if not self._latencies else min(
-            LATE_FACTOR * max(self._latencies) + LATE_MARGIN, self._max_wait)
+            max(self._latencies) + LATE_MARGIN, self._max_wait)
         pending = [each.stamp for each in self._poses]
         while self._frames:
             frame = self._frames[0]

@@ -250,7 +250,7 @@ class Tracker:
             return Sighting(rejections=[(view.value, '')])
         if T_body_frame is None:
             view = view._replace(T_smooth_camera=Transform(np.eye(3), -view.own.correction))
-        measurement = Measurement(name, T_frame_body, np.zeros(3), covariance, 0.0, None, 'source')
+        measurement = Measurement(name, T_frame_body, np.zeros(3), covariance, 0.0, None)
         return self._take(Look(
             stamp, stamp, camera, NO_IMAGE, view, [], [], {}, measured={name: measurement}))
 

@@ -63,7 +63,8 @@ def test_poses_and_velocities_relative_to_a_camera_in_a_hand() -> None:
         seen = perceiver.process(t)
         assert seen is not None
         for name, estimate in seen.sighting.estimates.items():
-            state = from_odometry(perceiver.messages(empty, seen.image.stamp_ns, name, estimate)[0])
+            state = from_odometry(perceiver.messages(
+                empty, seen.image.stamp_ns, name, estimate)[0])
             off = state.position - seen_at(t).translation
             velocity = (seen_at(t + 1e-4).translation - seen_at(t - 1e-4).translation) / 2e-4
             errors.append(off)

@@ -20,14 +20,12 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 import statistics
-import struct
 import time
-from types import SimpleNamespace
 from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from flock_follower.messages import ODOMETRY, read_stamp, stamp_age
+from flock_follower.messages import stamp_age
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import Problem, STEADY, WARN
 from flock_follower.nodes.support.inputs import best_effort, LARGEST, StaticChild
@@ -35,10 +33,9 @@ from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.perception.neighbor_filter import UpdateOutcome
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.perception.pose_sources import Sourced, TWO_PUBLISHERS
-from flock_follower.pose_messages import from_pose, POSE, TRANSFORMS
+from flock_follower.pose_messages import from_pose, POSE_TYPES, stamp_of, TRANSFORMS
 
 LOOK_PERIOD = 0.5  # s between two looks at the publishers of the topics
-POSE_TYPES = (POSE, 'geometry_msgs/msg/PoseStamped', ODOMETRY)
 JUDGED = 50  # poses that latency and outliers are judged by
 LATE = 0.2  # s: a larger median of the latency is reported
 MANY_OUTLIERS = 0.02  # share of poses outside the gate that is reported
@@ -158,16 +155,3 @@ class PoseInputs:
             if outliers > MANY_OUTLIERS:
                 return WARN, f'{outliers:.0%} of the poses of {name} are outliers'
         return None
-
-
-def stamp_of(data: bytes) -> int:
-    """
-    Return the stamp, ns, of the bytes of a message that begins with a header.
-
-    :raises ValueError: if there is none.
-    """
-    try:
-        seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
-    except (struct.error, IndexError):
-        raise ValueError('a message without a header') from None
-    return read_stamp(SimpleNamespace(sec=seconds, nanosec=nanoseconds))
