@@ -40,6 +40,7 @@
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
 #   RUNS=20             how often `make flights` flies each scenario
+#   DETECTOR=FILE       a program whose poses `make fly` flies on: examples/other_detector.py
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
