@@ -140,10 +140,11 @@ class RelativePose(FlockNode):
         self._polls: list[Callable[[], None]] = []
         """Take the odometry that waits, and before it the motion that is flown on without it."""
         if not self._tracker.alone:
+            self._own = OwnOdometry(
+                self, self._values, self._use_odometry, awaited=self._awaited)
             self._polls = [
                 self.poll(Odometry, MOTION_TOPIC, self._take_motion, best_effort(200),
-                          required=False, awaited=self._awaited),
-                OwnOdometry(self, self._values, self._use_odometry, awaited=self._awaited).poll]
+                          required=False, awaited=self._awaited), self._own.poll]
         self.create_timer(POLL_PERIOD, self.poll_odom, clock=STEADY)
         self.subscribe(Range, 'ranges', self._take_range, best_effort(50), required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', QoSProfile(depth=10))
