@@ -41,6 +41,7 @@
 #   OUTPUT=folder       where `make demo` and `make fly` write (default: build/demo, build/fly)
 #   RUNS=20             how often `make flights` flies each scenario
 #   VIEW=no             `make demo` and `make fly` start no live page (default: http://127.0.0.1:8090)
+#   DETECTOR=FILE       a program whose poses `make fly` flies on: examples/other_detector.py
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it sends the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
@@ -62,6 +63,7 @@ OUTPUT ?=
 TRUTH ?=
 FORWARD ?=
 LEADER ?=
+DETECTOR ?=
 DURATION ?= 0
 # Frozen flights are 25 runs of each scenario, unless RUNS is given.
 FROZEN_RUNS := $(if $(RUNS),--runs $(RUNS))
@@ -91,6 +93,7 @@ demo: setup
 fly: setup
 	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) \
 		--output $(or $(OUTPUT),build/fly) \
+		$(if $(DETECTOR),--detector $(DETECTOR)) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 

@@ -53,6 +53,8 @@ setup(
                                 'ros-jazzy-common-interfaces==5.3.6', 'aiohttp', 'matplotlib',
                                 'numpy>=1.26', 'opencv-python-headless>=4.7', 'pymavlink',
                                 'pyyaml', 'rosbags', 'mcap', 'scipy', 'tqdm'],
+                    # For examples/other_detector.py.
+                    'detector': ['pupil-apriltags'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [

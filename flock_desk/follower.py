@@ -60,6 +60,7 @@ from flock_follower.messages import (
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
+from flock_follower.perception.pose_sources import Sourced
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
 from flock_follower.planner.inputs import OwnState
@@ -67,6 +68,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision
+from flock_follower.pose_messages import POSE, PoseState
 
 
 @dataclass
@@ -289,6 +291,22 @@ class Follower:
                 self._listener.rejected(*rejection)
             self._use_ranges(self.perceiver)
 
+    def pose(self, time: int, name: str, state: PoseState) -> None:
+        """Take a neighbor's pose by another detector."""
+        self.advance(time)
+        if self.perceiver is not None:
+            rejection = self.perceiver.take_pose(name, state, self._seconds())
+            if rejection is not None:
+                self._listener.rejected(*rejection)
+            self._use_sources(self.perceiver)
+
+    def source_frame(self, time: int, stamp: int) -> None:
+        """Take the stamp, ns, of an image that another detector processes."""
+        self.advance(time)
+        if self.perceiver is not None:
+            self.perceiver.take_frame(stamp, self._seconds())
+            self._use_sources(self.perceiver)
+
     def neighbor(self, time: int, state: OdometryState) -> None:
         """Take a neighbor's state."""
         self.advance(time)
@@ -377,11 +395,29 @@ class Follower:
                 self._listener.rejected(*rejection)
             for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
                 self._publish_neighbor(perceiver, image.stamp_ns, name, estimate)
+            if self._make is not None:
+                for topic, pose in perceiver.poses(self._make, seen):
+                    self._listener.publish(topic, POSE, self._now, pose)
             if seen.usable:
                 self._see_frame(image.stamp_ns)
             self._listener.image(ImageOutcome(
                 image.stamp_ns, sighting, seen.decoding, seen.perception, image.camera))
         self._use_ranges(perceiver)
+        self._use_sources(perceiver)
+
+    def _use_sources(self, perceiver: Perceiver) -> None:
+        for outcome in perceiver.sources.due(self._seconds()):
+            if isinstance(outcome, int):
+                self._see_frame(outcome)
+            elif isinstance(outcome, Sourced):
+                sighting = outcome.sighting
+                for rejection in sighting.rejections:
+                    self._listener.rejected(*rejection)
+                for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
+                    self._publish_neighbor(perceiver, outcome.stamp, name, estimate)
+                self._listener.image(ImageOutcome(outcome.stamp, sighting))
+            else:
+                self._listener.rejected(*outcome)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
         for outcome in perceiver.tracker.ranging.due():

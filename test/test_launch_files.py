@@ -209,3 +209,16 @@ def test_a_number_is_given_as_a_number_and_a_name_as_a_string(
 def test_an_invalid_value_is_refused(file: str, argument: str, text: str, valid: str) -> None:
     with pytest.raises(ValueError, match=f'{argument}:={text}: must be {valid}'):
         launched(file, **{argument: text})
+
+
+def test_detector_launch_starts_perception_alone_without_odometry() -> None:
+    nodes, _ = launched('detector.launch.py', image='/cam/image', camera_info='/cam/info',
+                        namespace='lab')
+    assert nodes.keys() == {'relative_pose'}
+    node, known = nodes['relative_pose'], {spec.name: spec for spec in RELATIVE_POSE}
+    for name, value in node.parameters[-1].items():
+        known[name].check(value)
+    assert node.parameters[-1]['odometry'] == 'none' and node.namespace == 'lab'
+    assert dict(node.remappings)['image_raw/compressed'] == '/cam/image/compressed'
+    with pytest.raises(OSError):
+        launched('detector.launch.py', neighbors_file='/none.yaml')

@@ -62,6 +62,7 @@ GPS_DISAGREEMENT = 1.2
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 COUNTER_PERIOD = 1.2  # s in which every node publishes its counters once more
 VIEW = 'view'
+DETECTED = 'DICT_APRILTAG_36h11'  # of the leader's marker, for another detector
 T = TypeVar('T')
 
 
@@ -121,7 +122,7 @@ def spacing(scenario: Scenario) -> float:
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
-        external: External | None = None, followers: int = 1
+        external: External | None = None, followers: int = 1, detector: Path | None = None
         ) -> Flown:
     """
     Fly a scenario through all nodes, leaving logs and records in ``out``.
@@ -129,6 +130,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
     :param name: of the scenario, as the simulator shall load it.
     :param external: the autopilot that flies the follower; None: the embedded one.
     :param followers: how many fly in a column; the logs of each are in ``namespaces``.
+    :param detector: a program whose poses replace the marker's, see ``with_detector``.
     :raises RuntimeError: if a process ends early or a service refuses, with the reason.
     :raises TooBusyError: if something came too late because the machine was too busy.
     """
@@ -141,6 +143,8 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             parameters = parameters_of_nodes(
                 scenario, name, seed + i, duration, out / namespace, external,
                 fleet[i - 1] if i else '', i + 1)
+            if detector is not None:
+                parameters = with_detector(parameters, detector)
             start(processes, parameters, RECORDED,
                   namespace, show=i == 0)
         start_view(processes, fleet[0])
@@ -198,8 +202,9 @@ def start(processes: Processes, parameters: Mapping[str, Sequence[str]], recorde
     for node, values in parameters.items():
         simulates = node == 'simulator'
         processes.start(
-            f'{prefix}{node}',
-            'flock_desk.simulator_node' if simulates else f'flock_follower.nodes.{node}',
+            f'{prefix}{Path(node).stem}',
+            'flock_desk.simulator_node' if simulates else node if node.endswith('.py') else (
+                f'flock_follower.nodes.{node}'),
             ['--ros-args', *renamed, *(word for value in values for word in ('-p', value))],
             show=show and simulates, ends=simulates)
 
@@ -260,6 +265,20 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],
     }
+
+
+def with_detector(parameters: Mapping[str, list[str]], detector: Path) -> dict[str, list[str]]:
+    """
+    Return the parameters of the nodes with another detector, a program, among them.
+
+    The neighbors' file has its name with .yaml; the simulator draws an AprilTag for it.
+    """
+    neighbors = f'neighbors_file:={detector.with_suffix(".yaml").resolve()}'
+    added = {'relative_pose': neighbors, 'planner': neighbors,
+             'simulator': f'dictionary:={DETECTED}'}
+    return {str(detector.resolve()): [], **{
+        node: [*values, *([added[node]] if node in added else [])]
+        for node, values in parameters.items()}}
 
 
 def take_off(processes: Processes) -> None:

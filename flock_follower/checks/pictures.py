@@ -52,6 +52,8 @@ def camera_model(seen: Observations) -> CameraModel:
 
 def check_pictures(seen: Observations) -> Iterator[Finding]:
     """Check calibration, images and markers."""
+    if not seen.has_markers:
+        return
     good = [picture for picture in seen.pictures if not picture.fault]
     if faults := [picture.fault for picture in seen.pictures if picture.fault]:
         yield Finding(ERROR, 'images', faults[0], 'an encoding that can be read',
